@@ -7,7 +7,7 @@ SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
 
 
-.PHONY: help sortie screenshot test quick lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks fuzz
+.PHONY: help sortie screenshot test test-all lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks fuzz
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -28,11 +28,11 @@ screenshot: $(STAMP) ## fly the paper's replay and take docs/sortie.png from the
 	$(BIN)/sortie fly paper_replay --set perception.detector=surrogate --out runs/screenshot --replace
 	$(BIN)/sortie view runs/screenshot --picture docs/sortie.png --at 64.2
 
-test: $(STAMP) ## run the whole test suite, a worker a core
-	$(BIN)/python -m pytest -n auto
+test: $(STAMP) ## run the test suite but for its slow tests, a worker a core
+	$(BIN)/python -m pytest -n auto -m 'not slow'
 
-quick: $(STAMP) ## run the tests that take seconds
-	$(BIN)/python -m pytest -m 'not slow' -x
+test-all: $(STAMP) ## run the whole test suite
+	$(BIN)/python -m pytest -n auto
 
 lint: $(STAMP) ## style and types
 	$(BIN)/ruff check .

@@ -42,6 +42,7 @@ from sortie.policies.damping import DampedLink, apply_hysteresis, damp
 from sortie.policies.verification.enforced import Cap, Steps
 
 _FRESH = LinkHealth.FRESH
+_NOTHING = nothing(0, 1, "")[2:8]
 
 
 class Platform(NamedTuple):
@@ -129,6 +130,7 @@ class Agent:
         phase_s: float,
         handshake_bytes: Callable[[], int],
         guard: Guard | None = None,
+        reads: Callable[[FleetView], FleetView] | None = None,
     ) -> None:
         """Put a drone together; `start` begins its process.
 
@@ -145,6 +147,7 @@ class Agent:
             phase_s: when in each frame this drone acts.
             handshake_bytes: what its sharing method puts on every link and frame before payloads, at the moment.
             guard: has the last word before the gates; None where there are no invariants.
+            reads: gives what the drone reads in place of what it heard; None where that is the same.
         """
         self.drone, self.status, self.memory = memory.drone, memory.status, memory
         self.here: Capture | None = None
@@ -162,7 +165,7 @@ class Agent:
         self._sealer = sealer
         self._phase_s = phase_s
         self._handshake_bytes = handshake_bytes
-        self._guard = guard
+        self._guard, self._reads = guard, reads
         self._period_s = rules.descriptor_period_s
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
@@ -306,6 +309,8 @@ class Agent:
     def _decide(self) -> None:
         now_s, me, links, fresh_s = self._env.now, self.drone, self._links, self._fresh_s
         view = self.memory.view(now_s)
+        if self._reads is not None:
+            view = self._reads(view)
         if self._rules.people and view.human_in_region != self._alert:
             self._alert = not self._alert
             self._log.alert(now_s, me, self._alert)
@@ -336,10 +341,14 @@ class Agent:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
         before = link.state
         fidelity, link.asked, capped = _FRESH, asked, asked
-        if age_s > self._fresh_s:
-            fidelity = self._health(age_s)
-            link.asked, capped = None, cap_by_age(asked, fidelity, age_s)
+        is_aged = age_s > self._fresh_s
+        if is_aged:
+            fidelity, link.asked = self._health(age_s), None
         self._blame_clock(link, asked.destination, fidelity, age_s, now_s)
+        if not before.proposals and asked[2:8] == _NOTHING and asked == before.enforced:
+            return  # nothing is left for age to reduce
+        if is_aged:
+            capped = cap_by_age(asked, fidelity, age_s)
         link.state = after = damp(before, capped, now_s, self._rules.dwell_s)
         if self._guard is None and after.enforced is not before.enforced:
             self._put_in_force(link, asked, after.enforced, fidelity)

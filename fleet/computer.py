@@ -12,7 +12,7 @@ Both are at least 0. What the radio's own processor does is left out.
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 from sortie.scenarios.schema import Computer
 
@@ -39,7 +39,8 @@ def headrooms(computer: Computer, look_s: float, before: Work, after: Work, last
         before, after: what had been done at the time's begin and end.
         lasts_s: the time's length.
     """
-    looks, maps, decisions, payload_bytes = (b - a for a, b in zip(astuple(before), astuple(after), strict=True))
+    looks, maps = after.looks - before.looks, after.maps - before.maps
+    decisions, payload_bytes = after.decisions - before.decisions, after.payload_bytes - before.payload_bytes
     accelerator_s = min(lasts_s, looks * look_s + maps * computer.fusion_s)
     cpu_s = (
         computer.driving_cores * accelerator_s

@@ -116,8 +116,8 @@ class PeerMemory:
         return [i for i in self._known if i != self.drone]
 
     def heard_ago_s(self, peer: int, now_s: float) -> float:
-        """Time since the last descriptor of a peer arrived, whatever its stamp."""
-        return now_s - self._heard_at_s[peer]
+        """Time since the last descriptor of a peer arrived, whatever its stamp; infinite if none did."""
+        return now_s - self._heard_at_s.get(peer, -math.inf)
 
     def ages_s(self, now_s: float) -> dict[int, float]:
         """Age of every descriptor by this drone's clock and the peers' offsets from it, and at least the time since it arrived."""

@@ -21,6 +21,7 @@ class Probes:
         """Args: `period_s` is the time between two descriptors of a peer, `periods` how many of them are looked back on."""
         self._period_s, self._window = period_s, max(1, round(periods))
         self._mask = (1 << self._window) - 1
+        self._mbps = [probed_mbps(arrived / self._window) for arrived in range(self._window + 1)]
         self._heard: dict[int, tuple[float, int]] = {}  # peer → when it was last heard; a bit a period, latest lowest
 
     def heard(self, peer: int, now_s: float) -> None:
@@ -32,22 +33,10 @@ class Probes:
         since = int((now_s - before[0]) / self._period_s + 0.5)
         self._heard[peer] = now_s, (before[1] << min(since, self._window) | 1) & self._mask
 
-    def share(self, peer: int, now_s: float) -> float | None:
-        """The share of the peer's latest descriptors that arrived, 0 … 1; None if none ever did.
-
-        One that is less than half a period overdue is not missed yet.
-        """
-        heard = self._heard.get(peer)
-        if heard is None:
-            return None
-        at_s, bits = heard
-        missed = int((now_s - at_s) / self._period_s - 0.5)
-        if missed > 0:
-            bits = bits << min(missed, self._window) & self._mask
-        return bits.bit_count() / self._window
-
     def fill(self, me: int, goodput_mbps: Sequence[float], now_s: float) -> tuple[float, ...]:
         """The goodputs of a drone's descriptor, Mb/s: measured ones stay, and probes stand for the others.
+
+        A descriptor that is less than half a period overdue is not missed yet. Peers never heard stay 0.
 
         Args:
             me: the drone.
@@ -55,9 +44,12 @@ class Probes:
             now_s: the time, s.
         """
         known = list(goodput_mbps)
-        for slot, mbps in enumerate(known):
-            if mbps <= 0.0:
-                share = self.share(slot + (slot >= me), now_s)
-                if share is not None:
-                    known[slot] = probed_mbps(share)
+        mask, window, period_s = self._mask, self._window, self._period_s
+        for peer, (at_s, bits) in self._heard.items():
+            slot = peer - (peer > me)
+            if slot < len(known) and known[slot] <= 0.0:
+                missed = int((now_s - at_s) / period_s - 0.5)
+                if missed > 0:
+                    bits = bits << min(missed, window) & mask
+                known[slot] = self._mbps[bits.bit_count()]
         return tuple(known)

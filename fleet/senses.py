@@ -5,7 +5,7 @@ It follows from the motion alone, so it is computed for many frames and all dron
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,13 +45,15 @@ class FlightSenses:
         field: HeightField,
         cameras: Sequence[Cameras],
         errors: Mapping[int, Array] | None = None,
+        blind: Container[int] = (),
     ) -> None:
         """Args:
         field: what hides the ground from the drones' cameras.
         cameras: each drone's.
         errors: by drone, what faults add to its believed pose (`sortie.fleet.sensor_faults`).
+        blind: members of the fleet without cameras; their footprints have no radius.
         """
-        self._errors = errors or {}
+        self._errors, self._blind = errors or {}, blind
         self._motion, self._frame_s, self._field, self._cameras = motion, frame_s, field, cameras
         self._first = -_BLOCK
         self._block: list[tuple[Sensed, ...]] = []
@@ -87,6 +89,8 @@ class FlightSenses:
         )  # fmt: skip
         yaw = poses.est_yaw_rad[:, drone].tolist()
         radius = footprint_radius_m(poses.est_position_m[:, drone, 2], cameras).tolist()
+        if drone in self._blind:
+            radius = [0.0] * len(radius)
         error = self._errors.get(drone)
         wrong_rad = [0.0] * len(yaw) if error is None else error[frames, 3].tolist()
         return [

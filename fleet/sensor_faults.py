@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.scenarios import scratch
-from sortie.scenarios.plugins.reference import PluginError, checked_call, name_of, resolve
+from sortie.scenarios.plugins.reference import checked_array, resolve
 from sortie.scenarios.schema import GnssLoss, HeadingFault, PositionFault, Scenario
 from sortie.scenarios.streams import stream
 
@@ -56,7 +56,7 @@ def sensor_errors(scenario: Scenario, positions_m: Array, seed: int, replication
         model = resolve("sensor", scenario.fleet.sensor, scenario.fleet.sensor_params)
         for drone in range(drones):
             rng = stream(seed, replication, drone, "own sensor")
-            errors[drone] = _own(model, times_s, np.array(positions_m[:, drone]), rng)
+            errors[drone] = own_errors(model, times_s, np.array(positions_m[:, drone]), rng)
     for index, event in enumerate(scenario.events):
         if isinstance(event, PositionFault | HeadingFault | GnssLoss):
             for drone in [event.drone] if event.drone is not None else range(drones):
@@ -87,12 +87,9 @@ def _of_event(event: PositionFault | HeadingFault | GnssLoss, times_s: Array, rn
     return error
 
 
-def _own(model: OwnSensor, times_s: Array, positions_m: Array, rng: np.random.Generator) -> Array:
-    given = np.asarray(checked_call("sensor", model, times_s.copy(), positions_m, rng), dtype=float)
-    if given.shape != (len(times_s), COLUMNS):
-        raise PluginError(f"sensor {name_of(model)}: returns shape {given.shape}, must be {(len(times_s), COLUMNS)}")
-    if not np.isfinite(given).all():
-        raise PluginError(f"sensor {name_of(model)}: returns {given[~np.isfinite(given)][0]}, must be finite")
+def own_errors(model: OwnSensor, times_s: Array, positions_m: Array, rng: np.random.Generator) -> Array:
+    """What a sensor of one's own returns for one drone, checked."""
+    given = checked_array("sensor", model, (len(times_s), COLUMNS), times_s.copy(), positions_m, rng)
     return scratch.copied(given)
 
 

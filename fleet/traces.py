@@ -5,13 +5,18 @@ One row a drone and time, CSV or Parquet. Names, units and frames are those of t
 
     t_s                       seconds since the sortie's begin, increasing for each drone        must be there
     drone                     whose row; left out, everything is drone 0's
-    x_m, y_m, z_m             pose, ENU                                                           all three, or no pose
-    qx, qy, qz, qw            attitude, FLU in ENU (all four)                  } one of the two, or level and heading
-    yaw_deg                   heading, counter-clockwise from east             } along the track
+    x_m, y_m, z_m             pose, ENU                                        } one of the two, all three of it,
+    lat_deg, lon_deg, alt_m   the same as WGS-84 degrees and altitude          } or no pose
+    qx, qy, qz, qw            attitude, FLU in ENU (all four)                  } one of the three, or level and heading
+    yaw_deg                   heading, counter-clockwise from east             } along the track; without roll_deg and
+    heading_deg               compass heading, with roll_deg and pitch_deg     } pitch_deg level: nose up, right side down
     vx_mps, vy_mps, vz_mps    velocity, ENU; left out, the slope of the positions                  all three, or none
     soc                       state of charge by charge, 0 … 1; it never rises
     voltage_v, current_a      at the terminals
     rssi_dbm, rssi_percent    what the drone's radio heard; kept for people, nothing reads it
+
+Latitudes and longitudes become ENU on the plane that touches the ellipsoid at `fleet.origin`, and altitudes heights above
+it. A ground station may be among the drones: one row with its place is enough (`fleet.ground`).
 
 Time and gaps follow the rules of all traces (scenarios/traces.py); attitudes run on the shorter arc. Before the first and
 after the last place a drone stands there, without velocity. A drone without a pose or a charge keeps its model there.
@@ -29,10 +34,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sortie.fleet.energy.cell import energy_fraction
 from sortie.fleet.energy.recorded import BatteryTrace
-from sortie.fleet.flight.frames import yaw_rad
+from sortie.fleet.flight.frames import swap_attitude, tangent_plane_m, yaw_rad
 from sortie.fleet.flight.motion import Trajectories, body_rates, fly
 from sortie.scenarios import scratch
-from sortie.scenarios.schema import Fleet
+from sortie.scenarios.schema import Fleet, Origin
 from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
 
 Array = npt.NDArray[np.float64]
@@ -40,6 +45,8 @@ Array = npt.NDArray[np.float64]
 POSITION = ("x_m", "y_m", "z_m")
 ATTITUDE = ("qx", "qy", "qz", "qw")
 VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
+GLOBE = ("lat_deg", "lon_deg", "alt_m")
+COMPASS = ("roll_deg", "pitch_deg", "heading_deg")
 BATTERY = ("soc", "voltage_v", "current_a")
 ROUNDING = 1e-5
 """A charge that rises by less is rounding, and held."""
@@ -52,7 +59,11 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     **dict.fromkeys(POSITION, (-20_000.0, 20_000.0)),
     **dict.fromkeys(ATTITUDE, (-1.000001, 1.000001)),
     **dict.fromkeys(VELOCITY, (-200.0, 200.0)),
+    "lat_deg": (-85.0, 85.0),
+    "lon_deg": (-180.0, 180.0),
+    "alt_m": (-1_000.0, 20_000.0),
     "yaw_deg": (-360.0, 360.0),
+    **dict.fromkeys(COMPASS, (-360.0, 360.0)),
     "soc": (0.0, 1.0),
     "voltage_v": (0.0, 200.0),
     "current_a": (-1000.0, 2000.0),
@@ -79,12 +90,13 @@ class DroneTrace:
     battery: BatteryTrace | None
 
 
-def read_traces(path: str | Path, drones: int) -> dict[int, DroneTrace]:
+def read_traces(path: str | Path, drones: int, origin: Origin | None = None) -> dict[int, DroneTrace]:
     """Read a trace.
 
     Args:
         path: *.csv, or anything else as Parquet.
         drones: drones of the fleet; a trace of another is refused.
+        origin: where on the globe ENU (0, 0, 0) lies; None: at the first place, at the lowest altitude.
 
     Raises:
         TraceError: no such file, no table, a column missing or unknown, a value out of bounds, time that does not
@@ -92,9 +104,16 @@ def read_traces(path: str | Path, drones: int) -> dict[int, DroneTrace]:
     """
     path = Path(path)
     columns = read_columns(path, BOUNDS)
-    for what, names in (("a pose", POSITION), ("an attitude", ATTITUDE), ("a velocity", VELOCITY)):
+    for what, names in (
+        ("a pose", POSITION), ("a place on the globe", GLOBE), ("an attitude", ATTITUDE), ("a velocity", VELOCITY),
+    ):  # fmt: skip
         if 0 < sum(name in columns for name in names) < len(names):
             raise TraceError(f"{path}: {what} needs all of {', '.join(names)}")
+    for some, others in (((POSITION[0],), (GLOBE[0],)), (("yaw_deg", ATTITUDE[0]), COMPASS)):
+        both = [name for name in (*some, *others) if name in columns]
+        if set(both) & set(some) and set(both) & set(others):
+            raise TraceError(f"{path}: columns {' and '.join(both)} say the same, must be one of them")
+    columns = _placed(columns, origin)
     who = columns.get("drone", np.zeros(len(columns["t_s"])))
     check_whole(path, "drone", who)
     traces = {}
@@ -117,7 +136,7 @@ def flown_motion(
         TraceError: a trace that cannot be read or does not fit.
         MotionError: a way that cannot be flown.
     """
-    traces = {} if fleet.trace is None else read_traces(fleet.trace, fleet.drones)
+    traces = {} if fleet.trace is None else read_traces(fleet.trace, fleet.drones, fleet.origin)
     return follow(fly(fleet, duration_s, frame_s, seed, replication), traces, frame_s), traces
 
 
@@ -162,6 +181,32 @@ def follow(motion: Trajectories, traces: Mapping[int, DroneTrace], frame_s: floa
 
 
 # --- reading -------------------------------------------------------------------------------------
+
+
+def _placed(columns: Mapping[str, Array], origin: Origin | None) -> dict[str, Array]:
+    """The columns with places on the globe and compass headings as ENU and as attitudes."""
+    placed = dict(columns)
+    if GLOBE[0] in columns:
+        fixes = _stack(columns, GLOBE)
+        there = ~np.isnan(fixes).any(axis=-1)
+        if there.any():
+            first = fixes[there][0]
+            zero = (
+                (first[0], first[1], fixes[there, 2].min()) if origin is None else tuple(origin.model_dump().values())
+            )
+            metres = tangent_plane_m(fixes, zero)
+            metres[:, 2] = fixes[:, 2] - zero[2]  # the ground is level in the simulator
+            placed |= dict(zip(POSITION, metres.T, strict=True))
+    if "heading_deg" in columns:
+        level = np.zeros_like(columns["heading_deg"])
+        roll, pitch = (np.nan_to_num(columns.get(name, level)) for name in COMPASS[:2])
+        known = ~np.isnan(columns["heading_deg"])
+        turns = np.stack([columns["heading_deg"], pitch, roll], axis=-1)[known]
+        attitude = np.full((len(level), 4), np.nan)
+        if known.any():
+            attitude[known] = swap_attitude(Rotation.from_euler("ZYX", turns, degrees=True).as_quat())
+        placed |= dict(zip(ATTITUDE, attitude.T, strict=True))
+    return placed
 
 
 def _pose(own: Mapping[str, Array]) -> PoseTrace | None:

@@ -11,6 +11,7 @@ All of it is pure: `judge` takes what is known and gives what is thought of a pe
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Container, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
@@ -136,6 +137,7 @@ def judge(
     """
     before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
     fell_per_s = {i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items()}
+    by_fall = sorted(fell_per_s.values())
     # who was not heard drained on: its fall, once it is heard again, is over this second too
     after = {
         i: s if i in known else s._replace(seconds=s.seconds + 1, unheard=s.unheard + 1) for i, s in standings.items()
@@ -145,7 +147,7 @@ def judge(
         doubt = ""
         if peer != ego:
             came = arrivals.get(peer, ()) if claim.counts(ego) else ()  # who leaves the ego out claims no goodput to it
-            others_fell = median([rate for i, rate in fell_per_s.items() if i != peer]) * standing.elapsed
+            others_fell = _median_without(by_fall, fell_per_s[peer]) * standing.elapsed
             doubt = (
                 (
                     coverage_doubt(claim, form.blur_m, peer in looking, cameras(peer))
@@ -165,6 +167,14 @@ def judge(
         least_soc = min(standing.least_soc, claim.battery_soc)
         after[peer] = standing._replace(strikes=strikes, reason=doubt or standing.reason, least_soc=least_soc)
     return after
+
+
+def _median_without(ascending: Sequence[float], value: float) -> float:
+    """The median of the others, where `value` is one of several."""
+    at, rest = bisect_left(ascending, value), len(ascending) - 1
+    middle = rest // 2
+    high = ascending[middle + (middle >= at)]
+    return high if rest % 2 else (ascending[middle - 1 + (middle > at)] + high) / 2
 
 
 def _aged(standing: Standing, soc: float) -> Standing:

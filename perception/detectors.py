@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.errors import InputError
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
@@ -68,6 +71,7 @@ class LooksByAnother(Protocol):
     """Detects for the trackers."""
 
 
+Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 Constructor = Callable[[SceneModel, Perception, int, int], Detector]
 """From the scene, the scenario's `perception` section, the sortie's seed and its replication."""
 
@@ -100,23 +104,59 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
     made = checked_call("detector", constructor, scene, config, seed, replication)
     needed = ("detect", "truth", "count_boxes", "camera_views")
     found: Any = Guard("detector", made, needed, Path(config.detector).name, timed=False)  # a network takes its time
-    detect = found.detect
+    detect, truth, count = found.detect, found.truth, found.count_boxes
 
-    def checked(jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
-        boxes = detect(jobs)
-        if len(boxes) != len(jobs) or not all(isinstance(each, Boxes) for each in boxes):
+    def boxes(made: object, what: str) -> Boxes:
+        if not isinstance(made, Boxes):
+            raise PluginError(f"detector {found.name}: {what} returns {made!r:.60}, must be Boxes")
+        n = len(made)
+        for column, shape in (("xy_m", (n, 2)), ("size_m", (n, 2)), ("yaw_rad", (n,)), ("score", (n,))):
+            value = np.asarray(getattr(made, column))
+            if value.shape != shape:
+                raise PluginError(
+                    f"detector {found.name}: {what} returns {column} of shape {value.shape}, must be {shape}"
+                )
+            if not np.isfinite(value).all():
+                raise PluginError(f"detector {found.name}: {what} returns {column} that is not finite")
+        return made
+
+    def checked(jobs: Jobs, several: Sequence[Any]) -> list[Boxes]:
+        if len(several) != len(jobs) or not all(isinstance(each, Boxes) for each in several):
             raise PluginError(
-                f"detector {found.name}: detect returns {boxes!r:.60}, must be Boxes for each of the jobs"
+                f"detector {found.name}: detect returns {several!r:.60}, must be Boxes for each of the jobs"
             )
-        return list(boxes)
+        return [boxes(each, "detect") for each in several]
 
-    found.detect = checked
+    def counted(capture: Capture, roi: Disc | None) -> int:
+        number = count(capture, roi)
+        if not isinstance(number, Integral) or number < 0:
+            raise PluginError(f"detector {found.name}: count_boxes returns {number!r:.60}, must be a whole number ≥ 0")
+        return int(number)
+
+    found.detect = lambda jobs: checked(jobs, detect(jobs))
+    found.truth = lambda t_s, ego: boxes(truth(t_s, ego), "truth")
+    found.count_boxes = counted
+    if isinstance(made, DetectsAhead):
+        begin = found.begin
+
+        def begun(jobs: Jobs) -> Callable[[], list[Boxes]]:
+            finish = begin(jobs)
+            return lambda: checked(jobs, checked_call("detector", finish))
+
+        found.begin = begun
     detector: Detector = found
     return detector
 
 
 def _torch(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector:
-    from sortie.perception.network.detector import TorchDetector
+    try:
+        from sortie.perception.network.detector import TorchDetector
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise InputError(
+            "perception.detector is torch, which is not installed: pip install 'sortie-sim[torch]', or take surrogate"
+        ) from None
 
     weights = None if config.weights is None else Path(config.weights)
     return TorchDetector(scene, config, seed, weights, replication)

@@ -294,7 +294,7 @@ class Directive(NamedTuple):
         return hash(self[:-1])
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=1 << 16)  # a few for each link of a hundred drones
 def nothing(source: int, destination: int, reason: str) -> Directive:
     """The directive to send nothing. Equal arguments give one object, because it is the most frequent directive."""
     return Directive(source, destination, reason=reason)

@@ -105,13 +105,13 @@ def damp(link: DampedLink, proposed: Directive, now_s: float, dwell_s: float) ->
     elif _level(proposed) == _level(current):
         # A disc that follows its target, a deadline: no step on the ladder.
         return link if _is_small_move(proposed, current) else DampedLink(proposed)
-    lower = _lower_of(current, proposed)
+    lower = lower_of(current, proposed)
     if lower == proposed:
         return DampedLink(proposed)
     proposals = _with(proposals, proposed, now_s)
     if now_s - proposals[0][0] >= dwell_s - EPSILON_S:
         proposals = _since(proposals, now_s - dwell_s + EPSILON_S)
-        least = reduce(_lower_of, [directive for _, directive in proposals])
+        least = reduce(lower_of, [directive for _, directive in proposals])
         if least == proposed:
             return DampedLink(proposed)
         if _level(least) != _level(lower):  # more than now: `lower` bounds it from below
@@ -140,7 +140,7 @@ def _since(proposals: tuple[tuple[float, Directive], ...], begin_s: float) -> tu
     return proposals[first:]
 
 
-def _lower_of(current: Directive, proposed: Directive) -> Directive:
+def lower_of(current: Directive, proposed: Directive) -> Directive:
     """The lower of two directives in every part: what may take effect at once."""
     if current.representation == _NONE or proposed.representation == _NONE:
         # Nothing flows, so the duty cycle alone is left to lower.
@@ -168,6 +168,11 @@ def _lower_of(current: Directive, proposed: Directive) -> Directive:
         return current
     # A disc that moved while an upgrade waits does not come from that upgrade, so its reason would mislead.
     return reduced._replace(reason=current.reason) if _level(reduced) == _level(current) else reduced
+
+
+def is_climb(a: Directive, b: Directive) -> bool:
+    """Whether the second of two directives for one link is higher in some part, so that damping would make it wait."""
+    return _level(a) != _level(b) and lower_of(a, b) != b
 
 
 def is_switch(a: Directive, b: Directive) -> bool:

@@ -11,7 +11,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call, name_of
+from sortie.scenarios.plugins.reference import Guard, PluginError, checked_array, checked_call, name_of
 
 FloatArray = NDArray[np.float64]
 GAIN_DB = 6.1
@@ -74,7 +74,7 @@ def path_loss(
         PluginError: it fails, or returns another shape, a number that is not finite or a loss below that of free space.
     """
     ends = np.broadcast_arrays(*(np.asarray(a, dtype=float) for a in (distance_m, height_a_m, height_b_m)))
-    loss_db = _numbers("path_loss", model, ends[0].shape, *ends, carrier_ghz)
+    loss_db = checked_array("path_loss", model, ends[0].shape, *ends, carrier_ghz)
     above_db = loss_db - (free_space_db - GAIN_DB)
     if above_db.size and above_db.min() < 0.0:
         k = int(above_db.argmin())
@@ -92,21 +92,5 @@ def changed_snr(model: LinkModel, t_s: float, positions_m: FloatArray, snr_db: F
         PluginError: it fails, or returns another shape or a number that is not finite.
     """
     diagonal = np.eye(len(snr_db), dtype=bool)
-    given = _numbers("link", model.snr_db, snr_db.shape, t_s, positions_m.copy(), snr_db.copy(), left_out=diagonal)
+    given = checked_array("link", model.snr_db, snr_db.shape, t_s, positions_m.copy(), snr_db.copy(), left_out=diagonal)
     return np.where(diagonal, np.nan, given)
-
-
-def _numbers(
-    kind: str,
-    function: Callable[..., Any],
-    shape: tuple[int, ...],
-    *args: Any,
-    left_out: NDArray[np.bool_] | None = None,
-) -> FloatArray:
-    found = np.asarray(checked_call(kind, function, *args), dtype=float)
-    if found.shape != shape:
-        raise PluginError(f"{kind} {name_of(function)}: returns shape {found.shape}, must be {shape}")
-    wrong = ~np.isfinite(found) & (True if left_out is None else ~left_out)
-    if wrong.any():
-        raise PluginError(f"{kind} {name_of(function)}: returns {found[wrong][0]}, must be finite")
-    return found

@@ -22,7 +22,7 @@ from sortie.radio.mac.airtime import (
     tries,
 )
 from sortie.radio.mac.contention import SIFS_S, SLOT_S, contention
-from sortie.radio.mac.jobs import AirJob
+from sortie.radio.mac.jobs import NO_FRAMES, AirJob
 from sortie.radio.mac.medium import Link
 from sortie.radio.mac.rate_control import Minstrel
 from sortie.radio.overrides import LinkNow
@@ -98,7 +98,7 @@ class Sample(AirJob):
             self.arrived.append(self.pieces[self.here])
             self.pieces = np.delete(self.pieces, self.here)
         self.arrived_frames = self.sent_frames = self.mark_frames = 0
-        self.here = np.arange(0)
+        self.here = NO_FRAMES
         self.dropped = []
         return missing
 
@@ -160,7 +160,9 @@ class Service:
         self.least_snr_db = settings.preamble_detection_dbm - noise_dbm
         self.minstrel = Minstrel(self._rates) if settings.rate_control == "minstrel" else None
         self._mbps_at: FloatArray | None = None
-        self._equivalents: dict[tuple[int, int, int], float] = {}  # payloads come in few sizes
+        # payloads come in few sizes
+        self._equivalents: dict[tuple[int, int, int], float] = {}
+        self._passes: dict[tuple[int, int, int, int, bool], tuple[int, int, float]] = {}
 
     def use(
         self, sender: int, receiver: int, now_s: float, known_snr_db: float, snr_db: float, receiver_gone: bool,
@@ -226,15 +228,26 @@ class Service:
 
     def prepare(self, s: Sample) -> None:
         """Set the frames of a sample's next pass."""
-        c = self._settings
-        alone, unit = s.piece_bytes > 0, s.piece_bytes or c.fragment_bytes
-        split = s.fragments > 1 and not alone
-        payload = s.payload_bytes if s.left == s.fragments else min(s.payload_bytes, s.left * unit)
-        last = payload - (s.left - 1) * unit
         s.frames = s.left
-        s.full_bytes = frame_bytes(unit if s.left > 1 else last, fragmented=split)
-        s.last_bytes = frame_bytes(last, fragmented=split) + (repair_wire_bytes(1) if s.reliable else 0)
-        s.pass_wire = (payload + s.left * frame_bytes(0, fragmented=split)) / s.left
+        key = s.payload_bytes, s.fragments, s.left, s.piece_bytes, s.reliable
+        found = self._passes.get(key)
+        if found is None:
+            if len(self._passes) > _MAX_KEPT:
+                self._passes.clear()
+            found = self._passes[key] = self._pass(*key)
+        s.full_bytes, s.last_bytes, s.pass_wire = found
+
+    def _pass(
+        self, payload_bytes: int, fragments: int, left: int, piece_bytes: int, reliable: bool
+    ) -> tuple[int, int, float]:
+        """Bytes of each frame and of the last one, and wire bytes a frame, where so many of the fragments are left."""
+        alone, unit = piece_bytes > 0, piece_bytes or self._settings.fragment_bytes
+        split = fragments > 1 and not alone
+        payload = payload_bytes if left == fragments else min(payload_bytes, left * unit)
+        last = payload - (left - 1) * unit
+        full_bytes = frame_bytes(unit if left > 1 else last, fragmented=split)
+        last_bytes = frame_bytes(last, fragmented=split) + (repair_wire_bytes(1) if reliable else 0)
+        return full_bytes, last_bytes, (payload + left * frame_bytes(0, fragmented=split)) / left
 
     def bits_of_a_frame(self, s: Sample) -> float:
         """What goodput counts for each frame that arrives: its time alone × the payload rate of full A-MPDUs."""

@@ -54,8 +54,8 @@ def _sections(section: type[BaseModel], path: str) -> Iterator[tuple[str, type[B
     yield path, section
     for name, field in section.model_fields.items():
         members = sections_of(field.annotation)
-        if path == "fleet.makes[]":  # its sections stand in place of the fleet's, which are listed above
-            continue
+        if path == "fleet.makes[]" or (path == "fleet.groups[]" and name in ("formation", "route")):
+            continue  # its sections stand in place of the fleet's, which are listed above
         for member in members:
             listed = "[]" if "tuple" in str(field.annotation) else ""
             kind = f" of kind {get_args(member.model_fields['kind'].annotation)[0]}" if len(members) > 1 else ""

@@ -13,7 +13,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from sortie.scenarios.plugins.reference import is_file, package_of
+from sortie.scenarios.plugins.reference import file_of, is_file, package_of
 from sortie.scenarios.plugins.user_code import imported_files
 from sortie.scenarios.reading.files import named_files, named_models
 from sortie.scenarios.schema import Scenario
@@ -106,11 +106,15 @@ def own_files(
         source, or of nothing where Python has none.
 
     Raises:
+        PluginError: a file of a model is not there.
         OSError: a file cannot be read.
     """
     sections = scenario.model_dump(mode="json")
     if policy is not None and policy != scenario.policy.name:
         sections["policy"] = {"name": policy if isinstance(policy, str) else ""}
+    for kind, name in named_models(sections):
+        if is_file(name):
+            file_of(kind, name)  # its errors: a model that does not fly may be missing
     named = {name: located(Path(name)) for name in named_files(sections)}
     found = {name: _digest(path) for name, path in named.items() if path.suffix != ".py"}
     code = [path for path in named.values() if path.suffix == ".py"]

@@ -9,8 +9,14 @@ from sortie.scenarios.errors import SortieError
 from sortie.sim.folders import RunError
 
 EXTRAS = {"matplotlib": "report", "SALib": "campaign", "threadpoolctl": "campaign", "cyclonedds": "dds", "pettingzoo": "env",
-          "gymnasium": "env", "rosbags": "ros2", "zarr": "zarr", "distributed": "campaign"}  # fmt: skip
+          "gymnasium": "env", "rosbags": "ros2", "zarr": "zarr", "distributed": "campaign", "torch": "torch"}  # fmt: skip
 """Which extra brings a library that not everybody needs."""
+
+
+def missing(error: ImportError) -> Exception:
+    """The extra that an import lacks, as one line; what no extra brings is the error itself."""
+    name = (error.name or "").partition(".")[0]
+    return RunError(f"{name} is missing: pip install 'sortie-sim[{EXTRAS[name]}]'") if name in EXTRAS else error
 
 
 @contextmanager
@@ -19,10 +25,7 @@ def user_errors() -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        name = (error.name or "").partition(".")[0]
-        if name not in EXTRAS:
-            raise
-        raise RunError(f"{name} is missing: pip install 'sortie-sim[{EXTRAS[name]}]'") from error
+        raise missing(error) from error
     except OSError as error:
         where = "" if error.filename is None else f"{error.filename}: "
         raise RunError(f"{where}{error.strerror or error}") from error

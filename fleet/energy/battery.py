@@ -4,27 +4,24 @@
 charge and voltage are read off it. So the ledger's sum and what left the pack are one number, up to rounding. The
 cells' chemistry is in `sortie.fleet.energy.cell`, what the rotors draw in `sortie.fleet.flight.rotor`.
 
-Proportion, wherever energy is claimed: hovering draws some 210 W electric, a Wi-Fi radio 2 to 6 W. Hover outweighs
-the radio about a hundredfold, so what is shared moves flight time mainly through compute duty cycling, hardly
-through airtime.
+Proportion, wherever energy is claimed: hovering draws some 210 W electric, a Wi-Fi radio 2 to 6 W. So what is shared
+moves flight time mainly through the duty cycle of perception, hardly through airtime.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 from sortie.fleet.energy.cell import (
-    CELL_TABLE,
     COOLING_TIME_S,
+    LIPO,
     REFERENCE_C,
-    SOC_TABLE,
     STEPS,
     ageing,
+    cell_curve,
     current_a,
-    energy_fraction,
     heat_capacity_jpk,
-    open_circuit_cell_v,
     resistance_factor,
 )
 from sortie.fleet.energy.recorded import BatteryTrace
@@ -60,6 +57,7 @@ class FleetBatteries:
         overrides: Sequence[DroneOverride],
         n: int,
         traces: Mapping[int, BatteryTrace] | None = None,
+        mains: Container[int] = (),
     ) -> None:
         """Packs of `n` drones at take-off.
 
@@ -68,11 +66,15 @@ class FleetBatteries:
             overrides: `fleet.overrides` of the scenario.
             n: number of drones.
             traces: drones whose charge is not modelled but read from a trace.
+            mains: members of the fleet that draw from the mains; their packs stay full.
         """
         packs = [config] * n if isinstance(config, Battery) else list(config)
         for override in overrides:
             changes = override.model_dump(exclude={"drone", "payload_kg"}, exclude_none=True)
             packs[override.drone] = packs[override.drone].model_copy(update=changes)
+        self._mains = {i for i in range(n) if i in mains}
+        for i in self._mains:
+            packs[i] = packs[i].model_copy(update={"initial_soc": 1.0})
         self._packs, self._now_s = packs, 0.0
         self._loads = [
             (
@@ -82,7 +84,11 @@ class FleetBatteries:
             )
             for p in packs
         ]  # fmt: skip
-        self._traces: dict[int, BatteryTrace] = dict(traces or {})
+        self._traces = {i: trace for i, trace in (traces or {}).items() if i not in self._mains}
+        # what a trace says of a charge was turned into energy by the built-in cell
+        named = [(pack.cell_model, str(pack.cell_params)) for pack in packs]
+        curves = {name: cell_curve(pack) for name, pack in zip(named, packs, strict=True)}
+        self._curves = [LIPO if i in self._traces else curves[name] for i, name in enumerate(named)]
         aged = [ageing(pack.cycles, pack.life_cycles) for pack in packs]
         self._full_j = [pack.capacity_wh * 3600.0 * share for pack, (share, _) in zip(packs, aged, strict=True)]
         self._worn = [worse for _, worse in aged]
@@ -96,11 +102,15 @@ class FleetBatteries:
         self.temperature_c = [REFERENCE_C if pack.ambient_c is None else pack.ambient_c for pack in packs]
         self.soc = [self._traces[i].soc_at(0.0) if i in self._traces else p.initial_soc for i, p in enumerate(packs)]
         self.energy_left_j = [
-            full * float(energy_fraction(soc)) for full, soc in zip(self._full_j, self.soc, strict=True)
+            full * float(curve.energy_fraction(soc))
+            for full, curve, soc in zip(self._full_j, self._curves, self.soc, strict=True)
         ]
         causes = CAUSES if not self._traces else (*CAUSES, RECORDED)
         self.energy_j: dict[str, list[float]] = {cause: [0.0] * n for cause in causes}
-        self.voltage_v = [float(open_circuit_cell_v(s)) * k for s, k in zip(self.soc, self.cells, strict=True)]
+        self.voltage_v = [
+            float(curve.open_circuit_v(soc)) * in_series
+            for curve, soc, in_series in zip(self._curves, self.soc, self.cells, strict=True)
+        ]
         self.current_a = [0.0] * n
         self.landed = [soc <= pack.landing_soc for soc, pack in zip(self.soc, packs, strict=True)]
         self.landing_reason = [self._charge(i) if down else "" for i, down in enumerate(self.landed)]
@@ -128,12 +138,13 @@ class FleetBatteries:
         """
         loads, left, soc, landed = self._loads, self.energy_left_j, self.soc, self.landed
         full_j, pack_ohm, pack_cells, traces = self._full_j, self._resistance_ohm, self.cells, self._traces
+        mains, curves = self._mains, self._curves
         voltage_v, current_a_, polarised_v = self.voltage_v, self.current_a, self._polarised_v
         rotor_j, avionics_j, compute_j = self.energy_j["rotor"], self.energy_j["avionics"], self.energy_j["compute"]
         radio_j, ohmic_j = self.energy_j["radio"], self.energy_j["ohmic"]
         self._now_s += dt_s
         for i, down in enumerate(landed):
-            if down:
+            if down or (mains and i in mains):
                 continue
             if traces and i in traces:
                 self._follow(i, dt_s)
@@ -143,7 +154,8 @@ class FleetBatteries:
             warmth = 1.0
             at = left[i] / full * STEPS
             k = int(at)
-            ocv = cells * (CELL_TABLE[k] + (at - k) * (CELL_TABLE[k + 1] - CELL_TABLE[k]))
+            soc_table, volt_table = curves[i][:2]
+            ocv = cells * (volt_table[k] + (at - k) * (volt_table[k + 1] - volt_table[k]))
             if thermal:
                 warmth = resistance_factor(self.temperature_c[i])
                 resistance *= warmth
@@ -175,20 +187,22 @@ class FleetBatteries:
                 self._warm(i, ohmic, dt_s)
             at = left[i] / full * STEPS
             k = int(at)
-            soc[i] = SOC_TABLE[k] + (at - k) * (SOC_TABLE[k + 1] - SOC_TABLE[k])
+            soc[i] = soc_table[k] + (at - k) * (soc_table[k + 1] - soc_table[k])
             if voltage < cutoff_cell_v * cells and soc[i] > landing_soc:
                 self.land(i, f"{voltage / cells:.2f} V a cell, cut off below {cutoff_cell_v:g} V")
             elif soc[i] <= landing_soc:
                 self.land(i)
 
     def fault(self, drone: int, lost_fraction: float) -> None:
-        """Lose a fraction of the remaining energy at once; the drone lands if too little is left.
+        """Lose a fraction of the remaining energy at once; the drone lands if too little is left. The mains lose none.
 
         Raises:
             ValueError: lost_fraction outside 0 … 1.
         """
         if not 0 <= lost_fraction <= 1:
             raise ValueError(f"lost_fraction is {lost_fraction}, must be in [0, 1]")
+        if drone in self._mains:
+            return
         self._lose(drone, lost_fraction)
         self._kept[drone] *= 1.0 - lost_fraction
         self._read_off(drone)
@@ -274,8 +288,8 @@ class FleetBatteries:
         """Charge, and the voltage at the present current, from the energy left."""
         at = self.energy_left_j[drone] / self._full_j[drone] * STEPS
         k = int(at)
-        cells = self.cells[drone]
-        self.soc[drone] = SOC_TABLE[k] + (at - k) * (SOC_TABLE[k + 1] - SOC_TABLE[k])
-        open_v = cells * (CELL_TABLE[k] + (at - k) * (CELL_TABLE[k + 1] - CELL_TABLE[k]))
+        cells, (soc, volts) = self.cells[drone], self._curves[drone][:2]
+        self.soc[drone] = soc[k] + (at - k) * (soc[k + 1] - soc[k])
+        open_v = cells * (volts[k] + (at - k) * (volts[k + 1] - volts[k]))
         ohmic_v = self.current_a[drone] * self._resistance_ohm[drone]
         self.voltage_v[drone] = open_v - ohmic_v

@@ -6,10 +6,13 @@ Pure functions of numbers; `fleet.battery` keeps the state of the packs.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from sortie.scenarios.plugins.reference import PluginError, checked_array, name_of, resolve
 from sortie.scenarios.schema import Battery
 
 Array = npt.NDArray[np.float64]
@@ -126,6 +129,72 @@ _grid_soc = np.linspace(0.0, 1.0, 8 * STEPS + 1)
 _soc_by_energy = np.interp(np.linspace(0.0, 1.0, STEPS + 1), energy_fraction(_grid_soc), _grid_soc)
 SOC_TABLE: list[float] = [*_soc_by_energy.tolist(), 1.0]  # one more, so that a full pack needs no special case
 CELL_TABLE: list[float] = [*open_circuit_cell_v(_soc_by_energy).tolist(), _CELL_V[-1]]
+
+
+class OwnCell(Protocol):
+    """A cell of one's own, `fleet.battery.cell_model`. Keyword-only arguments are its parameters.
+
+    Example, a cell whose voltage rises evenly:
+
+    >>> def straight(soc, *, empty_v=3.0, full_v=4.2):
+    ...     return empty_v + (full_v - empty_v) * soc
+    """
+
+    def __call__(self, soc: Array) -> npt.ArrayLike:
+        """Voltage at rest by state of charge 0 … 1, [K] → [K] V, above 0 and nowhere falling."""
+
+
+class CellCurve(NamedTuple):
+    """A cell at rest."""
+
+    soc: list[float]
+    """By the share of the energy that is left, on a grid of `STEPS` even steps and one more."""
+    volts: list[float]
+    energy_fraction: Callable[[npt.ArrayLike], Array]
+    """Share of a full cell's energy by state of charge."""
+    open_circuit_v: Callable[[npt.ArrayLike], Array]
+
+
+LIPO = CellCurve(SOC_TABLE, CELL_TABLE, energy_fraction, open_circuit_cell_v)
+
+
+def own_cell_v(model: OwnCell, soc: Array) -> Array:
+    """What a cell of one's own gives at charges [K] in ascending order, V, checked.
+
+    Raises:
+        PluginError: it fails, or returns another shape, no voltage or a falling one.
+    """
+    volts = checked_array("cell", model, soc.shape, soc.copy())
+    if volts.min() <= 0.0:
+        k = int(volts.argmin())
+        raise PluginError(f"cell {name_of(model)}: {volts[k]:g} V at a charge of {soc[k]:.3f}, must be above 0")
+    steps = np.diff(volts)
+    if (steps < 0.0).any():
+        k = int(steps.argmin())
+        fall = f"falls from {volts[k]:.6g} to {volts[k + 1]:.6g} V at a charge of {soc[k]:.3f}"
+        raise PluginError(f"cell {name_of(model)}: {fall}, must not fall as the charge rises")
+    return volts
+
+
+def cell_curve(pack: Battery) -> CellCurve:
+    """The cell that a pack names.
+
+    Raises:
+        PluginError: a cell of one's own that is not there, fails, or has no voltage or a falling one somewhere.
+    """
+    if pack.cell_model == "lipo":
+        return LIPO
+    soc = _grid_soc
+    volts = own_cell_v(resolve("cell", pack.cell_model, pack.cell_params), soc)
+    energy = np.concatenate([[0.0], np.cumsum((volts[1:] + volts[:-1]) / 2)])
+    share = energy / energy[-1]
+    by_energy = np.interp(np.linspace(0.0, 1.0, STEPS + 1), share, soc)
+    return CellCurve(
+        [*by_energy.tolist(), 1.0],
+        [*np.interp(by_energy, soc, volts).tolist(), float(volts[-1])],
+        lambda at: np.interp(np.asarray(at, dtype=float), soc, share),
+        lambda at: np.interp(np.asarray(at, dtype=float), soc, volts),
+    )
 
 
 def terminal_voltage_v(time_s: Array, current_a: Array, pack: Battery, soc: float) -> Array:

@@ -75,3 +75,34 @@ def compass_deg(yaw: npt.ArrayLike) -> Array:
     """Compass heading [...] (0 north, 90 east, clockwise, [0, 360)) of ENU yaws in radians."""
     heading = np.mod(90.0 - np.degrees(np.asarray(yaw, dtype=float)), 360.0)
     return np.where(heading >= 360.0, 0.0, heading)  # np.mod may round a tiny negative up to 360
+
+
+def tangent_plane_m(fixes: npt.ArrayLike, origin: npt.ArrayLike) -> Array:
+    """Places on the globe as ENU metres on the plane that touches the WGS-84 ellipsoid at an origin, [K, 3].
+
+    Exact at any distance, by earth-centred coordinates. The plane rises above the ground by d²/12,700 km.
+
+    Args:
+        fixes: [K, 3] latitude and longitude in degrees, height in metres.
+        origin: the same of one place.
+
+    Example:
+        >>> tangent_plane_m([(42.002581974, -81.997751960, 1139.7018)], (42.0, -82.0, 200.0)).round(2).tolist()
+        [[186.28, 286.84, 939.69]]
+    """
+    at, zero = np.asarray(fixes, dtype=float), np.asarray(origin, dtype=float)
+    latitude, longitude = np.radians(zero[:2])
+    sin, cos, sine, cosine = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
+    x, y, z = np.moveaxis(_earth_centred_m(at) - _earth_centred_m(zero), -1, 0)
+    outward = cosine * x + sine * y
+    return np.stack([cosine * y - sine * x, cos * z - sin * outward, sin * z + cos * outward], axis=-1)
+
+
+def _earth_centred_m(fixes: Array) -> Array:
+    """Earth-centred, earth-fixed coordinates [..., 3] of latitudes and longitudes in degrees and heights."""
+    a, e2 = 6378137.0, 6.69437999014e-3
+    latitude, longitude = np.radians(fixes[..., 0]), np.radians(fixes[..., 1])
+    normal_m = a / np.sqrt(1.0 - e2 * np.sin(latitude) ** 2)
+    out = (normal_m + fixes[..., 2]) * np.cos(latitude)
+    up = (normal_m * (1.0 - e2) + fixes[..., 2]) * np.sin(latitude)
+    return np.stack([out * np.cos(longitude), out * np.sin(longitude), up], axis=-1)

@@ -18,10 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from sortie.fleet.flight.frames import up_vector, yaw_rad
 from sortie.fleet.flight.noise import LAGS, GaussMarkov, Smooth
-from sortie.fleet.flight.route import frame_path
+from sortie.fleet.flight.ways import raised, route_path, ways_of
 from sortie.scenarios import schema, scratch
 from sortie.scenarios.errors import SortieError
-from sortie.scenarios.formation import slots
 from sortie.scenarios.streams import stream
 
 Array = npt.NDArray[np.float64]
@@ -134,10 +133,11 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
 
     Raises:
         MotionError: the asked motion needs thrust that points downwards.
+        PluginError: a mobility model that is not there, fails, or cannot be flown.
     """
     n = fleet.drones
     frames = max(1, math.ceil(round(duration_s / frame_s, 9)))
-    flight = _Flight(fleet, frame_s, seed, replication)
+    flight = _Flight(fleet, frames, frame_s, seed, replication)
     shapes = shapes_of(n)
     whole = {name: scratch.empty((frames, *shape)) for name, shape in shapes.items()}
     for rows in scratch.blocks(frames, 8 * sum(math.prod(shape) for shape in shapes.values())):
@@ -163,9 +163,10 @@ def shapes_of(drones: int) -> dict[str, tuple[int, ...]]:
 class _Flight:
     """A formation on its route, block after block."""
 
-    def __init__(self, fleet: schema.Fleet, frame_s: float, seed: int, replication: int) -> None:
+    def __init__(self, fleet: schema.Fleet, frames: int, frame_s: float, seed: int, replication: int) -> None:
         self._fleet, config, drones = fleet, fleet.motion, range(fleet.drones)
-        self._slot = slots(fleet.formation.shape, fleet.drones, fleet.formation.spacing_m)
+        self._ways = ways_of(fleet, frames, frame_s, seed, replication)
+        self._standing = [station.drone for station in fleet.ground]
         self._streams = {
             purpose: [stream(seed, replication, i, purpose) for i in drones]
             for purpose in ("pose_jitter", "gust", "pose_error", "heading_error")
@@ -181,25 +182,18 @@ class _Flight:
 
     def block(self, time_s: Array) -> dict[str, Array]:
         """The next frames, by the names of `Trajectories`; all but the body rates."""
-        fleet, config, slot, frames = self._fleet, self._fleet.motion, self._slot, len(time_s)
-        path = frame_path(
-            fleet.route.waypoints_m, fleet.route.speed_mps, fleet.route.turn_time_s, fleet.formation.spacing_m, time_s
-        )
+        fleet, config, frames = self._fleet, self._fleet.motion, len(time_s)
+        path = route_path(fleet.formation, fleet.route, time_s)
+        position, velocity, acceleration = states = [np.empty((frames, fleet.drones, 3)) for _ in range(3)]
+        heading = np.empty((frames, fleet.drones))
+        jitter = [np.moveaxis(v, -1, 1) for v in self._jitter.block(self._draws("pose_jitter", frames, LAGS, 3))]
+        for flown, way in self._ways:
+            of, nominal = (slice(None), list(flown)), way.at(time_s)
+            heading[of] = nominal.yaw_rad
+            offsets = [v[of] for v in jitter]
+            for state, held, offset in zip(states, nominal.states, _swaying(offsets, nominal.sway), strict=True):
+                state[of] = held + offset
 
-        # the virtual structure: p + R(ψ)·s and its two time derivatives, [T, N, 3]
-        cos, sin = np.cos(path.yaw_rad)[:, None], np.sin(path.yaw_rad)[:, None]
-        arm = np.stack([cos * slot[:, 0] - sin * slot[:, 1], sin * slot[:, 0] + cos * slot[:, 1]], axis=-1)
-        across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
-        rate, rate_change = path.yaw_rate_radps[:, None, None], path.yaw_acceleration_radps2[:, None, None]
-        position = _raise(path.position_m[:, None] + arm, np.array(fleet.altitudes_m))
-        velocity = _raise(path.velocity_mps[:, None] + rate * across)
-        acceleration = _raise(path.acceleration_mps2[:, None] + rate_change * across - rate**2 * arm)
-
-        offsets = self._jitter.block(self._draws("pose_jitter", frames, LAGS, 3))
-        position, velocity, acceleration = (
-            held + np.moveaxis(offset, -1, 1)
-            for held, offset in zip((position, velocity, acceleration), offsets, strict=True)
-        )
         gusts = self._gusts.block(self._draws("gust", frames, 3))
         wind = np.array([*config.wind_mps, 0.0]) + np.moveaxis(gusts, -1, 1)
 
@@ -212,7 +206,7 @@ class _Flight:
                 f"{config.pose_jitter_m:g} within pose_jitter_time_s {config.pose_jitter_time_s:g} or gust_sigma_mps "
                 f"{config.gust_sigma_mps:g} cannot be flown"
             )
-        quaternion = attitude(thrust, np.broadcast_to(path.yaw_rad[:, None], thrust.shape[:2]))
+        quaternion = attitude(thrust, heading)
         before = quaternion[:1] if self._before is None else self._before[None]
         quaternion = _continuous(np.concatenate([before, quaternion]))[1:]
         self._before = quaternion[-1]
@@ -222,6 +216,9 @@ class _Flight:
         error = self._pose_error.block(self._draws("pose_error", frames, 2))
         est_position[..., :2] += np.moveaxis(error, -1, 1)
         est_yaw = yaw + self._heading_error.block(self._draws("heading_error", frames))
+        for i in self._standing:  # level, whatever the wind, and surveyed
+            quaternion[:, i], yaw[:, i], est_yaw[:, i] = (0.0, 0.0, 0.0, 1.0), 0.0, 0.0
+            est_position[:, i] = position[:, i]
         return {
             "time_s": time_s,
             "position_m": position,
@@ -232,9 +229,17 @@ class _Flight:
             "yaw_rad": yaw,
             "est_position_m": est_position,
             "est_yaw_rad": np.mod(est_yaw + np.pi, 2 * np.pi) - np.pi,
-            "frame_position_m": _raise(path.position_m, fleet.formation.altitude_m),
+            "frame_position_m": raised(path.position_m, fleet.formation.altitude_m),
             "frame_yaw_rad": path.yaw_rad,
         }
+
+
+def _swaying(jitter: list[Array], sway: tuple[Array, Array, Array] | None) -> list[Array]:
+    """Offsets from the nominal place, and their two derivatives, of drones that have a share of their jitter."""
+    if sway is None:
+        return jitter
+    (x, v, a), (f, rate, change) = jitter, (each[..., None] for each in sway)
+    return [f * x, f * v + rate * x, f * a + 2 * rate * v + change * x]
 
 
 def body_rates(quaternion_xyzw: Array, step_s: float) -> Array:
@@ -254,9 +259,3 @@ def _continuous(quaternion: Array) -> Array:
     flips[flips == 0] = 1.0
     quaternion[1:] *= np.cumprod(flips, axis=0)[..., None]
     return quaternion
-
-
-def _raise(ground: Array, height: float | Array = 0.0) -> Array:
-    """[..., 2] to [..., 3], to one height or to one for each of the last axis but one."""
-    up = np.broadcast_to(height, ground.shape[:-1])
-    return np.concatenate([ground, up[..., None]], axis=-1)

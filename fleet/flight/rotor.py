@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from sortie.fleet.flight.motion import Trajectories, air_speed_mps
 from sortie.scenarios import scratch
-from sortie.scenarios.plugins.reference import PluginError, checked_call, name_of, resolve
+from sortie.scenarios.plugins.reference import PluginError, checked_array, name_of, resolve
 from sortie.scenarios.schema import Airframe, Fleet
 
 Array = npt.NDArray[np.float64]
@@ -128,24 +128,27 @@ class PowerModel(Protocol):
 
 
 def fleet_power_w(fleet: Fleet, motion: Trajectories) -> Array:
-    """Power at the rotors of every drone in every frame, W [T, N], by the airframes' models and payloads.
+    """Power at the rotors of every drone in every frame, W [T, N], by the airframes' models and payloads; a ground
+    station has none.
 
     Raises:
         PluginError: a power model of one's own that is not there, fails, or returns something else.
     """
+    standing = [station.drone for station in fleet.ground]
     machines = [(a.model_copy(update={"payload_kg": 0.0}), a.payload_kg) for a in fleet.airframes]
     power_w = scratch.empty(motion.position_m.shape[:2])
     distinct: list[Airframe] = []
-    for airframe, _ in machines:
-        if airframe not in distinct:
+    for i, (airframe, _) in enumerate(machines):
+        if airframe not in distinct and i not in standing:
             distinct.append(airframe)
+    power_w[:, standing] = 0.0
     for airframe in distinct:
-        of = [i for i, (a, _) in enumerate(machines) if a == airframe]
+        of = [i for i, (a, _) in enumerate(machines) if a == airframe and i not in standing]
         mass_kg = airframe.mass_kg + np.array([machines[i][1] for i in of])
         if airframe.power_model not in ("level", "momentum"):  # asked once: it may look at the whole flight
             model = resolve("power", airframe.power_model, airframe.power_params)
             air_mps, climb_mps = (motion.velocity_mps - motion.wind_mps)[:, of], motion.velocity_mps[:, of, 2]
-            power_w[:, of] = _own_power_w(model, air_mps, motion.acceleration_mps2[:, of], climb_mps, mass_kg)
+            power_w[:, of] = own_power_w(model, air_mps, motion.acceleration_mps2[:, of], climb_mps, mass_kg)
             continue
         for rows in scratch.blocks(len(power_w), motion.velocity_mps[0].nbytes):
             velocity_mps, wind_mps = motion.velocity_mps[rows][:, of], motion.wind_mps[rows][:, of]
@@ -159,17 +162,11 @@ def fleet_power_w(fleet: Fleet, motion: Trajectories) -> Array:
     return power_w
 
 
-def _own_power_w(
-    model: PowerModel, air_mps: Array, acceleration_mps2: Array, climb_mps: Array, mass_kg: Array
-) -> Array:
+def own_power_w(model: PowerModel, air_mps: Array, acceleration_mps2: Array, climb_mps: Array, mass_kg: Array) -> Array:
     """What a power model of one's own returns, checked."""
-    given = checked_call("power", model, air_mps, acceleration_mps2, climb_mps.copy(), mass_kg)
-    power_w = np.asarray(given, dtype=float)
-    if power_w.shape != climb_mps.shape:
-        raise PluginError(f"power {name_of(model)}: returns shape {power_w.shape}, must be {climb_mps.shape}")
-    wrong = ~(np.isfinite(power_w) & (power_w >= 0.0))
-    if wrong.any():
-        raise PluginError(f"power {name_of(model)}: returns {power_w[wrong][0]:g} W, must be finite and ≥ 0")
+    power_w = checked_array("power", model, climb_mps.shape, air_mps, acceleration_mps2, climb_mps.copy(), mass_kg)
+    if (power_w < 0.0).any():
+        raise PluginError(f"power {name_of(model)}: returns {power_w.min():g} W, must be ≥ 0")
     return power_w
 
 

@@ -84,10 +84,7 @@ def frame_path(
     ramp, step, slope = spread(time_s[:, None] - jump_s, turn_time_s)
 
     course = np.arctan2(legs[:, 1], legs[:, 0])
-    turn = np.diff(course)
-    turn = turn - 2 * np.pi * np.ceil((turn - np.pi) / (2 * np.pi))  # into (−π, π]
-    yaw_rate = min(MAX_YAW_RATE_RADPS, MAX_RING_SPEED_MPS / spacing_m)
-    width_s = np.maximum(turn_time_s, _PEAK * np.abs(turn) / yaw_rate)
+    turn, width_s = turns(course, turn_time_s, spacing_m)
     since_s = time_s[:, None] - jump_s[:-1]
     _, turned, turning = spread(since_s, width_s)
     return FramePath(
@@ -98,6 +95,14 @@ def frame_path(
         yaw_rate_radps=_sums(turning, turn),
         yaw_acceleration_radps2=_sums(bend(since_s, width_s), turn),
     )
+
+
+def turns(course_rad: Array, turn_time_s: float, spacing_m: float) -> tuple[Array, Array]:
+    """Between headings flown in turn: by how much the formation turns, within (−π, π], and over what time (s)."""
+    turn = np.diff(course_rad)
+    turn = turn - 2 * np.pi * np.ceil((turn - np.pi) / (2 * np.pi))
+    yaw_rate = min(MAX_YAW_RATE_RADPS, MAX_RING_SPEED_MPS / spacing_m)
+    return turn, np.maximum(turn_time_s, _PEAK * np.abs(turn) / yaw_rate)
 
 
 def bend(since_s: Array, width_s: Array | float) -> Array:

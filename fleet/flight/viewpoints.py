@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sortie.fleet.flight.motion import MotionError
-from sortie.fleet.flight.route import FramePath, bend, frame_path, spread
+from sortie.fleet.flight.route import FramePath, bend, spread
+from sortie.fleet.flight.ways import route_path
 from sortie.scenarios import schema
 from sortie.scenarios.formation import slots
 
@@ -89,7 +90,7 @@ class Course:
 
     time_s: Array  # [T]
     path: FramePath
-    slot_m: Array  # [N, 2]
+    slot_m: Array  # [N, 2]; NaN for drones outside of the formation
 
     def world_m(self, places_m: Array, frames: slice = slice(None)) -> Array:
         """Places [..., 2] of the formation's frame, one for every frame, on the ground, ENU."""
@@ -122,11 +123,14 @@ def course_of(fleet: schema.Fleet, time_s: Array) -> Course:
     Raises:
         MotionError: a slot's own way leaves the fence.
     """
-    formation, route = fleet.formation, fleet.route
-    path = frame_path(route.waypoints_m, route.speed_mps, route.turn_time_s, formation.spacing_m, time_s)
-    course = Course(time_s, path, slots(formation.shape, fleet.drones, formation.spacing_m))
+    formation, members = fleet.formation, list(fleet.in_formation) if fleet.mobility == "formation" else []
+    slot_m = np.full((fleet.drones, 2), np.nan)
+    if members:
+        slot_m[members] = slots(formation.shape, len(members), formation.spacing_m)
+    course = Course(time_s, route_path(formation, fleet.route, time_s), slot_m)
     bounds = bounds_of(fleet)
-    for drone, slot in enumerate(course.slot_m):
+    for drone in members:
+        slot = slot_m[drone]
         if not fenced(course, bounds, drone, (), 0):
             x, y = course.world_m(slot[None])[first_outside(course.world_m(slot[None]), bounds)]
             raise MotionError(

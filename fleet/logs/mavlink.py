@@ -79,6 +79,8 @@ class Telemetry:
     cpu_load: float
     """0 … 1."""
     landed: bool
+    ground_station: bool = False
+    """Whether it is no vehicle."""
 
 
 def geodetic(position_m: tuple[float, float, float], origin: Origin) -> tuple[float, float, float]:
@@ -118,11 +120,12 @@ def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]
     latitude, longitude, altitude = geodetic(state.position_m, origin)
     heading = round(float(compass_deg(yaw_rad(state.orientation_xyzw))) * 100) % 36000
     charge, current_ca = round(state.soc * 100), _fitting(state.current_a * 100)
+    station = state.ground_station
     return [
         mavlink2.MAVLink_heartbeat_message(
-            mavlink2.MAV_TYPE_QUADROTOR,
-            mavlink2.MAV_AUTOPILOT_GENERIC,
-            0 if state.landed else mavlink2.MAV_MODE_FLAG_SAFETY_ARMED | mavlink2.MAV_MODE_FLAG_AUTO_ENABLED,
+            mavlink2.MAV_TYPE_GCS if station else mavlink2.MAV_TYPE_QUADROTOR,
+            mavlink2.MAV_AUTOPILOT_INVALID if station else mavlink2.MAV_AUTOPILOT_GENERIC,
+            0 if state.landed or station else mavlink2.MAV_MODE_FLAG_SAFETY_ARMED | mavlink2.MAV_MODE_FLAG_AUTO_ENABLED,
             0,
             mavlink2.MAV_STATE_STANDBY if state.landed else mavlink2.MAV_STATE_ACTIVE,
             3,
@@ -151,7 +154,7 @@ def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]
         ),
         mavlink2.MAVLink_extended_sys_state_message(
             mavlink2.MAV_VTOL_STATE_UNDEFINED,
-            mavlink2.MAV_LANDED_STATE_ON_GROUND if state.landed else mavlink2.MAV_LANDED_STATE_IN_AIR,
+            mavlink2.MAV_LANDED_STATE_ON_GROUND if state.landed or station else mavlink2.MAV_LANDED_STATE_IN_AIR,
         ),
         mavlink2.MAVLink_battery_status_message(
             0,

@@ -8,13 +8,31 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, fields, replace
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 Allocation = Literal["uniform", "overlap"]
 CellsBy = Literal["confidence", "norm"]
 Unsent = Literal["zero", "masked"]
+Absent = Literal["excluded", "zeros"]
+Serve = Literal["grid", "region_first"]
 _PEERS = re.compile(r"none|(all|best|worst|random)-([1-9]\d?)")
-_ALLOWED = {"allocation": get_args(Allocation), "cells_by": get_args(CellsBy), "unsent": get_args(Unsent)}
+_ALLOWED = {
+    "allocation": get_args(Allocation),
+    "cells_by": get_args(CellsBy),
+    "unsent": get_args(Unsent),
+    "absent": get_args(Absent),
+}
+
+
+class Ways(NamedTuple):
+    """What an instrument does with peers that were not chosen, and which cells it sends first."""
+
+    absent: Absent = "excluded"
+    serve: Serve = "grid"
+    """All cells by rank, or those of the mission's disc before all others."""
+
+
+PAPER_WAYS = Ways()
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +55,8 @@ class Sharing:
     """A cell that was not sent takes part in the fusion as zeros, or is left out (masked)."""
     roi: bool = False
     """Whether cells in the mission's disc come before all others."""
+    absent: Absent = "excluded"
+    """A peer that was not chosen has no part in the fusion, or takes part as zeros wherever its grid reaches."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.received_budget <= 1.0:
@@ -71,7 +91,11 @@ class Sharing:
             if float(f"{self.received_budget:g}") == self.received_budget
             else repr(self.received_budget)
         )
-        marks = [str(getattr(self, f.name)) for f in fields(self)[2:5] if getattr(self, f.name) != f.default]
+        marks = [
+            str(getattr(self, f.name))
+            for f in fields(self)
+            if f.name in _ALLOWED and getattr(self, f.name) != f.default
+        ]
         return ",".join([f"{self.peers}@{budget}", *marks, *(["roi"] if self.roi else [])])
 
     @classmethod
@@ -106,6 +130,8 @@ class Sharing:
             out = replace(out, peers=f"all-{others}")
         if out.k and out.received_budget * others >= out.k:
             out = replace(out, allocation="uniform", cells_by="confidence", roi=False)
+        if out.unsent == "masked" or out.k in (0, others):
+            out = replace(out, absent="excluded")
         if out.received_budget == 0.0 and out.unsent == "masked":
             return SINGLE
         return out

@@ -199,6 +199,10 @@ def exchanges(
                 sent = orders[which][list(peers)] < np.array(count)[:, None, None]
             else:
                 sent = np.zeros((len(peers), CELLS, CELLS), np.bool_)
+            if c.absent == "zeros":
+                rest = tuple(i for i in range(drones) if i != ego and i not in peers)
+                peers, count = (*peers, *rest), [*count, *[0] * len(rest)]
+                sent = np.concatenate([sent, np.zeros((len(rest), CELLS, CELLS), np.bool_)])
             out.append((Exchange(ego, peers, sent, c.unsent), count))
     return out
 

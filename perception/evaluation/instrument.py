@@ -20,6 +20,7 @@ from sortie.perception.network.fusion.base import PerCell
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
 from sortie.perception.network.warp import Support, arriving, rows, support
+from sortie.scenarios.schema.base import Params
 
 CPU = torch.device("cpu")
 BATCH = 5
@@ -29,16 +30,19 @@ BATCH = 5
 class CarNetInstrument:
     """A network on frames that carry `images` uint8 [n, d, 4, 256, 256]."""
 
-    def __init__(self, net: CarNet, device: torch.device = CPU) -> None:
-        self.fingerprint = fingerprint(net)
+    def __init__(self, net: CarNet, device: torch.device = CPU, fusion_params: Params | None = None) -> None:
+        """Args: `fusion_params` change how the network's fusion mixes (`Fusion.tune`)."""
+        params = fusion_params or {}
+        net.fusion.tune(**params)
+        self.fingerprint = fingerprint(net) + "".join(f" {k}={v!r}" for k, v in sorted(params.items()))
         self.geometry: Geometry = net.config.geometry
         self._device = device
         self._net = folded(net).to(device)
 
     @classmethod
-    def load(cls, weights: Path, device: torch.device = CPU) -> CarNetInstrument:
+    def load(cls, weights: Path, device: torch.device = CPU, fusion_params: Params | None = None) -> CarNetInstrument:
         """From a weights file; ValueError where it is missing or does not fit."""
-        return cls(load_weights(weights), device)
+        return cls(load_weights(weights), device, fusion_params)
 
     def start_worker(self) -> None:
         """For a thread of `evaluate`: frames side by side, each in one thread, beat two threads in every operation."""

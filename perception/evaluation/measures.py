@@ -13,7 +13,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing, Unsent
+from sortie.perception.evaluation.condition import FULL_SHARING, PAPER_WAYS, SINGLE, CellsBy, Sharing, Unsent, Ways
 from sortie.perception.evaluation.verdict import MeasuredValue
 from sortie.scenarios.intervals import p_value, percentile_interval
 
@@ -295,10 +295,12 @@ Counted = FleetFrameBytes | UnequalBytes
 Measure = Accuracy | Counted | Elsewhere
 
 
-def under(condition: Sharing, unsent: Unsent, cells_by: CellsBy = "confidence") -> Sharing:
+def under(condition: Sharing, unsent: Unsent, cells_by: CellsBy = "confidence", ways: Ways = PAPER_WAYS) -> Sharing:
     """A claim's condition under another instrument; unchanged where every cell is sent, or none."""
-    everything = condition.peers == "none" or (condition.rule == "all" and condition.received_budget >= 1.0)
-    return condition if everything else replace(condition, unsent=unsent, cells_by=cells_by)
+    if condition.peers == "none" or (condition.rule == "all" and condition.received_budget >= 1.0):
+        return condition
+    roi = condition.roi or ways.serve == "region_first"
+    return replace(condition, unsent=unsent, cells_by=cells_by, absent=ways.absent, roi=roi)
 
 
 def best(conditions: Sequence[Sharing], region: Region, scores: Scores) -> Sharing:

@@ -35,7 +35,9 @@ def measure(
         workers: frames worked on side by side; the numbers do not depend on it.
         progress: called with frames done and frames in all.
     """
-    every = dict.fromkeys(under(c, unsent, settings.cells_by) for unsent in settings.unsent for c in conditions())
+    every = dict.fromkeys(
+        under(c, unsent, settings.cells_by, settings.ways) for unsent in settings.unsent for c in conditions()
+    )
     regions: tuple[Region, ...] = ("full", "mission", "ego")
     found = evaluate(instrument, frames, tuple(every), regions=regions, store=store, workers=workers, progress=progress)
     return TableResults(found, settings)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sortie.perception.evaluation.condition import CellsBy, Unsent
+from sortie.perception.evaluation.condition import PAPER_WAYS, CellsBy, Unsent, Ways
 from sortie.perception.evaluation.matched import FLOOR, Evaluation
 from sortie.perception.evaluation.scores import Bootstrap, By
 from sortie.scenarios.intervals import DRAWS
@@ -31,6 +31,7 @@ class TableSettings:
     by: By = "frame"
     """What the bootstrap resamples."""
     draws: int = DRAWS
+    ways: Ways = PAPER_WAYS
 
     def __post_init__(self) -> None:
         if not self.unsent:
@@ -63,6 +64,7 @@ class TableResults:
                 disc=disc,
                 by=self.settings.by,
                 draws=self.settings.draws,
+                ways=self.settings.ways,
             )
         return self._made[key]
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from sortie.perception.evaluation.condition import CellsBy, Sharing, Unsent
+from sortie.perception.evaluation.condition import PAPER_WAYS, CellsBy, Sharing, Unsent, Ways
 from sortie.perception.evaluation.matched import Evaluation
 from sortie.perception.evaluation.matched import Region as Evaluated
 from sortie.perception.evaluation.measures import Floats, Region, under
@@ -22,8 +22,9 @@ class Bootstrap:
     """Bootstrapped APs of an evaluation at its threshold, for the paper's conditions under one way to fuse.
 
     Args:
-        evaluation: it has to hold the conditions with `unsent` and `cells_by` put in.
+        evaluation: it has to hold the conditions with `unsent`, `cells_by` and `ways` put in.
         unsent, cells_by: what a cell that was not sent counts as, and what ranks cells.
+        ways: what peers that were not chosen count as, and which cells are sent first.
         disc: which of the evaluation's regions answers for the mission.
         by: what is resampled: frames, or whole scenes.
         draws: resamples, and as many random splits into halves.
@@ -42,10 +43,11 @@ class Bootstrap:
         by: By = "frame",
         draws: int = DRAWS,
         seed: int = 0,
+        ways: Ways = PAPER_WAYS,
     ) -> None:
         if (convention := evaluation.settings.convention) != "rotated":
             raise ValueError(f"the evaluation's convention is {convention!r}, must be 'rotated' to be resampled")
-        self._evaluation, self._unsent, self._cells_by = evaluation, unsent, cells_by
+        self._evaluation, self._unsent, self._cells_by, self._ways = evaluation, unsent, cells_by, ways
         self._disc, self._by = disc, by
         self._draws, self._seed = draws, seed
         self._ranked: dict[tuple[Sharing, Evaluated], Ranked] = {}
@@ -74,7 +76,7 @@ class Bootstrap:
         return per_frame
 
     def _under(self, condition: Sharing) -> Sharing:
-        return under(condition, self._unsent, self._cells_by)
+        return under(condition, self._unsent, self._cells_by, self._ways)
 
     def _get(self, condition: Sharing, region: Region) -> tuple[float, Floats]:
         key = self._key(condition, region)

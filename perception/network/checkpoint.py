@@ -13,8 +13,10 @@ from safetensors.torch import load_file, save_file
 
 from sortie.perception.errors import InputError
 from sortie.perception.files import replacing
+from sortie.perception.network.fusion.base import Fusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.model import CarNet, ModelConfig
+from sortie.scenarios.plugins.reference import installed, is_file
 
 
 def save_weights(net: CarNet, path: Path, facts: dict[str, Any] | None = None) -> None:
@@ -26,14 +28,25 @@ def save_weights(net: CarNet, path: Path, facts: dict[str, Any] | None = None) -
         part.chmod(0o644)  # the library makes it private
 
 
-def load_weights(path: Path) -> CarNet:
+def load_weights(path: Path, own: Fusion | None = None) -> CarNet:
     """A network in evaluation mode from a safetensors file.
+
+    Args:
+        path: the file.
+        own: a fusion of one's own. Its parameters come from the file where the file was made for such a fusion.
+            From a file for a built-in fusion only encoder and head are taken.
 
     Raises:
         InputError: naming the file, and the tensor or configuration field that is missing, unknown or of another shape.
     """
-    net = CarNet(read_config(path))
+    config = read_config(path)
+    if own is None and config.fusion not in FUSIONS:
+        raise InputError(f"{path}: made for fusion {config.fusion!r}, which perception.fusion does not name")
+    net = CarNet(config, own)
     found = load_file(path)
+    if own is not None and config.fusion in FUSIONS:
+        found = {k: v for k, v in found.items() if not k.startswith("fusion.")}
+        found |= {f"fusion.{k}": v for k, v in own.state_dict().items() if v.dtype.is_floating_point}
     wanted = {k: v for k, v in net.state_dict().items() if v.dtype.is_floating_point}
     for name, tensor in wanted.items():
         if name not in found:
@@ -58,7 +71,11 @@ def read_config(path: Path) -> ModelConfig:
             raise InputError(f"{path}: model.{name} is not known, must be one of {', '.join(known)}")
     config = ModelConfig(**given)
     for name, value, allowed in (
-        ("fusion", config.fusion, tuple(FUSIONS)),
+        (
+            "fusion",
+            config.fusion,
+            (*FUSIONS, *installed("fusion"), *([config.fusion] if is_file(config.fusion) else [])),
+        ),
         ("exchange", config.exchange, ("rectified", "signed")),
         ("decoder", config.decoder, ("shallow", "deep")),
         ("half_extent_m", config.half_extent_m, (102.4, 51.2)),

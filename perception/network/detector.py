@@ -29,7 +29,8 @@ from sortie.perception.metrics.ap import suppress
 from sortie.perception.network.bev import lift
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.decode import decode
-from sortie.perception.network.fusion.base import takes_part
+from sortie.perception.network.fusion.base import Shares, takes_part
+from sortie.perception.network.fusion.own import OwnFusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.inference import folded
 from sortie.perception.network.memory import keep_freed
@@ -51,8 +52,9 @@ __all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "shi
 
 
 def shipped(fusion: str) -> Path:
-    """The weights that a fusion flies with when the scenario names none; those without parameters of their own take DiscoNet's."""
-    return SHIPPED_WEIGHTS if FUSIONS[fusion].shares != "features" else WEIGHTS / f"{fusion}.safetensors"
+    """The weights that a fusion flies with when the scenario names none: DiscoNet's unless others are shipped for it."""
+    own = fusion not in FUSIONS or FUSIONS[fusion].shares != "features"
+    return SHIPPED_WEIGHTS if own else WEIGHTS / f"{fusion}.safetensors"
 
 
 @dataclass(slots=True)
@@ -94,10 +96,13 @@ class TorchDetector:
         self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None, replication: int = 0
     ) -> None:
         self._scene, self._config = scene, config
-        self._fusion = FUSIONS[config.fusion]
+        own = None if config.fusion in FUSIONS else OwnFusion(config.fusion, config.fusion_params)
+        self._shares: Shares = "features" if own else FUSIONS[config.fusion].shares
         path = shipped(config.fusion) if weights is None else weights
-        net = load_weights(path)
-        if self._fusion.shares == "features" and net.config.fusion != config.fusion:
+        net = load_weights(path, own)
+        if own is None:
+            net.fusion.tune(**config.fusion_params)
+        if own is None and self._shares == "features" and net.config.fusion != config.fusion:
             raise InputError(
                 f"{path}: made for fusion {net.config.fusion!r}, perception.fusion is {config.fusion!r}, must be the same"
             )
@@ -124,9 +129,9 @@ class TorchDetector:
 
     def begin(self, jobs: Jobs) -> Callable[[], list[Boxes]]:
         """Render what the jobs need and compute the rest in the background; calling the result waits for the boxes."""
-        if self._fusion.shares == "nothing":
+        if self._shares == "nothing":
             jobs = [(ego, ()) for ego, _ in jobs]
-        elif self._fusion.shares == "features":
+        elif self._shares == "features":
             jobs = [(ego, weighed(ego, shares)) for ego, shares in jobs]
         seen = [c for ego, shares in jobs for c in (ego, *(s.capture for s in shares if s.is_map or s.is_detected))]
         known = self._encode([c for c in seen if c.looked])
@@ -139,7 +144,7 @@ class TorchDetector:
                 self._look_alone(capture)
             else:
                 self._head_alone(capture)
-        if self._fusion.shares == "boxes":
+        if self._shares == "boxes":
             for share in shared:
                 if share.is_map:
                     self._head_in_part(share, known)
@@ -255,7 +260,7 @@ class TorchDetector:
         return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing))[None]
 
     def _is_fused(self, share: Share) -> bool:
-        return self._fusion.shares == "features" and share.is_map
+        return self._shares == "features" and share.is_map
 
     def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
@@ -340,7 +345,7 @@ class TorchDetector:
 
     def _sendable(self, boxes: Boxes) -> Boxes:
         """Those of a drone's boxes that it sends: in late fusion only confident ones."""
-        return sendable(boxes) if self._fusion.shares == "boxes" else boxes
+        return sendable(boxes) if self._shares == "boxes" else boxes
 
     def _head_in_part(self, share: Share, known: Known) -> None:
         """The head's output from the cells that were sent, computed once per capture and budget."""

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from sortie.perception.geometry import CHANNELS, Geometry
 from sortie.perception.network.bev import ground_points
+from sortie.perception.network.fusion.base import Fusion
 from sortie.perception.network.fusion.registry import FUSIONS
 
 COLOUR_MEAN, COLOUR_GAIN = 0.42, 4.0
@@ -26,7 +27,7 @@ class ModelConfig:
 
     half_extent_m: float = 102.4
     fusion: str = "disconet"
-    """A name of `fusion.registry.FUSIONS`."""
+    """A name of `fusion.registry.FUSIONS`, or what names one of one's own."""
     exchange: Literal["rectified", "signed"] = "rectified"
     """Whether features are ≥ 0 where they are exchanged, or go there before the last non-linearity."""
     decoder: Literal["shallow", "deep"] = "shallow"
@@ -152,16 +153,20 @@ class DeepTrunk(nn.Module):
 class CarNet(nn.Module):
     """Encoder, fusion and head; about 0.27 M parameters as shipped.
 
+    Args:
+        config: what it is built as.
+        fusion: a fusion in place of the built-in one that `config` names.
+
     Raises:
         ValueError: a fusion that is not there, naming those that are.
     """
 
-    def __init__(self, config: ModelConfig = ModelConfig()) -> None:
+    def __init__(self, config: ModelConfig = ModelConfig(), fusion: Fusion | None = None) -> None:
         super().__init__()
-        if config.fusion not in FUSIONS:
+        if fusion is None and config.fusion not in FUSIONS:
             raise ValueError(f"fusion is {config.fusion!r}, must be one of {', '.join(FUSIONS)}")
         self.config = config
         self.encoder = Encoder(config)
-        self.fusion = FUSIONS[config.fusion]()
+        self.fusion = FUSIONS[config.fusion]() if fusion is None else fusion
         self.head = Head(config)
         nn.Module.to(self, memory_format=torch.channels_last)  # type: ignore[call-overload]  # a third faster on a CPU

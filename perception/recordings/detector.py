@@ -46,7 +46,7 @@ class RecordedDetector:
     def __init__(self, config: Perception) -> None:
         self._recording = rec = open_recording(Path(config.recording or ""))
         self._config = config
-        self._fuse = None if config.recorded_fusion is None else resolve("fusion", config.recorded_fusion)
+        self._fuse = None if config.recorded_fusion is None else resolve("recorded_fusion", config.recorded_fusion)
         scenes = len(set(rec.scene.tolist()))
         if scenes > 1:
             raise RecordingError(f"{rec.path}: scene names {scenes} scenes, must be one to be flown")

@@ -59,7 +59,7 @@ class RecordedInstrument:
     def __init__(self, recording: Recording, fusion: str | None = None) -> None:
         self.geometry = recording.geometry
         self._recording = recording
-        self._fuse: Fuse | None = None if fusion is None else resolve("fusion", fusion)
+        self._fuse: Fuse | None = None if fusion is None else resolve("recorded_fusion", fusion)
         if fusion is not None and "features" not in recording.large:
             raise RecordingError(f"{recording.path}: features are missing, must be there for a fusion")
         self.fingerprint = f"{content_hash(recording.path)}{fusion_hash(fusion)}"

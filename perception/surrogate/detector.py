@@ -104,6 +104,10 @@ class SurrogateDetector:
             raise InputError(
                 f"{name}: calibrated for fusion {fitted!r}, perception.fusion is {config.fusion!r}, must be that or 'none'"
             )
+        if config.fusion_params:
+            raise InputError(
+                f"perception.fusion_params: {name} was calibrated without them, must be empty for the surrogate"
+            )
         self.parameters, self.calibration = parameters, parameters.id
         self._scene, self._config = scene, config
         self._eyes = eyes or Eyes(scene)

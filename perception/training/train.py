@@ -27,6 +27,8 @@ from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, 
 from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference
 from sortie.perception.network.checkpoint import load_weights, read_config
+from sortie.perception.network.fusion.own import OwnFusion
+from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.training.learn import SHARDS, Thinning, apply, draw_batch, gradients
 from sortie.perception.training.recipe import PEAK_LR, Recipe, benchmark_root
@@ -110,7 +112,7 @@ def train(
     log.info("%d training frames in %d scenes", len(data), len(files))
 
     torch.manual_seed(recipe.seed)
-    net = CarNet(config)
+    net = CarNet(config, None if config.fusion in FUSIONS else OwnFusion(config.fusion))
     if warm_start is not None:
         _begin_from(net, warm_start, log)
     net = net.to(where).train()
@@ -194,7 +196,8 @@ def _first(frames: Frames, count: int) -> Frames:
 
 def _begin_from(net: CarNet, path: Path, log: logging.Logger) -> None:
     """Take over the tensors of `path` that the network has in the same shape."""
-    given = load_weights(path)
+    own = read_config(path).fusion not in FUSIONS and isinstance(net.fusion, OwnFusion)
+    given = load_weights(path, copy.deepcopy(net.fusion) if own else None)
     if read_config(path).geometry != net.config.geometry:
         raise ValueError(f"{path}: made for another range than ±{net.config.half_extent_m:g} m")
     mine, theirs = net.state_dict(), given.state_dict()

@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 
 from sortie.policies.contract import Descriptor, Directive, FleetView
 from sortie.policies.verification.invariants import (
-    DECISIONS,
-    WORDS,
     Binary,
     Fresh,
     Invariant,
@@ -25,6 +23,7 @@ from sortie.policies.verification.invariants import (
     Number,
     walk,
 )
+from sortie.policies.verification.words import DECISIONS, WORDS
 
 Ask = Callable[["Context", Directive], Any]
 """The value of an expression in a context, for one link."""

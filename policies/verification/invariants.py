@@ -5,9 +5,17 @@
     rate_hz <= fresh.rate_hz
 
 A line is `REQUIREMENT`, or `when CONDITION: REQUIREMENT`; `#` begins a comment. An expression has comparisons,
-`and`, `or`, `not`, `+ - * /`, numbers, and the names in `WORDS`. A line that names a property of a link must hold for
-each outgoing link. `any_link(…)`, `every_link(…)`, `count_links(…)` and `sum_links(…)` cover all links at once.
+`and`, `or`, `not`, `+ - * /`, numbers, and the names in `words.WORDS`. A line that names a property of a link must hold
+for each outgoing link. `any_link(…)`, `every_link(…)`, `count_links(…)` and `sum_links(…)` cover all links at once.
 `fresh.rate_hz` is what the same policy decides for the same link if every descriptor has age 0.
+
+Lines about time are judged on what a drone's gates enforce from decision to decision (`past`):
+
+    when human_in_region and peers >= 1: within 0.5 s: any_link(representation >= detections)
+    climbs_in(dwell) <= 1
+
+`within 0.5 s: REQUIREMENT` may be broken for up to 0.5 s without a break while the condition holds. `climbs_in(2)` is how
+often the link rose in the last 2 s, `switches_in(2)` how often it changed. `dwell` is the flight's dwell time.
 
 Python's parser reads the text. An allow-list of its nodes becomes a frozen tree. Nothing is ever executed.
 """
@@ -15,129 +23,35 @@ Python's parser reads the text. An allow-list of its nodes becomes a frozen tree
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
-from sortie.policies.contract import PERSON_FLAG, Descriptor, Directive, FleetView, Policy, Representation, TaskPhase
+from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.policies.verification.words import (
+    CHANGES,
+    CONSTANTS,
+    DECISIONS,
+    DWELL,
+    ELSEWHERE,
+    LINK_FUNCTIONS,
+    WORDS,
+    Counts,
+    Kind,
+    Scope,
+    Span,
+    link_of,
+)
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.representation import NAME_OF
-
-Kind = Literal["number", "truth"]
 
 
 class InvariantError(SortieError):
     """A text that is not an invariant; the message names the line and the part that is wrong."""
 
 
-# --- the words -----------------------------------------------------------------------------------
-
-
-class Scope(NamedTuple):
-    """The values that an expression is evaluated on: a view, all its directives, and one link if the line needs a link."""
-
-    view: FleetView
-    me: Descriptor
-    directives: Sequence[Directive]
-    fresh: Mapping[int, Directive]
-    link: Directive | None = None
-
-
-class Word(NamedTuple):
-    """A name of the language; `of_link` if it needs a link."""
-
-    about: str
-    kind: Kind
-    of_link: bool
-    value: Callable[[Scope], Any]
-    raw: Callable[..., Any] | None = None
-    """Of a directive's field: from the directive. Of a peer: from the scope and the peer's id."""
-
-
-def _view_word(about: str, value: Callable[[Scope], Any], kind: Kind = "number") -> Word:
-    return Word(about, kind, False, value)
-
-
-def _decided(about: str, value: Callable[[Directive], Any], kind: Kind = "number") -> Word:
-    return Word(about, kind, True, lambda s: value(_link(s)), value)
-
-
-def _of_peer(about: str, value: Callable[[Scope, int], Any], kind: Kind = "number") -> Word:
-    return Word(about, kind, True, lambda s: value(s, _link(s).destination), value)
-
-
-def _link(scope: Scope) -> Directive:
-    assert scope.link is not None, "the parser binds link words to a link"  # noqa: S101
-    return scope.link
-
-
-DECISIONS: dict[str, Word] = {
-    "representation": _decided("the rung: none, tracks, detections, features or raw", lambda d: d.representation),
-    "rho": _decided("share of the sender's feature cells, 0 … 1", lambda d: d.rho),
-    "rate_hz": _decided("rate, Hz", lambda d: d.rate_hz),
-    "deadline_s": _decided("deadline, s", lambda d: d.deadline_s),
-    "fusion_weight": _decided("weight at the receiver, 0 … 1", lambda d: d.fusion_weight),
-    "duty": _decided("share of frames in which perception runs, 0 … 1", lambda d: d.duty_percent / 100),
-    "roi": _decided("whether it is confined to a region", lambda d: d.roi is not None, "truth"),
-}
-"""The fields of a directive, as names of the language."""
-
-WORDS: dict[str, Word] = {
-    "battery": _view_word("the ego's state of charge, 0 … 1", lambda s: s.me.battery_soc),
-    "cpu": _view_word("the ego's CPU headroom, 0 … 1", lambda s: s.me.cpu_headroom),
-    "gpu": _view_word("the ego's GPU headroom, 0 … 1", lambda s: s.me.gpu_headroom),
-    "phase": _view_word("the ego's: transit, search, track, returning or landing", lambda s: s.me.task_phase),
-    "peers": _view_word("how many peers are attached", lambda s: len(s.view.attached.peers)),
-    "region": _view_word("the ego has a region of responsibility", lambda s: s.me.region is not None, "truth"),
-    "targets": _view_word("the ego reports priority targets", lambda s: bool(s.me.priority_target_ids), "truth"),
-    "target_in_region": _view_word(
-        "the ego has a region and reports targets, which are cars",
-        lambda s: s.me.region is not None and bool(s.me.priority_target_ids),
-        "truth",
-    ),
-    "human_in_region": _view_word(
-        "the ego has a region, and its thermal camera or an attached peer's found a person there",
-        lambda s: s.view.human_in_region,
-        "truth",
-    ),
-    "goodput_mbps": _of_peer("to the link's peer, as the ego measured it", lambda s, p: s.me.goodput_to(p)),
-    "age_s": _of_peer("age of the peer's descriptor", lambda s, p: s.view.age_s[p]),
-    "age_periods": _of_peer("the same in periods", lambda s, p: s.view.age_s[p] / s.view.period_s),
-    "peer_battery": _of_peer("the peer's state of charge, 0 … 1", lambda s, p: s.view.descriptors[p].battery_soc),
-    "human": _view_word(
-        "the ego's own thermal camera found a person in its region",
-        lambda s: s.me.novelty_flags & PERSON_FLAG != 0,
-        "truth",
-    ),
-    "peer_human": _of_peer(
-        "the peer's thermal camera found a person in the peer's region",
-        lambda s, p: s.view.descriptors[p].novelty_flags & PERSON_FLAG != 0,
-        "truth",
-    ),
-    "peer_phase": _of_peer("the peer's phase", lambda s, p: s.view.descriptors[p].task_phase),
-    "same_network": _of_peer(
-        "the peer has the ego's network, so it can fuse the ego's maps",
-        lambda s, p: s.view.shares_features_with(p),
-        "truth",
-    ),
-    **DECISIONS,
-}
-"""Every name that an invariant may use."""
-
-CONSTANTS: dict[str, int] = {name: int(r) for r, name in NAME_OF.items()} | {
-    "transit": TaskPhase.TRANSIT,
-    "search": TaskPhase.SEARCH,
-    "track": TaskPhase.TRACK,
-    "returning": TaskPhase.RETURN,  # `return` is a Python keyword
-    "landing": TaskPhase.LANDING,
-}
-LINK_FUNCTIONS: dict[str, tuple[Kind, Kind]] = {
-    "any_link": ("truth", "truth"),
-    "every_link": ("truth", "truth"),
-    "count_links": ("truth", "number"),
-    "sum_links": ("number", "number"),
-}
-"""Functions over all links: the kind of the argument, and of the result."""
+LEAST_SPAN_S, MOST_SPAN_S = 0.001, 3600.0
 
 
 # --- the tree ------------------------------------------------------------------------------------
@@ -185,7 +99,15 @@ class LinksTerm:
     body: Node
 
 
-Node = Number | Name | Fresh | Binary | Logic | LinksTerm
+@dataclass(frozen=True, slots=True)
+class Recent:
+    """How often the link changed in the last time."""
+
+    change: str
+    span: Span
+
+
+Node = Number | Name | Fresh | Binary | Logic | LinksTerm | Recent
 
 _COMPARE: dict[str, Callable[[Any, Any], Any]] = {
     "<": lambda a, b: a < b,
@@ -214,6 +136,20 @@ class Invariant:
     text: str
     when: Node | None
     then: Node
+    within: Span | None = None
+    """How long `then` may be false without a break while `when` is true; None: not at all."""
+
+    @property
+    def nodes(self) -> Iterator[Node]:
+        """All parts of the line."""
+        for top in (self.when, self.then):
+            if top is not None:
+                yield from walk(top)
+
+    @property
+    def over_time(self) -> bool:
+        """Whether it is about more than one decision."""
+        return self.within is not None or any(isinstance(n, Recent) for n in self.nodes)
 
     @property
     def of_link(self) -> bool:
@@ -223,7 +159,7 @@ class Invariant:
     @property
     def needs_fresh(self) -> bool:
         """Whether it compares with the policy's decision at age 0."""
-        return any(isinstance(n, Fresh) for top in (self.when, self.then) if top is not None for n in walk(top))
+        return any(isinstance(n, Fresh) for n in self.nodes)
 
 
 def walk(node: Node) -> Iterator[Node]:
@@ -248,7 +184,7 @@ def _children(node: Node) -> tuple[Node, ...]:
 def _needs_link(node: Node) -> bool:
     if isinstance(node, LinksTerm):
         return False  # it binds the link itself
-    if isinstance(node, Fresh):
+    if isinstance(node, Fresh | Recent):
         return True
     if isinstance(node, Name):
         return node.word in WORDS and WORDS[node.word].of_link
@@ -284,7 +220,22 @@ def _parse_line(line: str) -> Invariant:
         if not colon:
             raise InvariantError("a condition ends with a colon, as in `when battery < 0.3: rate_hz <= 2`")
         when = _parse_expression(condition)
-    return Invariant(line, when, _parse_expression(requirement))
+    within = None
+    if re.match(r"\s*within\b", requirement):
+        time, colon, requirement = requirement.strip().removeprefix("within").partition(":")
+        if not colon or (not time.strip().endswith("s") and time.strip() != DWELL):
+            raise InvariantError("a time ends with `s` and a colon, as in `within 0.5 s: representation > none`")
+        within = _span(time.strip().removesuffix("s").strip())
+    return Invariant(line, when, _parse_expression(requirement), within)
+
+
+def _span(text: str) -> Span:
+    """A time as it is written: `0.5`, or `dwell`."""
+    if text == DWELL:
+        return DWELL
+    if not re.fullmatch(r"\d+(\.\d*)?|\.\d+", text) or not LEAST_SPAN_S <= float(text) <= MOST_SPAN_S:
+        raise InvariantError(f"the time {text!r} must be in [{LEAST_SPAN_S:g}, {MOST_SPAN_S:g}] s, or {DWELL}")
+    return float(text)
 
 
 def _parse_expression(text: str) -> Node:
@@ -310,7 +261,8 @@ def _to_node(tree: ast.expr) -> Node:
                 return Number(CONSTANTS[word])
             if word in WORDS:
                 return Name(word)
-            raise InvariantError(f"unknown word {word!r}, known: {', '.join([*WORDS, *CONSTANTS])}")
+            hint = f" ({ELSEWHERE[word]})" if word in ELSEWHERE else ""
+            raise InvariantError(f"unknown word {word!r}{hint}, known: {', '.join([*WORDS, *CONSTANTS, *CHANGES])}")
         case ast.Attribute(value=ast.Name(id="fresh"), attr=word) if word in DECISIONS:
             return Fresh(word)
         case ast.UnaryOp(op=ast.Not(), operand=operand):
@@ -329,6 +281,10 @@ def _to_node(tree: ast.expr) -> Node:
                 Binary(_SIGNS[type(op)], left, right) for op, left, right in zip(ops, sides, sides[1:], strict=False)
             ]
             return pairs[0] if len(pairs) == 1 else Logic("and", tuple(pairs))
+        case ast.Call(func=ast.Name(id=change), args=[ast.Name() | ast.Constant() as time], keywords=[]) if (
+            change in CHANGES
+        ):
+            return Recent(change, _span(ast.unparse(time)))
         case ast.Call(func=ast.Name(id=function), args=[body], keywords=[]) if function in LINK_FUNCTIONS:
             inner = _to_node_of_kind(LINK_FUNCTIONS[function][0], body)
             if any(isinstance(n, LinksTerm) for n in walk(inner)):
@@ -347,7 +303,7 @@ def _to_node_of_kind(kind: Kind, tree: ast.expr) -> Node:
 
 def _kind(node: Node) -> Kind:
     match node:
-        case Number():
+        case Number() | Recent():
             return "number"
         case Name() | Fresh():
             return WORDS[node.word].kind
@@ -363,7 +319,11 @@ def _kind(node: Node) -> Kind:
 
 
 def violations(
-    invariant: Invariant, view: FleetView, directives: Sequence[Directive], fresh: Sequence[Directive] = ()
+    invariant: Invariant,
+    view: FleetView,
+    directives: Sequence[Directive],
+    fresh: Sequence[Directive] = (),
+    past: Counts | None = None,
 ) -> list[Directive | None]:
     """The directives that break an invariant; [None] if they only break it together.
 
@@ -372,11 +332,12 @@ def violations(
         view: the policy's input.
         directives: its output.
         fresh: its output for the same view at age 0, if the invariant needs it.
+        past: what the links did before, if the invariant counts changes. How long a line is broken is `Past.overdue`'s.
     """
     me = view.me
     if me is None:
         return []
-    scope = Scope(view, me, directives, {d.destination: d for d in fresh})
+    scope = Scope(view, me, directives, {d.destination: d for d in fresh}, None, past)
     broken: list[Directive | None] = []
     for link in directives if invariant.of_link else (None,):
         here = scope._replace(link=link)
@@ -393,9 +354,13 @@ def evaluate(node: Node, scope: Scope) -> Any:
         case Name():
             return WORDS[node.word].value(scope)
         case Fresh():
-            link = _link(scope)
+            link = link_of(scope)
             known = scope.fresh.get(link.destination, Directive(link.source, link.destination))
             return WORDS[node.word].value(scope._replace(link=known))
+        case Recent():
+            if scope.past is None:
+                raise InvariantError(f"{node.change}(…) is about time: a single view does not decide it")
+            return scope.past.count(node.change, link_of(scope).destination, node.span)
         case Logic(word="not"):
             return not evaluate(node.parts[0], scope)
         case Logic():
@@ -415,21 +380,6 @@ def evaluate(node: Node, scope: Scope) -> Any:
             if node.function == "every_link":
                 return all(links)
             return sum(1 if v else 0 for v in links) if node.function == "count_links" else sum(links)
-
-
-def find_violation(invariants: Iterable[Invariant], policy: Policy, view: FleetView) -> str | None:
-    """The first invariant that a policy breaks on a view, as text; None if it keeps all."""
-    directives = list(policy(view))
-    fresh: list[Directive] | None = None
-    for invariant in invariants:
-        if invariant.needs_fresh and fresh is None:
-            fresh = list(policy(just_heard(view)))
-        for broken in violations(invariant, view, directives, fresh or ()):
-            where = (
-                "the directives break" if broken is None else f"directive {broken.source}→{broken.destination} breaks"
-            )
-            return f"{where} {invariant.text!r}: {describe_directives(directives if broken is None else [broken])}"
-    return None
 
 
 def just_heard(view: FleetView) -> FleetView:

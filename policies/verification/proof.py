@@ -43,7 +43,13 @@ from sortie.policies.contract import (
 from sortie.policies.verification.advice import advise
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.conformance import missing_links, older_views, raised_part, without_detached
-from sortie.policies.verification.invariants import Invariant, describe_directives, just_heard, violations
+from sortie.policies.verification.invariants import (
+    Invariant,
+    InvariantError,
+    describe_directives,
+    just_heard,
+    violations,
+)
 from sortie.policies.verification.search import Budget, Found, Searched, Stopped, search_size
 from sortie.policies.verification.solver import solver_paths
 from sortie.policies.verification.subject import searchable
@@ -189,7 +195,13 @@ def prove(
 
     Returns:
         One verdict for each property, the plane's first.
+
+    Raises:
+        InvariantError: a line is about time, which no single view decides (`sortie.sim.check.over_time` does).
     """
+    for rule in invariants:
+        if rule.over_time:
+            raise InvariantError(f"{rule.text!r} is about time: a single view does not decide it")
     properties = [*PLANE, *(property_of(i) for i in invariants)]
     searched = [Searched(p.name) for p in properties]
     coverage = _search(policy, list(zip(searched, properties, strict=True)), max_drones, period_s, Budget(budget_s))

@@ -146,6 +146,16 @@ class FleetOfRanges:
         return raised
 
 
+def _refused(name: str) -> Any:
+    """A field that cannot be searched."""
+    return property(lambda descriptor: _refusing(descriptor, name))
+
+
+def _share(name: str) -> Any:
+    """A field between 0 and 1."""
+    return property(lambda descriptor: descriptor._number(name, 0.0, 1.0))
+
+
 class DescriptorOfRanges(Descriptor):
     """A descriptor with ranges as fields. Fields without order fork the run; fields that cannot be searched raise `Refused`.
 
@@ -172,17 +182,9 @@ class DescriptorOfRanges(Descriptor):
     def agent_id(self) -> int:
         return self._origin.drone
 
-    @property
-    def battery_soc(self) -> Any:
-        return self._number("battery_soc", 0.0, 1.0)
-
-    @property
-    def cpu_headroom(self) -> Any:
-        return self._number("cpu_headroom", 0.0, 1.0)
-
-    @property
-    def gpu_headroom(self) -> Any:
-        return self._number("gpu_headroom", 0.0, 1.0)
+    battery_soc = _share("battery_soc")
+    cpu_headroom = _share("cpu_headroom")
+    gpu_headroom = _share("gpu_headroom")
 
     @property
     def peer_goodput_mbps(self) -> tuple[Any, ...]:
@@ -277,29 +279,12 @@ class DescriptorOfRanges(Descriptor):
     __reduce__ = __reduce_ex__ = __getnewargs__ = __copy__ = __deepcopy__ = count = index = _whole
     _replace = _asdict = _make = with_roster = goodput_by_id = _whole
 
-    @property
-    def coverage_corner(self) -> Any:
-        return _refusing(self, "coverage_corner")
-
-    @property
-    def stamp_ns(self) -> Any:
-        return _refusing(self, "stamp_ns")
-
-    @property
-    def orientation_xyzw(self) -> Any:
-        return _refusing(self, "orientation_xyzw")
-
-    @property
-    def velocity_mps(self) -> Any:
-        return _refusing(self, "velocity_mps")
-
-    @property
-    def coverage_grid(self) -> Any:
-        return _refusing(self, "coverage_grid")
-
-    @property
-    def roster(self) -> Any:
-        return _refusing(self, "roster")
+    coverage_corner = _refused("coverage_corner")
+    stamp_ns = _refused("stamp_ns")
+    orientation_xyzw = _refused("orientation_xyzw")
+    velocity_mps = _refused("velocity_mps")
+    coverage_grid = _refused("coverage_grid")
+    roster = _refused("roster")
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:

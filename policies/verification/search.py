@@ -92,8 +92,8 @@ def search_size(
     exact = True
     for ego, heard in rosters(drones):
 
-        def run(path: Path, ego: int = ego, heard: tuple[int, ...] = heard) -> _Run:
-            return _Run(policy, FleetOfRanges(path, drones, ego, heard, period_s))
+        def run(path: Path, ego: int = ego, heard: tuple[int, ...] = heard) -> Run:
+            return Run(policy, FleetOfRanges(path, drones, ego, heard, period_s))
 
         for path, found in explore(run, make):
             exact = exact and path.exact
@@ -110,7 +110,7 @@ def search_size(
 
 def _search_cell(
     path: Path,
-    found: _Run,
+    found: Run,
     searched: Searched,
     complaint: Complaint,
     confirm: Callable[[Searched, Found], bool],
@@ -144,7 +144,7 @@ def _search_cell(
             raise Stopped
 
 
-class _Run:
+class Run:
     """One run of the policy, and the views that properties ask for."""
 
     def __init__(self, policy: Policy, system: FleetOfRanges) -> None:

@@ -4,7 +4,8 @@
 
 A directive that breaks an invariant is replaced by the nearest one that keeps them all. Its reason then begins with
 "shield:", so the record shows each intervention and `interventions` counts them. Nearest means: fewest fields changed,
-then the smallest change. A step of representation counts as a quarter, a number as a share of its bounds.
+then the smallest change. A step of representation counts as a quarter, a number as a share of its bounds. A line
+`within T s: …` is kept at once.
 
 In flight the shield acts twice: here, on the policy's output, and at the gate, on what the staleness rules and damping
 left of it (`policies.verification.enforced`). There a limit keeps it from giving a link more than its age allows.
@@ -17,8 +18,9 @@ from typing import Any
 
 from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, FleetView, Policy, Representation, check_directives
 from sortie.policies.verification.compiled import Context, Part, Rule, compiled
-from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, just_heard, walk
+from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, Recent, just_heard
 from sortie.policies.verification.nearest import LEAST_RATE_HZ, distance, least_distance, nearest
+from sortie.policies.verification.words import CHANGES
 from sortie.scenarios.representation import NAME_OF
 
 MARK = "shield: "
@@ -32,8 +34,8 @@ def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
     directives stay as decided, and each one's reason states it.
 
     Raises:
-        InvariantError: an invariant uses `sum_links` or `count_links`, so it does not determine the link to change; or
-            `every_link`, which means the same as its requirement alone.
+        InvariantError: an invariant uses `sum_links` or `count_links`, so it does not determine the link to change;
+            `every_link`, which means the same as its requirement alone; or counts a link's changes.
     """
     return Shielded(policy, check_shieldable(invariants))
 
@@ -71,12 +73,12 @@ def check_shieldable(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
     """
     rules = tuple(invariants)
     for rule in rules:
-        for top in (rule.when, rule.then):
-            for node in () if top is None else walk(top):
-                if isinstance(node, LinksTerm) and node.function in _NOT_SHIELDED:
-                    raise InvariantError(
-                        f"{rule.text!r}: a shield cannot keep {node.function}(…); `sortie verify` can only prove it"
-                    )
+        for node in rule.nodes:
+            name = node.function if isinstance(node, LinksTerm) else node.change if isinstance(node, Recent) else ""
+            if name in (*_NOT_SHIELDED, *CHANGES):
+                raise InvariantError(
+                    f"{rule.text!r}: a shield cannot keep {name}(…); `sortie verify` can only prove it"
+                )
     return rules
 
 

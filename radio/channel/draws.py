@@ -37,23 +37,15 @@ class StreamShadowing:
         self._streams = [stream(seed, replication, h, "shadowing") for h in range(n)]
         self._last_db: FloatArray | None = None
 
-    def block(self, frames: int, flown: int) -> FloatArray:
-        """Of the next frames, dB.
-
-        Args:
-            frames: how many to draw, the same in every block.
-            flown: how many of them are wanted.
-
-        Returns:
-            [flown, n, n], symmetric.
-        """
+    def block(self, frames: int) -> FloatArray:
+        """Of the next frames, dB; [frames, n, n], symmetric. All blocks but the last must be of one length."""
         normals = np.zeros((frames, self._n, self._n))
         for h in range(1, self._n):
             normals[:, h, :h] = drawn = self._streams[h].standard_normal((frames, h))
             normals[:, :h, h] = drawn
         shadow_db = gauss_markov(normals, self._sigma_db, self._keep, self._last_db)
         self._last_db = shadow_db[-1]
-        return shadow_db[:flown]
+        return shadow_db
 
 
 def mix(z: Keys) -> Keys:

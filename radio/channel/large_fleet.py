@@ -75,7 +75,7 @@ class Crowd:
         else:
             shadow_db = self._shadowing(low, high, frame, len(p))
             early = int(np.searchsorted(high, self._n_early))  # pairs are by higher id
-            shadow_db[:, :early] = self._early.block(EPOCH, len(p))[:, low[:early], high[:early]]
+            shadow_db[:, :early] = self._early.block(len(p))[:, low[:early], high[:early]]
         gain_db = shadow_db - loss_db
         return BlockStart(links, np.concatenate([gain_db, gain_db], axis=1), np.tile(shadow_db, 2))
 

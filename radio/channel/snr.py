@@ -255,7 +255,7 @@ class Channel:
             self._snr_db = gain_db + (c.tx_power_dbm - self.noise_dbm)
             return
         if self._field is None:
-            self._shadow_db = self._drawn.block(self._block, len(p)).reshape(len(p), -1)
+            self._shadow_db = self._drawn.block(len(p)).reshape(len(p), -1)
         self._work_out(self.frame)
 
     def _work_out(self, first: int) -> None:

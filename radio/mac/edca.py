@@ -12,6 +12,8 @@ jobs (a group frame or a sample) and flows (a link with unicast traffic); the co
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numba import carray, types
 from numba.core.cgutils import voidptr_t
@@ -31,6 +33,8 @@ ACK, BLOCK_ACK, BLOCK_ACK_LONG, REQUEST_NS, CONTROL = 28_000, 32_000, 40_000, 32
 """At 24 Mb/s: ack (14 B), block ack of 64 and of 256 frames (32 and 56 B); request (24 B); RTS and CTS (20 and 14 B)."""
 GROUP_CURVE, CONTROL_CURVE = 12, 13
 """Packet error rates: of HE MCS 0 … 11, of group frames, of control frames at 24 Mb/s."""
+CENTRE_DB, SLOPE, WEIGHT, SURE, EVEN = range(5)
+"""Columns of a curve; the last two are the SINR from which every frame is received, and that at which half of them are."""
 CONTROL_BYTES = 32.0
 REFERENCE_BYTES = 1458.0
 OVERLAPS = 12
@@ -59,8 +63,8 @@ STATION_COLUMNS = 52
 JOB_COLUMNS = 18
 
 # columns of a flow
-FLOW_FROM, FLOW_TO, FLOW_LINK, FLOW_MCS, FLOW_FRAMES, FLOW_DEAD, FLOW_PROBED, FLOW_SENT = range(8)
-FLOW_COLUMNS = 8
+FLOW_TO, FLOW_MCS, FLOW_FRAMES, FLOW_DEAD = range(4)
+FLOW_COLUMNS = 4
 FLOW_RATE, FLOW_LOSS, FLOW_BURST = range(3)
 
 # the settings, as integers and as floats
@@ -87,6 +91,7 @@ _LEVEL = np.uint64(0xFFFF)
 _TRIES = 63
 _RECEIVED, _RESOLVED = 64, 128
 _PROBE_EVERY = 10
+loop = partial(compiled, allocates=False)
 
 
 @part
@@ -299,14 +304,14 @@ def release(s, t, S, P, W, C, F, begin, receiver):
 @part
 def log_success(sinr, mcs, curves):
     """Of a frame of `REFERENCE_BYTES`."""
-    if sinr >= curves[mcs, 3]:
+    if sinr >= curves[mcs, SURE]:
         return 0.0
     if sinr <= 1e-9:
         return -700.0
-    x = curves[mcs, 1] * (10.0 * np.log10(sinr) - curves[mcs, 0])
+    x = curves[mcs, SLOPE] * (10.0 * np.log10(sinr) - curves[mcs, CENTRE_DB])
     if x > 36.0:
         return 0.0
-    return -curves[mcs, 2] * np.log1p(np.exp(-x)) if x > -200.0 else -700.0
+    return -curves[mcs, WEIGHT] * np.log1p(np.exp(-x)) if x > -200.0 else -700.0
 
 
 @part
@@ -406,7 +411,7 @@ def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiv
         renew(s, S)
 
 
-@compiled
+@loop
 def account(t, G):
     """Add up how long frames have been on the air."""
     if G[G_OTHERS] > 0:
@@ -460,18 +465,19 @@ def build(s, job, S, J, M, T, LI, LF, RATES, LIMITS, C):
 
 
 @part
-def choose_mcs(flow, LI, ORDER, C):
+def choose_mcs(flow, LI, LS, ORDER, C):
     """The MCS of the next exchange: every tenth of a learning sender looks around."""
     if C[C_LEARNS] == 0 or LI[flow, FLOW_DEAD] > 0:
         return max(LI[flow, FLOW_MCS], 0)
-    LI[flow, FLOW_SENT] += 1
-    if LI[flow, FLOW_SENT] % _PROBE_EVERY != 0 or ORDER.shape[1] < 2:
+    n = ORDER.shape[1]
+    LS[flow, n, 0] += 1
+    if LS[flow, n, 0] % _PROBE_EVERY != 0 or n < 2:
         return LI[flow, FLOW_MCS]
-    at = ORDER[flow, LI[flow, FLOW_PROBED] % ORDER.shape[1]]
-    LI[flow, FLOW_PROBED] += 1
+    at = ORDER[flow, LS[flow, n, 1] % n]
+    LS[flow, n, 1] += 1
     if at == LI[flow, FLOW_MCS]:
-        at = ORDER[flow, LI[flow, FLOW_PROBED] % ORDER.shape[1]]
-        LI[flow, FLOW_PROBED] += 1
+        at = ORDER[flow, LS[flow, n, 1] % n]
+        LS[flow, n, 1] += 1
     return at
 
 
@@ -491,7 +497,7 @@ def send_data(s, t, job, S, J, M, T, LI, LF, RATES, LIMITS, C, G):
 
 
 @part
-def access(s, t, S, J, M, T, LI, LF, RATES, LIMITS, ORDER, C, G, keys):
+def access(s, t, S, J, M, T, LI, LS, LF, RATES, LIMITS, ORDER, C, G, keys):
     """A station's turn: the class of higher priority sends, the other one's equal counter is a collision within."""
     a = 0 if S[s, GRANT] <= t and S[s, HEAD] >= 0 else 1
     if S[s, HEAD + a] < 0:
@@ -517,7 +523,7 @@ def access(s, t, S, J, M, T, LI, LF, RATES, LIMITS, ORDER, C, G, keys):
         J[job, AIR_NS] += REQUEST_NS + S[s, TX_NAV]
         S[s, AWAITS] = BLOCK_REQUEST
         return True
-    S[s, TX_MCS] = choose_mcs(flow, LI, ORDER, C)
+    S[s, TX_MCS] = choose_mcs(flow, LI, LS, ORDER, C)
     if C[C_RTS] == 1 and LI[flow, FLOW_DEAD] == 0:
         duration = build(s, job, S, J, M, T, LI, LF, RATES, LIMITS, C)
         transmit(s, t, RTS, to, CONTROL, S, G)
@@ -543,7 +549,8 @@ def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, re
                 told += 1
                 remove(job, t, S, J)
         elif what == DATA:
-            LS[J[job, FLOW], S[s, TX_MCS], 0] += S[s, TX_COUNT]
+            if C[C_LEARNS] == 1:
+                LS[J[job, FLOW], S[s, TX_MCS], 0] += S[s, TX_COUNT]
             if S[s, TX_COUNT] == 1:
                 told = settle(s, t, job, False, True, S, J, M, T, OUT, told, DROPS, C)
             else:  # ask what has arrived, for as long as it takes
@@ -586,15 +593,19 @@ def settle(s, t, job, is_answered, counts, S, J, M, T, OUT, told, DROPS, C):
 
 
 @part
-def is_read(j, s, t, S, W, SEG_AT, SEG, mcs, length, noise, whole, curves, bits):
-    """Whether a lone frame is received; `whole` false: whether anything of it is, for those it is not meant for."""
+def is_noticed(j, S, W, SEG, mcs, noise, curves):
+    """Whether anything of a frame is received by one whom it is not meant for."""
+    least = SEG[j, 0]
+    for k in range(1, S[j, SEGMENTS]):
+        least = min(least, SEG[j, k])
+    return W[S[j, LOCK_LINK]] > curves[mcs, EVEN] * (noise + least)
+
+
+@part
+def is_read(j, t, S, W, SEG_AT, SEG, mcs, length, noise, curves, bits):
+    """Whether a lone frame is received."""
     link = S[j, LOCK_LINK]
     n = S[j, SEGMENTS]
-    if not whole:
-        least = SEG[j, 0]
-        for k in range(1, n):
-            least = min(least, SEG[j, k])
-        return log_success(W[link] / (noise + least), mcs, curves) > -0.7
     total, span = 0.0, max(1, t - S[j, LOCK_AT])
     for k in range(n):
         until = SEG_AT[j, k + 1] if k + 1 < n else t
@@ -618,7 +629,9 @@ def receive_fragments(s, r, t, job, S, J, M, T, W, SEG_AT, SEG, LF, C, curves, k
     body_ns = max(1, S[s, TX_END] - body_at)
     full, last = J[job, FULL_BYTES], J[job, LAST_BYTES]
     arrived, each_ns = 0, body_ns / n
-    alike = log_success(W[link] / (1.0 + SEG[r, 0]), mcs, curves) / REFERENCE_BYTES
+    for k in range(segments):  # of the interference that nobody asks for any more
+        SEG[r, k] = log_success(W[link] / (1.0 + SEG[r, k]), mcs, curves)
+    alike = SEG[r, 0] / REFERENCE_BYTES
     for x in range(n):
         index = T[s, x]
         length = full if index < J[job, COUNT] - 1 else last
@@ -629,7 +642,7 @@ def receive_fragments(s, r, t, job, S, J, M, T, W, SEG_AT, SEG, LF, C, curves, k
                 a = max(from_ns, np.float64(SEG_AT[r, k])) if k else from_ns
                 b = min(until_ns, np.float64(SEG_AT[r, k + 1])) if k + 1 < segments else until_ns
                 if b > a:
-                    good += (b - a) / each_ns * log_success(W[link] / (1.0 + SEG[r, k]), mcs, curves)
+                    good += (b - a) / each_ns * SEG[r, k]
             good *= length / REFERENCE_BYTES
         if given >= 0.0:
             good = np.log1p(-given) if given < 1.0 else -700.0
@@ -692,7 +705,7 @@ def finish(
             if kind == GROUP:
                 bits = mix(seed ^ keys[j])
                 length = np.float64(J[job, FULL_BYTES]) if job >= 0 else 334.0
-                good = is_read(j, s, t, S, W, SEG_AT, SEG, GROUP_CURVE, length, F[F_LEGACY_NOISE], True, curves, bits)
+                good = is_read(j, t, S, W, SEG_AT, SEG, GROUP_CURVE, length, F[F_LEGACY_NOISE], curves, bits)
                 if good and C[C_EXTRA] == 1 and extra[k] > 0.0:
                     if uniform(mix(bits)) < extra[k]:
                         good = False
@@ -708,20 +721,9 @@ def finish(
                     if job >= 0 and LI[J[job, FLOW], FLOW_DEAD] == 0:
                         good = receive_fragments(s, j, t, job, S, J, M, T, W, SEG_AT, SEG, LF, C, curves, keys) > 0
                 else:
+                    bits = mix(seed ^ keys[j])
                     good = is_read(
-                        j,
-                        s,
-                        t,
-                        S,
-                        W,
-                        SEG_AT,
-                        SEG,
-                        CONTROL_CURVE,
-                        CONTROL_BYTES,
-                        F[F_LEGACY_NOISE],
-                        True,
-                        curves,
-                        mix(seed ^ keys[j]),
+                        j, t, S, W, SEG_AT, SEG, CONTROL_CURVE, CONTROL_BYTES, F[F_LEGACY_NOISE], curves, bits
                     )
                 if good and kind == BLOCK_REQUEST and S[s, TX_JOB] >= 0:
                     flow = J[S[s, TX_JOB], FLOW]
@@ -729,11 +731,9 @@ def finish(
                     good = uniform(mix(seed)) >= lost
                 is_answered = good
             elif kind == DATA:
-                good = is_read(j, s, t, S, W, SEG_AT, SEG, S[s, TX_MCS], 1500.0, 1.0, False, curves, seed)
+                good = is_noticed(j, S, W, SEG, S[s, TX_MCS], 1.0, curves)
             else:
-                good = is_read(
-                    j, s, t, S, W, SEG_AT, SEG, CONTROL_CURVE, CONTROL_BYTES, F[F_LEGACY_NOISE], False, curves, seed
-                )
+                good = is_noticed(j, S, W, SEG, CONTROL_CURVE, F[F_LEGACY_NOISE], curves)
             S[j, EIFS_UNTIL] = 0 if good else t + EIFS_EXTRA
             if good and j != to and S[s, TX_NAV] > 0:
                 S[j, NAV] = max(S[j, NAV], t + S[s, TX_NAV])
@@ -801,7 +801,7 @@ def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, re
     job = S[s, TX_JOB]
     S[s, WINDOW + a], S[s, FAILS + a] = C[C_WINDOW + a], 0
     if job >= 0:
-        if what == DATA:
+        if what == DATA and C[C_LEARNS] == 1:
             flow = J[job, FLOW]
             LS[flow, S[s, TX_MCS], 0] += S[s, TX_COUNT]
             for x in range(S[s, TX_COUNT]):
@@ -814,7 +814,7 @@ def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, re
     return told
 
 
-@compiled
+@loop
 def run(
     until,
     S,
@@ -827,9 +827,9 @@ def run(
     T,
     SEG_AT,
     SEG,
-    LI,
     LS,
     DROPS,
+    LI,
     LF,
     OUT,
     TOUCH,
@@ -939,7 +939,7 @@ def run(
                     starters[count] = s
                     count += 1
             elif min(S[s, GRANT], S[s, GRANT_LOW]) <= t:
-                if access(s, t, S, J, M, T, LI, LF, RATES, LIMITS, ORDER, C, G, keys):
+                if access(s, t, S, J, M, T, LI, LS, LF, RATES, LIMITS, ORDER, C, G, keys):
                     starters[count] = s
                     count += 1
             renew(s, S)
@@ -961,7 +961,7 @@ def fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, 
     J[job, READY_AT], J[job, IS_LIVE], J[job, HEAD_AT] = at, 1, -1
 
 
-@compiled
+@loop
 def submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, J):
     """A job comes to its station at a time that is not yet over."""
     fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, J)
@@ -976,7 +976,7 @@ def submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes
         J[before, FOLLOWING] = job
 
 
-@compiled
+@loop
 def cancel(job, t, S, J):
     """Take a job out, wherever it is; a frame of it that is on the air goes on to its end."""
     s = J[job, STATION]
@@ -995,7 +995,7 @@ def cancel(job, t, S, J):
     renew(s, S)
 
 
-@compiled
+@loop
 def substitute(old, job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, J):
     """A job takes the place of one that waits in its station's queue; false if that one does not wait there."""
     is_first = S[station, COMING] == old
@@ -1032,7 +1032,6 @@ def copy(
     T,
     SEG_AT,
     SEG,
-    LI,
     LS,
     DROPS,
     S2,
@@ -1045,10 +1044,10 @@ def copy(
     T2,
     SEG_AT2,
     SEG2,
-    LI2,
     LS2,
     DROPS2,
     begin,
+    C,
 ):
     """Make the second state equal to the first; what is not in use is left out."""
     for s in range(S.shape[0]):
@@ -1058,13 +1057,15 @@ def copy(
     for k in range(G.shape[0]):
         G2[k] = G[k]
     for x in range(J.shape[0]):
-        for k in range(JOB_COLUMNS):
-            J2[x, k] = J[x, k]
-    for x in range(LI.shape[0]):
-        for k in range(FLOW_COLUMNS):
-            LI2[x, k] = LI[x, k]
-        for m in range(LS.shape[1]):
-            LS2[x, m, 0], LS2[x, m, 1] = LS[x, m, 0], LS[x, m, 1]
+        if J[x, IS_LIVE] == 1:
+            for k in range(JOB_COLUMNS):
+                J2[x, k] = J[x, k]
+        else:
+            J2[x, IS_LIVE] = 0
+    if C[C_LEARNS] == 1:
+        for x in range(LS.shape[0]):
+            for m in range(LS.shape[1]):
+                LS2[x, m, 0], LS2[x, m, 1] = LS[x, m, 0], LS[x, m, 1]
     for s in range(S.shape[0]):
         if S[s, TX_END] != FAR:
             for k in range(begin[s], begin[s + 1]):
@@ -1079,7 +1080,7 @@ def copy(
         DROPS2[x, 0], DROPS2[x, 1] = DROPS[x, 0], DROPS[x, 1]
 
 
-@compiled
+@loop
 def relink(S, P, W, WHY, old_begin, old_receiver, old_why, begin, receiver, gain, fade, keys, C):
     """The list of links is another one: find the frames on the air in it."""
     for j in range(C[C_STATIONS]):
@@ -1119,11 +1120,11 @@ SIZES = 8
 
 
 @compiled
-def ahead(at, since, until, job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, ready_at):
-    """Bring the first state up to `since`, let a job come to it (−1: none), and run a copy of it ahead.
+def ahead(at, since, until):
+    """Bring the first state up to `since`, and run a copy of it ahead.
 
     Arrays come by address, for numba looks at each array that it is handed, which costs more than most runs:
-    `SIZES` sizes, the 13 arrays of the first state, those of its copy, and what they share. an `until` before `since` is no copy.
+    `SIZES` sizes, the 12 arrays of the first state, those of its copy, and what they share. An `until` before `since` is no copy.
 
     Returns: the time that the copy has reached, and how many rows of OUT are to be told.
     """
@@ -1138,24 +1139,24 @@ def ahead(at, since, until, job, kind, station, flow, access_class, count, full_
     T = carray(pointer(at[15]), (n, window), np.int32)
     SEG_AT = carray(pointer(at[16]), (n, OVERLAPS), np.int64)
     SEG = carray(pointer(at[17]), (n, OVERLAPS), np.float64)
-    LI = carray(pointer(at[18]), (flows, FLOW_COLUMNS), np.int64)
-    LS = carray(pointer(at[19]), (flows, mcs, 2), np.int64)
-    DROPS = carray(pointer(at[20]), (drops, 2), np.int64)
-    LF = carray(pointer(at[34]), (flows, 3), np.float64)
-    OUT = carray(pointer(at[35]), (2 * n + 8, 2), np.int64)
-    TOUCH = carray(pointer(at[36]), (2 * n + 2,), np.int64)
-    begin = carray(pointer(at[37]), (n + 1,), np.int64)
-    receiver = carray(pointer(at[38]), (links,), np.int64)
-    gain = carray(pointer(at[39]), (links,), np.float64)
-    extra = carray(pointer(at[40]), (extras,), np.float64)
-    fade = carray(pointer(at[41]), (1 << 16,), np.float32)
-    keys = carray(pointer(at[42]), (n,), np.uint64)
-    RATES = carray(pointer(at[43]), (mcs,), np.float64)
-    LIMITS = carray(pointer(at[44]), (mcs,), np.int64)
-    ORDER = carray(pointer(at[45]), (flows, mcs), np.int64)
-    C = carray(pointer(at[46]), (17,), np.int64)
-    F = carray(pointer(at[47]), (4,), np.float64)
-    curves = carray(pointer(at[48]), (14, 4), np.float64)
+    LS = carray(pointer(at[18]), (flows, mcs + 1, 2), np.int64)
+    DROPS = carray(pointer(at[19]), (drops, 2), np.int64)
+    LI = carray(pointer(at[32]), (flows, FLOW_COLUMNS), np.int64)
+    LF = carray(pointer(at[33]), (flows, 3), np.float64)
+    OUT = carray(pointer(at[34]), (2 * n + 8, 2), np.int64)
+    TOUCH = carray(pointer(at[35]), (2 * n + 2,), np.int64)
+    begin = carray(pointer(at[36]), (n + 1,), np.int64)
+    receiver = carray(pointer(at[37]), (links,), np.int64)
+    gain = carray(pointer(at[38]), (links,), np.float64)
+    extra = carray(pointer(at[39]), (extras,), np.float64)
+    fade = carray(pointer(at[40]), (1 << 16,), np.float32)
+    keys = carray(pointer(at[41]), (n,), np.uint64)
+    RATES = carray(pointer(at[42]), (mcs,), np.float64)
+    LIMITS = carray(pointer(at[43]), (mcs,), np.int64)
+    ORDER = carray(pointer(at[44]), (flows, mcs), np.int64)
+    C = carray(pointer(at[45]), (17,), np.int64)
+    F = carray(pointer(at[46]), (4,), np.float64)
+    curves = carray(pointer(at[47]), (14, 5), np.float64)
     run(
         since,
         S,
@@ -1168,9 +1169,9 @@ def ahead(at, since, until, job, kind, station, flow, access_class, count, full_
         T,
         SEG_AT,
         SEG,
-        LI,
         LS,
         DROPS,
+        LI,
         LF,
         OUT,
         TOUCH,
@@ -1189,21 +1190,18 @@ def ahead(at, since, until, job, kind, station, flow, access_class, count, full_
     )
     if until < since:
         return since, 0
-    if job >= 0:
-        submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, ready_at, S, J)
-    S2 = carray(pointer(at[21]), (n, STATION_COLUMNS), np.int64)
-    P2 = carray(pointer(at[22]), (n,), np.float64)
-    W2 = carray(pointer(at[23]), (links,), np.float64)
-    WHY2 = carray(pointer(at[24]), (links,), np.uint8)
-    G2 = carray(pointer(at[25]), (5,), np.int64)
-    J2 = carray(pointer(at[26]), (jobs, JOB_COLUMNS), np.int64)
-    M2 = carray(pointer(at[27]), (n, window), np.uint8)
-    T2 = carray(pointer(at[28]), (n, window), np.int32)
-    SEG_AT2 = carray(pointer(at[29]), (n, OVERLAPS), np.int64)
-    SEG2 = carray(pointer(at[30]), (n, OVERLAPS), np.float64)
-    LI2 = carray(pointer(at[31]), (flows, FLOW_COLUMNS), np.int64)
-    LS2 = carray(pointer(at[32]), (flows, mcs, 2), np.int64)
-    DROPS2 = carray(pointer(at[33]), (drops, 2), np.int64)
+    S2 = carray(pointer(at[20]), (n, STATION_COLUMNS), np.int64)
+    P2 = carray(pointer(at[21]), (n,), np.float64)
+    W2 = carray(pointer(at[22]), (links,), np.float64)
+    WHY2 = carray(pointer(at[23]), (links,), np.uint8)
+    G2 = carray(pointer(at[24]), (5,), np.int64)
+    J2 = carray(pointer(at[25]), (jobs, JOB_COLUMNS), np.int64)
+    M2 = carray(pointer(at[26]), (n, window), np.uint8)
+    T2 = carray(pointer(at[27]), (n, window), np.int32)
+    SEG_AT2 = carray(pointer(at[28]), (n, OVERLAPS), np.int64)
+    SEG2 = carray(pointer(at[29]), (n, OVERLAPS), np.float64)
+    LS2 = carray(pointer(at[30]), (flows, mcs + 1, 2), np.int64)
+    DROPS2 = carray(pointer(at[31]), (drops, 2), np.int64)
     copy(
         S,
         P,
@@ -1215,7 +1213,6 @@ def ahead(at, since, until, job, kind, station, flow, access_class, count, full_
         T,
         SEG_AT,
         SEG,
-        LI,
         LS,
         DROPS,
         S2,
@@ -1228,10 +1225,10 @@ def ahead(at, since, until, job, kind, station, flow, access_class, count, full_
         T2,
         SEG_AT2,
         SEG2,
-        LI2,
         LS2,
         DROPS2,
         begin,
+        C,
     )
     return run(
         until,
@@ -1245,9 +1242,9 @@ def ahead(at, since, until, job, kind, station, flow, access_class, count, full_
         T2,
         SEG_AT2,
         SEG2,
-        LI2,
         LS2,
         DROPS2,
+        LI,
         LF,
         OUT,
         TOUCH,

@@ -21,6 +21,9 @@ class End(Enum):
     DEADLINE_IN_SERVICE = "deadline_in_service"
 
 
+NO_FRAMES = np.arange(0)
+
+
 class AirJob:
     """One sample's claim on the air; subclassed by what knows the sample.
 
@@ -44,7 +47,7 @@ class AirJob:
         self.arrived_frames = self.sent_frames = 0  # of this pass, as the medium told last
         self.dropped: list[int] = []  # frames of this pass that used up their tries, by index
         self.keeps_frames = False  # whether `here` is kept: which frames of this pass are at the receiver
-        self.here = np.arange(0)
+        self.here = NO_FRAMES
         self.granted_s = self.pass_granted_s = 0.0
         self.t_start_s = nan
 

@@ -19,6 +19,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 import simpy
 from numpy.typing import NDArray
+from simpy.events import EventPriority
 
 from sortie.radio.channel.draws import fade_table_db
 from sortie.radio.mac.airtime import CONTROL_MBPS, ampdu_frames, frame_bytes
@@ -39,7 +40,8 @@ ENERGY_OVER_PREAMBLE_DB = 20.0
 _NS = 1e-9
 _AHEAD_NS = 100_000_000
 """A plan goes no further than this; frames of the flight change the links as often."""
-_NO_ENTRY = (-1, *[0] * 9)
+_LAST = EventPriority(2)
+"""After everything else of the same instant."""
 _MODULE: list[Any] = []
 
 
@@ -79,7 +81,7 @@ class _State:
         return _State(tuple(a.copy() for a in self.arrays), self.jobs, self.now_ns)
 
 
-_S, _P, _W, _WHY, _G, _J, _M, _T, _SEG_AT, _SEG, _LI, _LS, _DROPS = range(13)
+_S, _P, _W, _WHY, _G, _J, _M, _T, _SEG_AT, _SEG, _LS, _DROPS = range(12)
 _JOBS, _FLOWS, _MOST_DROPS = 64, 32, 8192
 
 
@@ -121,12 +123,14 @@ class Medium(Generic[J, F]):
         self._e = e = _edca()
         self._begin_s = env.now
         self._timer: simpy.Event | None = None
+        self._is_replanning = False
         self._told: list[tuple[int, int, J | F | None]] = []
         self._is_telling = False
         self._free = list(range(_JOBS))[::-1]
         self._finished: list[int] = []
         self._at_row: dict[int, J | F] = {}
         self._flows: dict[tuple[int, int], int] = {}
+        self._tuned: list[Link | None] = []  # by flow
         self._is_square = True
         self._settings = settings
         s, order = _tables(e, settings, n, noise_dbm)
@@ -138,7 +142,8 @@ class Medium(Generic[J, F]):
         curves = [*CURVES, group_curve(settings.group_rate_mbps), LEGACY_CURVES[CONTROL_MBPS]]
         centre_db, slope, weight = np.array(curves).T
         sure = 10.0 ** ((centre_db + 36.001 / slope) / 10.0)  # the stations' form of the curve is 0 from 36 on
-        self._curves = np.column_stack((centre_db, slope, weight, sure))
+        even = 10.0 ** ((centre_db - np.log(np.expm1(0.7 / weight)) / slope) / 10.0)
+        self._curves = np.column_stack((centre_db, slope, weight, sure, even))
         self._window = window = int(self._ints[e.C_BLOCK])
         stations = np.zeros((n, e.STATION_COLUMNS), np.int64)
         for column in (e.TX_END, e.RESPONSE_AT, e.TIMEOUT_AT, e.GRANT, e.GRANT_LOW, e.ARRIVE_AT, e.NEXT_AT):
@@ -156,13 +161,13 @@ class Medium(Generic[J, F]):
                 stations, np.zeros(n), np.zeros(n * n), np.zeros(n * n, np.uint8), np.zeros(5, np.int64),
                 np.zeros((_JOBS, e.JOB_COLUMNS), np.int64), np.zeros((n, window), np.uint8),
                 np.zeros((n, window), np.int32), np.zeros((n, e.OVERLAPS), np.int64), np.zeros((n, e.OVERLAPS)),
-                np.zeros((_FLOWS, e.FLOW_COLUMNS), np.int64), np.zeros((_FLOWS, mcs, 2), np.int64),
-                np.zeros((_MOST_DROPS, 2), np.int64),
+                np.zeros((_FLOWS, mcs + 1, 2), np.int64), np.zeros((_MOST_DROPS, 2), np.int64),
             ),
             _JOBS, self._ns(env.now) - 1,
         )  # fmt: skip
         self._settled.arrays[_G][e.G_SINCE] = self._ns(env.now)
         self._planned = self._settled.clone()
+        self._flow_ints = np.zeros((_FLOWS, e.FLOW_COLUMNS), np.int64)
         self._flow_floats = np.zeros((_FLOWS, 3))
         self._orders = np.zeros((_FLOWS, mcs), np.int64)
         self._out = np.zeros((2 * n + 8, 2), np.int64)
@@ -225,11 +230,11 @@ class Medium(Generic[J, F]):
             if len(old[1]):
                 e.relink(a[_S], a[_P], a[_W], a[_WHY], old[0], old[1], old[2].copy(), begin, receiver, gain,
                          self._fade, self._keys, ints)  # fmt: skip
-        self._plan()
+        self.replan()
 
     def _share(self) -> None:
         self._shared = (
-            self._flow_floats, self._out, self._touch, self._begin, self._receiver, self._gain, self._extra, self._fade, self._keys,
+            self._flow_ints, self._flow_floats, self._out, self._touch, self._begin, self._receiver, self._gain, self._extra, self._fade, self._keys,
             self._rates, self._limits, self._orders, self._ints, self._floats, self._curves,
         )  # fmt: skip
 
@@ -242,7 +247,7 @@ class Medium(Generic[J, F]):
             second = self._planned if first is self._settled else self._settled
             a = first.arrays
             sizes = (
-                self._n, len(self._receiver), len(a[_J]), self._window, len(a[_LI]), len(self._rates), len(a[_DROPS]),
+                self._n, len(self._receiver), len(a[_J]), self._window, len(a[_LS]), len(self._rates), len(a[_DROPS]),
                 len(self._extra),
             )  # fmt: skip
             arrays = (*a, *second.arrays, *self._shared)
@@ -255,31 +260,33 @@ class Medium(Generic[J, F]):
         found = self._flows.get((sender, receiver))
         if found is None:
             found = self._flows[sender, receiver] = len(self._flows)
+            self._tuned.append(None)
             if found == len(self._flow_floats):
                 more = 2 * found
-                self._settled, self._planned = (
-                    _sized(x, {_LI: more, _LS: more}) for x in (self._settled, self._planned)
-                )
+                self._settled, self._planned = (_sized(x, {_LS: more}) for x in (self._settled, self._planned))
+                self._flow_ints = _longer(self._flow_ints, more)
                 self._flow_floats = _longer(self._flow_floats, more)
                 self._orders = _longer(self._orders, more)
                 self._share()
             e = self._e
-            self._settled.arrays[_LI][found, [e.FLOW_FROM, e.FLOW_TO]] = sender, receiver
+            self._flow_ints[found, e.FLOW_TO] = receiver
             self._orders[found] = np.roll(np.arange(len(self._rates)), 5 * sender + receiver)
         return found
 
     def tune(self, flow: int, link: Link) -> None:
         """From now on a sender uses a link like this."""
-        e = self._e
-        row = self._settled.arrays[_LI][flow]
-        row[e.FLOW_MCS], row[e.FLOW_FRAMES], row[e.FLOW_DEAD] = max(0, link.mcs), link.frames, link.dead
+        if link == self._tuned[flow]:
+            return
+        self._tuned[flow] = link
+        self._flow_ints[flow, self._e.FLOW_MCS :] = max(0, link.mcs), link.frames, link.dead
         loss = -1.0 if link.loss != link.loss else link.loss
         self._flow_floats[flow] = link.rate_mbps * 1e-3, loss, link.burst_loss
 
     def learned(self, flow: int) -> IntArray:
         """[MCS, 2]: frames of a link that were sent and that were acknowledged since the last call."""
-        found: IntArray = self._settled.arrays[_LS][flow].copy()
-        self._settled.arrays[_LS][flow] = 0
+        row = self._settled.arrays[_LS][flow, :-1]  # without its counts of exchanges and of probes
+        found: IntArray = row.copy()
+        row[:] = 0
         return found
 
     # --- jobs ------------------------------------------------------------------------------------
@@ -291,7 +298,7 @@ class Medium(Generic[J, F]):
         queue.append(job)
         if len(queue) == 1:
             self._on_begin(job, self._env.now)
-        self._plan(entry)
+        self._submit(entry)
 
     def replace(self, old: J, new: J) -> None:
         """Drop `old` (queued or in service) for `new`.
@@ -308,7 +315,7 @@ class Medium(Generic[J, F]):
             if self._e.substitute(old.row, *entry, a[_S], a[_J]):
                 queue[queue.index(old)] = new
                 self._leave(old)
-                self._plan()
+                self.replan()
                 return
             self._free.append(new.row)
             del self._at_row[new.row]
@@ -352,7 +359,7 @@ class Medium(Generic[J, F]):
         """Take a job out without a word; the next in its queue begins."""
         self.sync()
         self._take(job)
-        self._plan()
+        self.replan()
 
     def _take(self, job: J) -> None:
         self._read(job)
@@ -392,6 +399,8 @@ class Medium(Generic[J, F]):
 
     def _drain(self) -> None:
         drops = self._settled.arrays[_DROPS]
+        if not drops[0, 0]:
+            return
         for row, index in drops[1 : drops[0, 0] + 1].tolist():
             job = self._at_row.get(row)
             if job is not None:
@@ -426,7 +435,7 @@ class Medium(Generic[J, F]):
             for state in (self._settled, self._planned):  # the plan stands: it ends before
                 self._e.submit(*entry, state.arrays[_S], state.arrays[_J])
         else:
-            self._plan(entry)
+            self._submit(entry)
 
     def drop_context(self, sender: int) -> None:
         """Forget a drone's group frames, waiting or to come; one that is on the air ends."""
@@ -437,11 +446,7 @@ class Medium(Generic[J, F]):
                 e.cancel(row, self._ns(self._env.now), a[_S], a[_J])
                 self._finished.append(row)
                 del self._at_row[row]
-        self._plan()
-
-    def replan(self) -> None:
-        """How links are used has changed."""
-        self._plan()
+        self.replan()
 
     # --- the clock -------------------------------------------------------------------------------
 
@@ -449,17 +454,30 @@ class Medium(Generic[J, F]):
         """Bring the settled state up to now; what happens at this very instant is still to come."""
         until = self._ns(self._env.now) - 1
         if self._settled.now_ns < until:
-            self._e.ahead(self._table(self._settled), until, until - 1, *_NO_ENTRY)
+            self._e.ahead(self._table(self._settled), until, until - 1)
             self._settled.now_ns = until
 
-    def _plan(self, entry: tuple[int, ...] = _NO_ENTRY) -> None:
-        """Let a job come, run a copy ahead to whatever must be told next, and set the timer there."""
+    def _submit(self, entry: tuple[int, ...]) -> None:
+        """A job comes to the stations."""
+        state = self._settled.arrays
+        self._e.submit(*entry, state[_S], state[_J])
+        self.replan()
+
+    def replan(self) -> None:
+        """Something has come from outside: plan anew when all that comes at this instant has come."""
+        self._timer = None
+        if not (self._is_replanning or self._is_telling):
+            self._is_replanning = True
+            last = self._env.event()
+            last.callbacks.append(self._plan)
+            last._ok, last._value = True, None
+            self._env.schedule(last, _LAST)
+
+    def _plan(self, _: simpy.Event | None = None) -> None:
+        """Run a copy ahead to whatever must be told next, and set the timer there."""
         settled, planned = self._settled, self._planned
         now = self._env.now
-        if self._is_telling:
-            if entry is not _NO_ENTRY:
-                self._e.submit(*entry, settled.arrays[_S], settled.arrays[_J])
-            return
+        self._is_replanning = False
         self._timer = None
         self._told = []
         if not self._at_row:
@@ -471,7 +489,7 @@ class Medium(Generic[J, F]):
         until = since + _AHEAD_NS
         if deadlines:
             until = min(until, max(deadlines[0][0], since))
-        planned.now_ns, told = self._e.ahead(self._table(settled), since, until, *entry)
+        planned.now_ns, told = self._e.ahead(self._table(settled), since, until)
         settled.now_ns = since
         if told:
             self._told = [(kind, row, self._at_row.get(row)) for kind, row in self._out[:told].tolist()]
@@ -532,8 +550,8 @@ class Medium(Generic[J, F]):
         return self._busy_s()[0]
 
     def _busy_s(self) -> tuple[float, float]:
-        e, g = self._e, self._settled.arrays[_G].copy()
         self.sync()
+        e, g = self._e, self._settled.arrays[_G].copy()
         e.account(max(self._ns(self._env.now), int(g[e.G_SINCE])), g)
         return float(g[e.G_GROUP_NS]) * _NS, float(g[e.G_OTHER_NS]) * _NS
 

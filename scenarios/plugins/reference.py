@@ -17,6 +17,9 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plugins.user_calls import LOAD_S, Guarded, Source, guarded, watched
 from sortie.scenarios.plugins.user_code import imported_files, is_users, load
@@ -182,6 +185,27 @@ def checked_call(kind: str, function: Callable[..., Any], *args: Any, **kwargs: 
         raise
     except (Exception, SystemExit) as failure:
         raise PluginError(f"{kind} {name_of(function)}: {describe_error(failure)}") from failure
+
+
+def checked_array(
+    kind: str,
+    function: Callable[..., Any],
+    shape: tuple[int, ...],
+    *args: Any,
+    left_out: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64]:
+    """Call a user's model, and check that it returns finite numbers of a shape, but for those left out.
+
+    Raises:
+        PluginError: it fails, or returns another shape or a number that is not finite.
+    """
+    found = np.asarray(checked_call(kind, function, *args), dtype=float)
+    if found.shape != shape:
+        raise PluginError(f"{kind} {name_of(function)}: returns shape {found.shape}, must be {shape}")
+    wrong = ~np.isfinite(found) & (True if left_out is None else ~left_out)
+    if wrong.any():
+        raise PluginError(f"{kind} {name_of(function)}: returns {found[wrong][0]}, must be finite")
+    return found
 
 
 class Guard:

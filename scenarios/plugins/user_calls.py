@@ -68,6 +68,10 @@ class Guarded:
         self._origin = None if source is None else (source.file, source.name)
         self._late = ""  # what it exceeded: it is not called again
 
+    def __deepcopy__(self, memo: object) -> Guarded:
+        """Itself, as Python has it for functions."""
+        return self
+
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """The function's answer."""
         watch = _WATCHES.get(threading.get_ident())

@@ -24,13 +24,16 @@ MODELS = {
     "radio.path_loss": "path_loss",
     "radio.link": "link",
     "perception.detector": "detector",
-    "perception.recorded_fusion": "fusion",
+    "perception.fusion": "fusion",
+    "perception.recorded_fusion": "recorded_fusion",
     "fleet.airframe.power_model": "power",
+    "fleet.battery.cell_model": "cell",
     "fleet.sensor": "sensor",
+    "fleet.mobility": "mobility",
     "policy.name": "policy",
 }
-"""The kind of model that a field names. Makes name policies and power models too, changes of policy name
-policies, events of kind `own` name events, and `metrics` metrics."""
+"""The kind of model that a field names. Makes name policies, power models and cells too, groups of drones mobility models,
+changes of policy policies, events of kind `own` events, and `metrics` metrics."""
 
 
 def builtin(field: str) -> tuple[str, ...]:
@@ -75,6 +78,25 @@ def placed(name: str, folder: Path) -> str:
     return name if os.path.exists(here) or not os.path.exists(folder / name) else str(folder / name)
 
 
+def assigned(field: str, value: Any) -> Any:
+    """Plain sections in which a field alone is given; a place in a list stands first there.
+
+    Example:
+        >>> assigned("events.2.model", "rain.py:Front")
+        {'events': [{'model': 'rain.py:Front'}]}
+    """
+    for name in reversed(field.split(".")):
+        value = [value] if name.isdecimal() else {name: value}
+    return value
+
+
+def value_at(field: str, sections: Any) -> Any:
+    """The field's value in what `assigned` made."""
+    for name in field.split("."):
+        sections = sections[0 if name.isdecimal() else name]
+    return sections
+
+
 def named_models(sections: dict[str, Any]) -> list[tuple[str, str]]:
     """Every model that a scenario's plain sections name, with its kind first: built-in, installed and in files."""
     return [(kind, holder[key]) for kind, holder, key in _models(sections)]
@@ -97,6 +119,9 @@ def _models(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str
     for make in sections.get("fleet", {}).get("makes", ()):
         yield from (("policy", *at) for at in _given(make, ("policy",)))
         yield from (("power", *at) for at in _given(make, ("airframe.power_model",)))
+        yield from (("cell", *at) for at in _given(make, ("battery.cell_model",)))
+    for group in sections.get("fleet", {}).get("groups", ()):
+        yield from (("mobility", *at) for at in _given(group, ("mobility",)))
     for change in sections.get("policy", {}).get("changes", ()):
         yield "policy", change, "name"
     for event in sections.get("events", ()):
@@ -109,8 +134,8 @@ def _given(sections: dict[str, Any], fields: Iterable[str]) -> Iterator[tuple[di
     """The section and the key of each field that is there."""
     for field in fields:
         *above, key = field.split(".")
-        section = functools.reduce(lambda inside, name: inside.get(name) or {}, above, sections)
-        if section.get(key) is not None:
+        section: Any = functools.reduce(lambda inside, name: inside.get(name) or {}, above, sections)
+        if isinstance(section, dict) and section.get(key) is not None:  # otherwise a preset's name
             yield section, key
 
 

@@ -35,14 +35,21 @@ from sortie.scenarios.schema.fleet import (
     Computer,
     DroneOverride,
     Fleet,
-    Formation,
-    Motion,
     Polarisation,
-    Route,
-    Viewpoints,
 )
 from sortie.scenarios.schema.limits import Limits
 from sortie.scenarios.schema.mission import Mission, Phase, Region, Target
+from sortie.scenarios.schema.movement import (
+    FlightGroup,
+    Formation,
+    GroundStation,
+    Leg,
+    Motion,
+    Origin,
+    Route,
+    Steering,
+    Viewpoints,
+)
 from sortie.scenarios.schema.perception import Perception, Person, Scene, Thermal
 from sortie.scenarios.schema.policy import PolicyChange, PolicyCommand, PolicySection, ViewReplay
 from sortie.scenarios.schema.radio import MIN_TILE_BYTES, Bursts, Radio
@@ -72,14 +79,18 @@ __all__ = [
     "Event",
     "Expectation",
     "Fleet",
+    "FlightGroup",
     "Formation",
     "GnssLoss",
+    "GroundStation",
     "HeadingFault",
     "Jam",
     "json_schema",
+    "Leg",
     "Lie",
     "Limits",
     "LinkDrop",
+    "Origin",
     "Own",
     "PositionFault",
     "SlowPerception",
@@ -104,6 +115,7 @@ __all__ = [
     "Section",
     "Soc",
     "Spoof",
+    "Steering",
     "Target",
     "Thermal",
     "Viewpoints",

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -53,6 +56,19 @@ class PresetSection(Section):
         schema["anyOf"] = [{"enum": list(cls.presets)}, {"$ref": schema.pop("$ref")}]
 
 
+_OF_THE_PAST: ContextVar[bool] = ContextVar("_OF_THE_PAST", default=False)
+
+
+@contextmanager
+def models_of_the_past() -> Iterator[None]:
+    """Accept every name of a model within the block: what flew once need not be installed to be read."""
+    token = _OF_THE_PAST.set(True)
+    try:
+        yield
+    finally:
+        _OF_THE_PAST.reset(token)
+
+
 @dataclass(frozen=True)
 class ModelName:
     """Marks text that names a model: a built-in one, an installed plug-in, or `path/to/file.py:Name`."""
@@ -68,7 +84,7 @@ class ModelName:
         return {"anyOf": [*names, {"type": "string", "description": "An installed plug-in, or path/to/file.py:Name."}]}
 
     def _known(self, name: str) -> str:
-        if name in self.builtin or FILE.fullmatch(name) or name in installed(self.kind):
+        if name in self.builtin or FILE.fullmatch(name) or name in installed(self.kind) or _OF_THE_PAST.get():
             return name
         expected = ", ".join(map(repr, (*self.builtin, *installed(self.kind))))
         raise PydanticCustomError("model_name", "unknown {kind}", {"kind": self.kind, "expected": expected})

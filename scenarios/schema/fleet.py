@@ -1,78 +1,25 @@
-"""`fleet`: drones, formation, route, motion, airframe and battery."""
+"""`fleet`: drones, how they move, airframe, battery, computer and cameras."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import DroneId, ModelName, Params, PointM, PresetSection, Section, Soc, inconsistent
-
-
-class Formation(Section):
-    shape: Literal["cross", "line", "wedge", "grid", "circle"] = Field(
-        "cross", description="Slots around the moving reference point."
-    )
-    spacing_m: float = Field(
-        20.0, gt=0, le=500, description="Distance between neighbouring slots (arc length for circle)."
-    )
-    altitude_m: float = Field(60.0, ge=10, le=400, description="Height of the formation above the ground.")
-
-
-class Route(Section):
-    waypoints_m: tuple[PointM, ...] = Field(
-        ((0.0, 0.0),),
-        min_length=1,
-        max_length=1000,
-        description="Ground track of the reference point, ENU (x, y); one point hovers.",
-    )
-    speed_mps: float = Field(5.0, gt=0, le=30, description="Ground speed along the route.")
-    turn_time_s: float = Field(4.0, gt=0, le=60, description="Time over which a corner is rounded.")
-
-
-class Motion(Section):
-    wind_mps: tuple[Annotated[float, Field(ge=-40, le=40)], Annotated[float, Field(ge=-40, le=40)]] = Field(
-        (2.0, 1.0), description="Mean wind, the velocity of the air, ENU (x, y)."
-    )
-    gust_sigma_mps: float = Field(0.8, ge=0, le=15, description="Standard deviation of each gust component.")
-    gust_time_s: float = Field(3.0, gt=0, le=120, description="Correlation time of gusts.")
-    pose_jitter_m: float = Field(
-        0.4, ge=0, le=20, description="Standard deviation of each drone's true offset from its slot, per axis."
-    )
-    pose_jitter_time_s: float = Field(2.5, gt=0, le=120, description="Correlation time of the offset.")
-    pose_error_m: float = Field(
-        0.2, ge=0, le=20, description="Standard deviation of the horizontal position estimate's error, per axis."
-    )
-    heading_error_deg: float = Field(
-        0.2,
-        ge=0,
-        le=45,
-        description="Standard deviation of the heading estimate's error; 0.2° is a dual-antenna receiver, a magnetometer has degrees.",
-    )
-
-
-class Viewpoints(Section):
-    """How far the formation gives way to a policy that chooses viewpoints; the others are asked nothing."""
-
-    reach_m: float = Field(
-        40.0, ge=0, le=50, description="How far from its slot a drone may stand when its policy asks; 0: nowhere else."
-    )
-    speed_mps: float = Field(3.0, gt=0, le=15, description="Fastest that it moves within the formation.")
-    acceleration_mps2: float = Field(1.0, gt=0, le=5, description="Most that it accelerates for it.")
-    separation_m: float = Field(
-        10.0, gt=0, le=500, description="No two drones closer than this, unless their slots are."
-    )
-    fence_m: tuple[float, float, float, float] | None = Field(
-        None, description="Geofence that every drone keeps within, ENU (x_min, y_min, x_max, y_max); left out, none."
-    )
-
-    @model_validator(mode="after")
-    def _fence_holds_something(self) -> Viewpoints:
-        if self.fence_m is not None:
-            x_min, y_min, x_max, y_max = self.fence_m
-            if not (x_min < x_max and y_min < y_max):
-                raise inconsistent(("fence_m",), f"{self.fence_m}", "x_min < x_max and y_min < y_max")
-        return self
+from sortie.scenarios.schema.base import DroneId, ModelName, Params, PresetSection, Section, Soc, inconsistent
+from sortie.scenarios.schema.movement import (
+    FlightGroup,
+    Formation,
+    GroundStation,
+    Mobility,
+    Motion,
+    Origin,
+    Route,
+    Steering,
+    Viewpoints,
+    check_mobility,
+)
 
 
 class Airframe(PresetSection):
@@ -122,6 +69,11 @@ class Battery(Section):
     cell_resistance_mohm: float = Field(
         13.0, ge=0, le=500, description="Internal resistance of one cell with its wiring."
     )
+    cell_model: Annotated[str, ModelName("cell", ("lipo",))] = Field(
+        "lipo",
+        description="Voltage of a cell at rest by its charge: a lithium-polymer cell's, or one of one's own (docs/guide/power_model.md).",
+    )
+    cell_params: Params = Field({}, description="Keyword arguments of a cell of one's own.")
     drivetrain_efficiency: float = Field(0.8, gt=0, le=1, description="Rotor power over electric power.")
     avionics_w: float = Field(8.0, ge=0, le=500, description="Flight controller, sensors, cameras.")
     compute_idle_w: float = Field(10.0, ge=0, le=200, description="Companion computer at rest.")
@@ -295,6 +247,18 @@ class Fleet(Section):
     drones: int = Field(5, ge=1, le=200, description="Number of drones; ids are 0 … drones − 1.")
     formation: Formation = Formation()
     route: Route = Route()
+    groups: tuple[FlightGroup, ...] = Field(
+        (), max_length=200, description="Drones that fly apart from the formation, on ways of their own."
+    )
+    ground: tuple[GroundStation, ...] = Field(
+        (), max_length=200, description="Members of the fleet that stand on the ground: ground stations and relays."
+    )
+    mobility: Mobility = Field(
+        "formation",
+        description="What moves the drones that are in no group: formation and route, a random model, or one of one's own (docs/guide/mobility.md), which begins in the formation's slots.",
+    )
+    mobility_params: Params = Field({}, description="Keyword arguments of the mobility model.")
+    steering: Steering = Steering()
     motion: Motion = Motion()
     viewpoints: Viewpoints = Viewpoints()
     airframe: Airframe = Field(
@@ -321,6 +285,10 @@ class Fleet(Section):
         None,
         description="CSV or Parquet (fleet/traces.py): drones named in it take pose or battery from it, not from the models.",
     )
+    origin: Origin | None = Field(
+        None,
+        description="Where a trace in latitude and longitude has its ENU (0, 0, 0); left out, at its first place, at its lowest altitude.",
+    )
 
     @model_validator(mode="after")
     def _overrides_fit(self) -> Fleet:
@@ -339,6 +307,25 @@ class Fleet(Section):
         return self
 
     @model_validator(mode="after")
+    def _everyone_moves_in_one_way(self) -> Fleet:
+        check_mobility(self.mobility, self.mobility_params)
+        seen: dict[int, str] = {}
+        for at, drone in self._apart():
+            if drone >= self.drones:
+                raise inconsistent(at, f"{drone}", f"below fleet.drones = {self.drones}")
+            if drone in seen:
+                raise inconsistent(at, f"{drone}", f"named once, it is in {seen[drone]} already")
+            seen[drone] = f"{at[0]}.{at[1]}"
+        return self
+
+    def _apart(self) -> Iterator[tuple[tuple[str | int, ...], int]]:
+        """Every drone that is not in the fleet's formation, and where that is written."""
+        for k, group in enumerate(self.groups):
+            yield from ((("groups", k, "drones", i), drone) for i, drone in enumerate(group.drones))
+        for k, station in enumerate(self.ground):
+            yield ("ground", k, "drone"), station.drone
+
+    @model_validator(mode="after")
     def _makes_fit(self) -> Fleet:
         names: set[str] = set()
         made: dict[int, str] = {}
@@ -353,12 +340,11 @@ class Fleet(Section):
                 if drone in made:
                     raise inconsistent(at, f"{drone}", f"of one make, it is of {made[drone]!r} already")
                 made[drone] = make.name
-            altitude_m = self.formation.altitude_m + make.altitude_offset_m
-            if not 10.0 <= altitude_m <= 400.0:
-                bound = (
-                    f"such that its drones fly at 10 to 400 m, formation.altitude_m is {self.formation.altitude_m:g}"
-                )
-                raise inconsistent(("makes", i, "altitude_offset_m"), f"{make.altitude_offset_m:g}", bound)
+            for drone in make.drones:
+                for altitude_m in self._levels_m(drone):
+                    if not 10.0 <= altitude_m + make.altitude_offset_m <= 400.0:
+                        bound = f"such that its drones fly at 10 to 400 m, formation.altitude_m is {altitude_m:g}"
+                        raise inconsistent(("makes", i, "altitude_offset_m"), f"{make.altitude_offset_m:g}", bound)
         return self
 
     def make_of(self, drone: int) -> Make | None:
@@ -399,6 +385,34 @@ class Fleet(Section):
 
     @property
     def altitudes_m(self) -> tuple[float, ...]:
-        """The height at which each drone flies."""
-        common = self.formation.altitude_m
-        return tuple(common if make is None else common + make.altitude_offset_m for make in self.make_of_each)
+        """The height at which each drone flies first; of a ground station, that of its antenna."""
+        heights = []
+        for drone, make in enumerate(self.make_of_each):
+            station = self.station(drone)
+            level_m = self._levels_m(drone)[0] if station is None else station.position_m[2]
+            heights.append(level_m if make is None or station else level_m + make.altitude_offset_m)
+        return tuple(heights)
+
+    def group_of(self, drone: int) -> FlightGroup | None:
+        """The group in which a drone flies apart from the fleet's formation; None for one that does not."""
+        return next((group for group in self.groups if drone in group.drones), None)
+
+    def station(self, drone: int) -> GroundStation | None:
+        """The ground station that a member of the fleet is; None for one that flies."""
+        return next((station for station in self.ground if station.drone == drone), None)
+
+    @property
+    def in_formation(self) -> tuple[int, ...]:
+        """The drones of the fleet's own formation, in the order of its slots."""
+        apart = {drone for _, drone in self._apart()}
+        return tuple(drone for drone in range(self.drones) if drone not in apart)
+
+    def _levels_m(self, drone: int) -> tuple[float, ...]:
+        """The heights at which a drone flies, but for what its make adds; none for a ground station."""
+        if self.station(drone) is not None:
+            return ()
+        group = self.group_of(drone)
+        if group is None:
+            return (self.formation.altitude_m,)
+        legs = (leg.altitude_m for leg in group.legs)
+        return (group.formation.altitude_m, *(altitude_m for altitude_m in legs if altitude_m is not None))

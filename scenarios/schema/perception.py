@@ -58,15 +58,23 @@ class Thermal(Section):
     )
 
 
+FUSIONS = ("none", "late", "fcooper", "v2vnet", "disconet", "when2com", "where2comm")
+"""The built-in ones. The others need the torch detector."""
+
+
 class Perception(Section):
     detector: Annotated[str, ModelName("detector", ("torch", "surrogate", "recorded", "none"))] = Field(
         "torch",
         description="The detector: the network, its fast surrogate, a recording of another model, one of one's own (docs/guide), or none: the traffic alone.",
     )
     detector_params: Params = Field({}, description="Keyword arguments of a detector of one's own.")
-    fusion: Literal["none", "late", "fcooper", "v2vnet", "disconet", "when2com", "where2comm"] = Field(
+    fusion: Annotated[str, ModelName("fusion", FUSIONS)] = Field(
         "disconet",
-        description="How what peers sent is fused; weights belong to a fusion, none and late take any; the surrogate takes its calibration's, or none.",
+        description="How what peers sent is fused, or a fusion of one's own (docs/guide); weights belong to a fusion, none, late and one's own take any; the surrogate takes its calibration's, or none.",
+    )
+    fusion_params: Params = Field(
+        {},
+        description="Keyword arguments of a fusion of one's own. Of disconet, for studies: temperature (the softmax's logits are divided by it) and silent_weight (added to the logit of cells that were not sent and count as zeros).",
     )
     weights: str | None = Field(
         None,
@@ -135,4 +143,6 @@ class Perception(Section):
         for name in ("recording", "recorded_fusion"):
             if not recorded and getattr(self, name) is not None:
                 raise inconsistent((name,), f"{getattr(self, name)!r}", f"left out where detector is {self.detector}")
+        if self.fusion not in FUSIONS and self.detector not in ("torch", "none"):
+            raise inconsistent(("fusion",), f"{self.fusion!r}", f"built in where detector is {self.detector}")
         return self

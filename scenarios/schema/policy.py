@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from sortie.scenarios.schema.base import DroneId, Params, PhaseName, Section, inconsistent
@@ -32,6 +34,10 @@ class ViewReplay(Section):
     at_s: float = Field(ge=0, description="From when the drone's next decision is made on this view.")
     drone: DroneId = Field(description="Whose policy sees it; the view's ego.")
     view: str = Field(min_length=1, description="A fleet view as JSON, as `sortie verify` writes counterexamples.")
+    read_by: Literal["policy", "drone"] = Field(
+        "policy",
+        description="Who reads it: the policy alone, or the drone's staleness rules, damping and invariants too.",
+    )
 
 
 class PolicySection(Section):
@@ -64,7 +70,7 @@ class PolicySection(Section):
         description="Directives that break an invariant are replaced by the nearest that keep it, as far as ages allow.",
     )
     replays: tuple[ViewReplay, ...] = Field(
-        (), max_length=100, description="Views that a policy is shown instead of what its drone heard."
+        (), max_length=600, description="Views that a policy is shown instead of what its drone heard."
     )
 
     @model_validator(mode="after")

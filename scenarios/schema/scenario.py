@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from sortie.scenarios.schema.base import Section, inconsistent
 from sortie.scenarios.schema.context import Context
-from sortie.scenarios.schema.events import BaseEvent, Event, LinkDrop
+from sortie.scenarios.schema.events import BaseEvent, BatteryFault, CellFailure, DroneLeaves, Event, LinkDrop
 from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
 from sortie.scenarios.schema.fleet import Camera, Fleet, Make, Network
 from sortie.scenarios.schema.limits import Limits
@@ -24,6 +24,8 @@ from sortie.scenarios.schema.record import RecordSection
 
 LEARNED = ("torch", "surrogate")
 """Detectors with weights, which makes may name."""
+OF_A_DRONE = DroneLeaves, BatteryFault, CellFailure
+"""Events that a ground station on mains power cannot have."""
 GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -65,6 +67,7 @@ class Scenario(Section):
             until_s = getattr(event, "until_s", None)
             if until_s is not None and until_s <= event.at_s:
                 raise inconsistent(("events", i, "until_s"), f"{until_s:g}", f"above at_s = {event.at_s:g}")
+        self._stations_stay()
         # What is done at an instant must have its instant. Phases and expected decisions may lie beyond the end: missions
         # are flown shortened, and an expectation of a time that was not flown fails.
         policy = self.policy
@@ -85,6 +88,19 @@ class Scenario(Section):
             bound = f"above degraded_after_periods = {degraded:g}"
             raise inconsistent(("context", "detached_after_periods"), f"{detached:g}", bound)
         return self
+
+    def _stations_stay(self) -> None:
+        """Check that no ground station is sent home, and that what fails of one is there."""
+        for i, event in enumerate(self.events):
+            station = self.fleet.station(event.drone) if isinstance(event, OF_A_DRONE) else None
+            if station is not None and (isinstance(event, DroneLeaves) or station.mains):
+                bound = "a drone that flies, it is a ground station" + " on mains power" * station.mains
+                raise inconsistent(("events", i, "drone"), f"{station.drone}", bound)
+        for k, group in enumerate(self.mission.groups):
+            for i, drone in enumerate(group.drones):
+                if group.reserve and self.fleet.station(drone) is not None:
+                    bound = "a drone that flies where there is a reserve, it is a ground station"
+                    raise inconsistent(("mission", "groups", k, "drones", i), f"{drone}", bound)
 
     def _makes_fit(self) -> None:
         """Check what makes say against the other sections."""
@@ -142,14 +158,16 @@ class Scenario(Section):
                 return ""
             if make.feature_space is not None:
                 return make.feature_space
-            return "" if make.weights is None and self._network(make) == common else make.name
+            return "" if self._network(make) == common else make.name
 
         return tuple(space(make) for make in self.fleet.make_of_each)
 
     @property
     def context_only(self) -> tuple[bool, ...]:
-        """Whether each drone is of a make without a detector."""
-        return tuple(make is not None and make.detector == "none" for make in self.fleet.make_of_each)
+        """Whether each drone is of a make without a detector, or a ground station without cameras."""
+        blind = {station.drone for station in self.fleet.ground if not station.camera}
+        makes = enumerate(self.fleet.make_of_each)
+        return tuple(i in blind or (make is not None and make.detector == "none") for i, make in makes)
 
     @property
     def compute_delays_s(self) -> tuple[float, ...]:

@@ -21,7 +21,7 @@ from sortie.policies.contract import PolicyError
 from sortie.policies.registry import resolve
 from sortie.scenarios.plugins.user_code import imported_files
 from sortie.scenarios.reading.campaign import Study, extremes
-from sortie.scenarios.reading.files import FIELDS, found_beside, named_files, placed, with_files
+from sortie.scenarios.reading.files import assigned, found_beside, named_files, placed, value_at, with_files
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.reading.nodes import ScenarioError, as_node, assign, plain
 from sortie.scenarios.schema import Perception
@@ -191,12 +191,12 @@ def make_plan(study: Study) -> CampaignPlan:
     ]
     spec, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
     reading = [sections | {"policy": {}}, *({"policy": section} for _, section in policies)]
-    for field in sorted(campaign.vary.keys() & set(FIELDS)):
-        room, _, key = field.partition(".")
+    for field in sorted(campaign.vary):
         holder, within = (columns, field) if field in columns else (spec["vary"][field], "values")
-        varied = [with_files({room: {key: name}}, place) for name in holder[within]]
-        holder[within] = [section[room][key] for section in varied]
-        reading += varied
+        sections_of = [assigned(field, value) for value in holder.get(within) or ()]
+        if any(named_files(each) for each in sections_of):
+            reading += (varied := [with_files(each, place) for each in sections_of])
+            holder[within] = [value_at(field, each) for each in varied]
     _check_metrics(study, [section for _, section in policies])
     return CampaignPlan(
         {

@@ -82,7 +82,9 @@ def unused(folder: Path, stem: str) -> Path:
     """A free path in the folder for a `.json` and a `.yaml` file; the folder is made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [stem, *(f"{stem}_{k}" for k in range(2, 1000))]
-    return next(folder / name for name in names if not (folder / f"{name}.json").exists())
+    return next(
+        folder / name for name in names if not any((folder / f"{name}{e}").exists() for e in (".json", ".yaml"))
+    )
 
 
 def raised_ages(policy: Policy, view: FleetView) -> dict[int, float] | None:
@@ -119,3 +121,8 @@ def shows_in_flight(scenario: Scenario) -> bool:
     except Exception:  # what is no directive trips the audit before the contract names it: kept as a view alone
         return False
     return record.totals["invariant_violations"] > 0
+
+
+def breaks(scenario: Scenario) -> bool:
+    """Whether the scenario's flight breaks an invariant."""
+    return run_sortie(scenario).totals["invariant_violations"] > 0

@@ -1,12 +1,20 @@
 """`pytest my_scenarios/`: every expectation of every scenario file is a test.
 
 A YAML file is a scenario with something to check where it has, on top, a `name` and `expect` or `expect_decisions`, or
-a golden outcome beside it, whether in block or in flow style; other YAML files are left alone. A file's sorties are flown
-once, when its first test runs.
+a golden outcome beside it, whether in block or in flow style; other YAML files are left alone. The ini option
+`sortie_scenarios` names the scenario files instead, by patterns below the root folder:
+
+    [pytest]
+    sortie_scenarios = scenarios/*.yaml
+
+A file's sorties are flown once, when its first test runs. Under pytest-xdist one worker flies them, and the others wait
+for its verdicts.
 """
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,14 +22,21 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from sortie.sim.check.checking import Checked
     from sortie.sim.check.expectations import Verdict
+    from sortie.sim.check.once import Flown
 
 WRITTEN = pytest.StashKey[list[str]]()
+NAMED = pytest.StashKey[frozenset[Path]]()
+"""The files that `sortie_scenarios` names."""
+SHARED = pytest.StashKey[Path]()
+"""In the process that starts workers: the folder in which they share verdicts."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """`--sortie-update` and `--sortie-set`."""
+    """`--sortie-update`, `--sortie-set`, and the ini option `sortie_scenarios`."""
+    parser.addini(
+        "sortie_scenarios", "Patterns of scenario files, below the root folder; left out, they are recognised.", "args"
+    )
     group = parser.getgroup("sortie")
     group.addoption("--sortie-update", action="store_true", help="Write golden outcomes of scenarios anew.")
     group.addoption(
@@ -39,6 +54,24 @@ def pytest_configure(config: pytest.Config) -> None:
             ensure_own(config.getoption("sortie_set"), update=True)
         except RunError as error:
             raise pytest.UsageError(str(error)) from None
+    patterns = config.getini("sortie_scenarios")
+    if patterns:
+        config.stash[NAMED] = frozenset(path for each in patterns for path in config.rootpath.glob(each))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    """xdist starts a worker: tell it where verdicts are shared."""
+    stash = node.config.stash
+    if SHARED not in stash:
+        stash[SHARED] = Path(tempfile.mkdtemp(prefix="sortie-check-"))
+    node.workerinput["sortie_shared"] = str(stash[SHARED])
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove what workers shared."""
+    if SHARED in config.stash:
+        shutil.rmtree(config.stash[SHARED], ignore_errors=True)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
@@ -51,15 +84,19 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> ScenarioFi
     """A scenario file with expectations."""
     if file_path.suffix not in (".yaml", ".yml"):  # nothing is imported for other projects' files
         return None
-    from sortie.sim.check.discovery import is_scenario
+    if NAMED in parent.config.stash:
+        is_one = file_path in parent.config.stash[NAMED]
+    else:
+        from sortie.sim.check.discovery import is_scenario
 
-    return ScenarioFile.from_parent(parent, path=file_path) if is_scenario(file_path) else None
+        is_one = is_scenario(file_path)
+    return ScenarioFile.from_parent(parent, path=file_path) if is_one else None
 
 
 class ScenarioFile(pytest.File):
     """One scenario, flown when its first test runs."""
 
-    _checked: Checked | None = None
+    _flown: Flown | None = None
 
     def collect(self) -> Iterator[ScenarioItem]:
         """One test an expectation, and one for the golden outcome."""
@@ -78,16 +115,27 @@ class ScenarioFile(pytest.File):
         for i, name in enumerate(names):
             yield ScenarioItem.from_parent(self, name=name, number=i)
 
-    def checked(self) -> Checked:
+    def flown(self) -> Flown:
         """The verdicts, in the order of the tests."""
-        from sortie.sim.check.checking import check_scenario
+        from sortie.sim.check.once import flown_once
 
-        if self._checked is None:
-            update, overrides = (self.config.getoption(f"sortie_{n}") for n in ("update", "set"))
-            self._checked = check_scenario(str(self.path), overrides, update=update)
-            if self._checked.written:
-                self.config.stash.setdefault(WRITTEN, []).append(self._checked.written)
-        return self._checked
+        if self._flown is None:
+            shared = getattr(self.config, "workerinput", {}).get("sortie_shared")
+            self._flown = flown_once(None if shared is None else Path(shared), self.path, self._fly)
+            if self._flown.written:
+                self.config.stash.setdefault(WRITTEN, []).append(self._flown.written)
+        return self._flown
+
+    def _fly(self) -> Flown:
+        from sortie.sim.check.checking import check_scenario
+        from sortie.sim.check.once import Flown
+
+        update, overrides = (self.config.getoption(f"sortie_{n}") for n in ("update", "set"))
+        try:
+            checked = check_scenario(str(self.path), overrides, update=update)
+        except ValueError as error:  # scenarios, policies and files tell what is wrong in one line
+            return Flown(error=f"{type(error).__name__}: {error}")
+        return Flown(checked.verdicts, tuple(map(checked.replay, checked.verdicts)), checked.written)
 
 
 class ScenarioItem(pytest.Item):
@@ -100,26 +148,32 @@ class ScenarioItem(pytest.Item):
     def runtest(self) -> None:
         """Fly the scenario if this is its first test, and raise where the verdict is a failure."""
         assert isinstance(self.parent, ScenarioFile)  # noqa: S101
-        checked = self.parent.checked()
-        if self.number >= len(checked.verdicts):  # the golden outcome
-            if not checked.written:
+        flown = self.parent.flown()
+        if flown.error:
+            raise FlightFailed(flown.error)
+        if self.number >= len(flown.verdicts):  # the golden outcome
+            if not flown.written:
                 pytest.skip("not compared under --sortie-set")
             return
-        verdict = checked.verdicts[self.number]
+        verdict = flown.verdicts[self.number]
         if not verdict.holds:
-            raise ExpectationFailed(verdict, checked.replay(verdict))
+            raise ExpectationFailed(verdict, flown.replays[self.number])
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """A failed expectation in words; an error that the user can correct in one line."""
         if isinstance(excinfo.value, ExpectationFailed):
             return excinfo.value.in_words()
-        if isinstance(excinfo.value, ValueError):  # scenarios, policies and files tell what is wrong in one line
-            return f"{type(excinfo.value).__name__}: {excinfo.value}"
+        if isinstance(excinfo.value, FlightFailed):
+            return str(excinfo.value)
         return super().repr_failure(excinfo, style)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
         """The test's file and name."""
         return self.path, None, f"{self.path.name}: {self.name}"
+
+
+class FlightFailed(Exception):
+    """A flight without verdicts: an error that the user can correct."""
 
 
 class ExpectationFailed(AssertionError):

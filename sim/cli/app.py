@@ -37,10 +37,11 @@ from sortie.sim.cli import (
 from sortie.sim.cli.console import err, out
 from sortie.sim.identity import code_version
 from sortie.sim.process import own_process
+from sortie.sim.user_errors import missing
 
 
 class _Commands(TyperGroup):
-    """Prints that a command was interrupted; typer alone ends it silently."""
+    """Prints that a command was interrupted, which typer alone ends silently, or which extra it lacks."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -48,6 +49,8 @@ class _Commands(TyperGroup):
         except KeyboardInterrupt:
             err.print("interrupted; what was not finished was not written")
             raise typer.Exit(130) from None
+        except ImportError as error:
+            raise missing(error) from error
 
 
 app = typer.Typer(

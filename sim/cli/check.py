@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import sortie
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.campaign import read_any
 from sortie.scenarios.reading.load import ScenarioError, campaigns, condition_sets, library
+from sortie.sim.check.junit import Suite, junit
 from sortie.sim.cli import tables
 from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import SetOption
+from sortie.sim.folders import ensure_files, write_text
 
 
 def check(
@@ -27,6 +32,9 @@ def check(
     update: Annotated[
         bool, typer.Option("--update", help="Write NAME.golden.json beside each scenario instead of comparing with it.")
     ] = False,
+    junit_file: Annotated[
+        Path | None, typer.Option("--junit", help="Write the verdicts as JUnit XML too, for build servers.")
+    ] = None,
 ) -> None:
     """Fly scenarios and compare their outcomes with their own expectations. Exit code 1 if one fails."""
     from sortie.sim.check.checking import flights
@@ -37,20 +45,32 @@ def check(
 
     names = list(library()) if scenarios == ["all"] else [file for name in scenarios for file in scenario_files(name)]
     loaded = [(name, sortie.load(name, set_ or [])) for name in names]  # all of them, before the first one flies
-    failed = 0
+    ensure_files(junit_file)
+    failed, suites = 0, list[Suite]()
     for name, flown in loaded:
-        with bars() as bar:
-            watch = bar(flown.name, flown.duration_s * flights(flown))
-            (checked,) = sortie.check(name, set_ or [], update=update, progress=watch)
+        try:
+            with bars() as bar:
+                watch = bar(flown.name, flown.duration_s * flights(flown))
+                (checked,) = sortie.check(name, set_ or [], update=update, progress=watch)
+        except SortieError as error:
+            _write_junit(junit_file, [*suites, Suite(name, None, str(error))])
+            raise
+        suites.append(Suite(name, checked))
         failed += len(checked.failed)
         out.print(tables.verdict_table(flown.name, checked.verdicts))
         if checked.written:
             out.print(checked.written, soft_wrap=True, markup=False)
         for command in dict.fromkeys(map(checked.replay, checked.failed)):
             out.print(f"see it with: {command}", soft_wrap=True, markup=False)
+    _write_junit(junit_file, suites)
     if failed:
         err.print(f"[red]{failed} expectation{'s' if failed > 1 else ''} failed[/red]")
         raise typer.Exit(1)
+
+
+def _write_junit(file: Path | None, suites: Sequence[Suite]) -> None:
+    if file is not None:
+        write_text(file, junit(suites))
 
 
 def _check_syntax(files: list[str], overrides: list[str] | None) -> None:

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-out = Console()
-err = Console(stderr=True, highlight=False)
+out = Console(emoji=False)  # `mine.py:link:` is a file's name
+err = Console(stderr=True, highlight=False, emoji=False)
 
 
 @contextmanager

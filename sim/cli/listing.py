@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, get_args
 
 import typer
 from pydantic import BaseModel
 from rich.markup import escape
 
+from sortie.fleet.flight.mobility import MOBILITY
 from sortie.perception.detectors import DETECTORS
-from sortie.policies.registry import POLICIES, missing_parts, parameters
-from sortie.policies.verification.invariants import CONSTANTS, LINK_FUNCTIONS, WORDS
-from sortie.scenarios.plugins.reference import installed
+from sortie.policies import registry
+from sortie.policies.registry import POLICIES, missing_parts
+from sortie.policies.verification.words import CONSTANTS, LINK_FUNCTIONS, TIME_WORDS, WORDS
+from sortie.scenarios.plugins.reference import PluginError, installed, parameters, resolve
 from sortie.scenarios.reading.files import MODELS, builtin
 from sortie.scenarios.reading.load import campaigns, library, load
-from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema import Event, Scenario
 from sortie.scenarios.schema.campaign import Campaign
 from sortie.scenarios.schema.conditions import ConditionSet
-from sortie.sim.cli.console import out
+from sortie.sim.cli.console import err, out
 
-WHAT = "policies, scenarios, campaigns, detectors, fusions, invariants, path_loss, link, power, sensor, event, metric"
-
-
+Lines = Iterator[str]
+KINDS = list(dict.fromkeys([*(kind for kind in MODELS.values() if kind != "recorded_fusion"), "event", "metric"]))
+"""Kinds of models that can be replaced from outside."""
+PLURALS = {"policies": "policy", "detectors": "detector", "fusions": "fusion"}
 SCHEMAS: dict[str, type[BaseModel]] = {
     "schema": Scenario,
     "campaign_schema": Campaign,
@@ -29,6 +34,77 @@ SCHEMAS: dict[str, type[BaseModel]] = {
 }
 """For editors: `sortie list schema > sortie.schema.json`, and `# yaml-language-server: $schema=sortie.schema.json` as the
 first line of a file."""
+ABOUT = {
+    "free_space": "Friis' formula",
+    "log_distance": "free space at 1 m, then a power of distance: radio.path_loss_exponent",
+    "two_ray": "the direct ray and the one that the ground reflects: radio.ground_roughness_m",
+    "lipo": "a lithium-polymer cell: a monotone cubic through seven published points",
+    "level": "the formula for level flight, and m·g·v_z while climbing, from the fields of fleet.airframe",
+    "momentum": "momentum theory with climb, gusts and acceleration, from the fields of fleet.airframe",
+}
+"""Built-in models that are settings of the scenario's own fields."""
+
+
+def _policies() -> Lines:
+    for name, function in POLICIES.items():
+        missing = f" Missing: {missing_parts(name)}." if missing_parts(name) else ""
+        yield _line(name, registry.parameters(function), _summary(function) + missing)
+
+
+def _detectors() -> Lines:
+    for name, kind in DETECTORS.items():
+        yield _line(name, {}, kind.about)
+
+
+def _fusions() -> Lines:
+    from sortie.perception.network.fusion.registry import FUSIONS  # here: torch takes a second to import
+
+    for name, fusion in FUSIONS.items():
+        yield _line(name, {}, fusion.about)
+
+
+def _mobility() -> Lines:
+    yield _line("formation", {}, "slots about a point on a route: fleet.formation, fleet.route, fleet.groups")
+    for name, model in MOBILITY.items():
+        yield _line(name, parameters(model), _summary(model))
+
+
+def _events() -> Lines:
+    for event in get_args(get_args(Event)[0]):
+        given = {key: "…" if field.is_required() else field.default for key, field in event.model_fields.items()}
+        name = get_args(event.model_fields["kind"].annotation)[0]
+        del given["kind"]
+        yield _line(name, given, "")
+
+
+def _scenarios() -> Lines:
+    for name, path in library().items():
+        yield _line(name, {}, load(path).description)
+
+
+def _campaigns() -> Lines:
+    from sortie.scenarios.reading.campaign import load_campaign
+
+    for name in campaigns():
+        yield _line(name, {}, load_campaign(name).campaign.description)
+
+
+def _invariants() -> Lines:
+    for name, word in WORDS.items():
+        yield f"{_line(name, {}, word.about + (' (of each link)' if word.of_link else ''))}\n    {escape(word.example)}"
+    yield "words about time, judged in flight and over whole courses:"
+    for name, (about, example) in TIME_WORDS.items():
+        yield f"{_line(name, {}, about)}\n    {escape(example)}"
+    yield f"functions over all links: {', '.join(LINK_FUNCTIONS)}"
+    yield f"names of values: {', '.join(CONSTANTS)}"
+
+
+LISTS: Mapping[str, Callable[[], Lines]] = {
+    "policy": _policies, "detector": _detectors, "fusion": _fusions, "event": _events, "mobility": _mobility, "scenarios": _scenarios,
+    "campaigns": _campaigns, "invariants": _invariants,
+}  # fmt: skip
+"""Those that know more than names."""
+WHAT = f"{', '.join(KINDS)}, scenarios, campaigns, invariants"
 
 
 def list_(
@@ -37,49 +113,42 @@ def list_(
         typer.Argument(help=f"What to list: {WHAT}, or a JSON Schema: {', '.join(SCHEMAS)}."),
     ],
 ) -> None:
-    """List policies, scenarios and other names that commands take."""
-    if what == "policies":
-        for name, function in POLICIES.items():
-            defaults = ", ".join(f"{k}={v}" for k, v in parameters(function).items())
-            summary = (function.__doc__ or "").strip().splitlines()[0]
-            missing = f" Missing: {missing_parts(name)}." if missing_parts(name) else ""
-            out.print(f"[bold]{name}[/bold]{f'({defaults})' if defaults else ''}  {summary}{missing}", soft_wrap=True)
-        _installed("policy")
-    elif what == "scenarios":
-        for name, path in library().items():
-            out.print(f"[bold]{name}[/bold]  {load(path).description}", soft_wrap=True)
-    elif what == "campaigns":
-        from sortie.scenarios.reading.campaign import load_campaign
-
-        for name in campaigns():
-            out.print(f"[bold]{name}[/bold]  {load_campaign(name).campaign.description}", soft_wrap=True)
-    elif what == "detectors":
-        for name, kind in DETECTORS.items():
-            out.print(f"[bold]{name}[/bold]  {kind.about}", soft_wrap=True)
-        _installed("detector")
-    elif what in (*MODELS.values(), "event", "metric"):
-        for name in next((builtin(field) for field, kind in MODELS.items() if kind == what), ()):
-            out.print(f"[bold]{name}[/bold]", soft_wrap=True)
-        _installed(what)
-    elif what == "fusions":
-        from sortie.perception.network.fusion.registry import FUSIONS  # here: torch takes a second to import
-
-        for name, fusion in FUSIONS.items():
-            out.print(f"[bold]{name}[/bold]  {fusion.about}", soft_wrap=True)
-    elif what == "invariants":
-        for name, word in WORDS.items():
-            scope = " (of each link)" if word.of_link else ""
-            out.print(f"[bold]{name}[/bold]  {escape(word.about)}{scope}", soft_wrap=True)
-        out.print(f"functions over all links: {', '.join(LINK_FUNCTIONS)}", soft_wrap=True)
-        out.print(f"names of values: {', '.join(CONSTANTS)}", soft_wrap=True)
-    elif what in SCHEMAS:
+    """List the models of a kind, built-in and installed, with their parameters; or scenarios and other names."""
+    if what in SCHEMAS:
         out.print_json(data=SCHEMAS[what].model_json_schema())
-    else:
+        return
+    kind = PLURALS.get(what, what)
+    if kind not in (*KINDS, *LISTS):
         raise typer.BadParameter(f"{what!r}, must be {WHAT}, {', '.join(SCHEMAS)}")
+    lines = [*LISTS.get(kind, lambda: _named(kind))(), *_installed(kind)]
+    for line in lines:
+        out.print(line, soft_wrap=True)
+    if not lines:
+        err.print(f"no {kind} is built in or installed; name one of your own: path/to/file.py:Name", soft_wrap=True)
 
 
-def _installed(kind: str) -> None:
-    """The models of a kind that installed packages offer."""
+def _named(kind: str) -> Lines:
+    """Built-in models of which the schema has the names."""
+    for name in next((builtin(field) for field, of in MODELS.items() if of == kind), ()):
+        yield _line(name, {}, ABOUT.get(name, ""))
+
+
+def _installed(kind: str) -> Lines:
+    """The models of a kind that installed packages offer; one that does not load says why."""
     for name, entry in installed(kind).items():
         package = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
-        out.print(f"[bold]{name}[/bold]  {escape(package)}", soft_wrap=True)
+        try:
+            model = resolve(kind, name)
+            yield _line(name, parameters(model), f"{_summary(model)} ({package})".strip())
+        except PluginError as error:
+            yield _line(name, {}, f"({package}) {error}")
+
+
+def _line(name: str, given: Mapping[str, object], about: str) -> str:
+    inside = ", ".join(f"{key}={value}" for key, value in given.items())
+    return f"[bold]{name}[/bold]{escape(f'({inside})' if inside else '')}  {escape(about)}".rstrip()
+
+
+def _summary(model: Any) -> str:
+    """The first line of a model's docstring."""
+    return (inspect.getdoc(inspect.unwrap(model)) or "").partition("\n")[0]

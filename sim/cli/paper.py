@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from sortie.perception.evaluation import report
+from sortie.perception.evaluation.condition import Absent, CellsBy, Serve, Ways
 from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow, differ_by_chance
 from sortie.perception.evaluation.verdict import ClaimVerdict
 from sortie.sim.cli.console import out, stages
@@ -41,6 +42,18 @@ def paper(
         str, typer.Option(help="How unsent cells enter the fusion: zero (the paper), masked, or both.")
     ] = "both",
     cells_by: Annotated[str, typer.Option(help="How cells are ranked: confidence or norm.")] = "confidence",
+    absent: Annotated[
+        str, typer.Option(help="Peers that were not chosen: excluded from the fusion, or zeros in it.")
+    ] = "excluded",
+    serve: Annotated[
+        str, typer.Option(help="Which cells go first: grid (by rank alone), or region_first (the mission's disc).")
+    ] = "grid",
+    temperature: Annotated[
+        float, typer.Option(help="The fusion softmax's logits are divided by it; inf gives equal weights.")
+    ] = 1.0,
+    silent_weight: Annotated[
+        float, typer.Option(help="Added to a silent peer's logit in the fusion's softmax, under zero fill.")
+    ] = 0.0,
     tau: Annotated[float, typer.Option(help="Score threshold.")] = 0.1,
     scenes: Annotated[bool, typer.Option("--by-scene", help="Resample whole scenes instead of frames.")] = False,
     workers: Annotated[
@@ -76,15 +89,25 @@ def paper(
     chosen = {"both": ("zero", "masked"), "zero": ("zero",), "masked": ("masked",)}.get(unsent)
     if chosen is None:
         raise RunError(f"unsent is {unsent!r}, must be zero, masked or both")
-    if cells_by not in ("confidence", "norm"):
-        raise RunError(f"cells_by is {cells_by!r}, must be confidence or norm")
+    for name, value, allowed in (
+        ("cells_by", cells_by, get_args(CellsBy)),
+        ("absent", absent, get_args(Absent)),
+        ("serve", serve, get_args(Serve)),
+    ):
+        if value not in allowed:
+            raise RunError(f"{name} is {value!r}, must be {' or '.join(allowed)}")
+    given = {"temperature": temperature, "silent_weight": silent_weight}
+    fusion_params = {name: value for name, value in given.items() if value != {"temperature": 1.0}.get(name, 0.0)}
     if frame is not None and (readme is not None or against is not None):
         raise RunError(f"--{'against' if readme is None else 'readme'} goes with the whole report, not with --frame")
     ensure_between(readme, report.BEGIN, report.END)
     try:
-        asked = TableSettings(chosen, cells_by, tau, "scene" if scenes else "frame")  # type: ignore[arg-type]
+        ways = Ways(absent, serve)  # type: ignore[arg-type]
+        asked = TableSettings(chosen, cells_by, tau, "scene" if scenes else "frame", ways=ways)  # type: ignore[arg-type]
         cores = workers or os.cpu_count() or 1
-        job = making.PaperSettings(weights or SHIPPED_WEIGHTS, asked, frames, seed, cores, _command(context), live)
+        job = making.PaperSettings(
+            weights or SHIPPED_WEIGHTS, asked, frames, seed, cores, _command(context), live, fusion_params
+        )
         if frame is not None:
             _open_frame(
                 making.frame_picture(job, work, frame, ego),
@@ -195,7 +218,21 @@ def _command(context: typer.Context) -> str:
     for parameter in context.command.params:
         name, value = parameter.name, context.params.get(parameter.name or "")
         if (
-            name in ("frames", "seed", "weights", "unsent", "cells_by", "tau", "scenes", "live")
+            name
+            in (
+                "frames",
+                "seed",
+                "weights",
+                "unsent",
+                "cells_by",
+                "absent",
+                "serve",
+                "temperature",
+                "silent_weight",
+                "tau",
+                "scenes",
+                "live",
+            )
             and value != parameter.default
         ):
             shown = value.name if isinstance(value, Path) else value

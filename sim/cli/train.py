@@ -47,7 +47,9 @@ def train(
         float, typer.Option(help="Share of the links whose cells are randomly dropped, 0 to 1.", min=0, max=1)
     ] = 0.0,
     unsent: Annotated[Unsent, typer.Option(help="How a dropped cell enters the fusion in training.")] = Unsent.masked,
-    fusion: Annotated[str, typer.Option(help="Fusion method, see `sortie list fusions`.")] = "disconet",
+    fusion: Annotated[
+        str, typer.Option(help="Fusion method, see `sortie list fusion`, or path/to/file.py:Name.")
+    ] = "disconet",
     exchange: Annotated[
         ExchangeForm, typer.Option(help="Features after or before the last ReLU.")
     ] = ExchangeForm.rectified,
@@ -55,7 +57,10 @@ def train(
     range_: Annotated[Range, typer.Option("--range", help="How far the grids reach, ± metres.")] = Range.full,
     bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
     bench_dir: Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")] = Path("runs/bench"),
-    warm_start: Annotated[Path | None, typer.Option(help="Start from these weights, where their shapes fit.")] = None,
+    warm_start: Annotated[
+        Path | None,
+        typer.Option(help="Start from this weights file, or from those shipped for a fusion, where shapes fit."),
+    ] = None,
     minutes: Annotated[float | None, typer.Option(help="Stop after this many minutes.", min=0.1)] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda; default: cuda where available.")] = None,
     resume: Annotated[bool, typer.Option(help="Continue from the last checkpoint.")] = True,
@@ -66,16 +71,20 @@ def train(
     """
     from sortie.perception.benchmark.dataset import Benchmark  # here: torch takes a second to import
     from sortie.perception.geometry import Geometry
+    from sortie.perception.network.detector import shipped
     from sortie.perception.network.fusion.registry import FUSIONS
     from sortie.perception.network.model import ModelConfig
     from sortie.perception.training.recipe import Recipe
     from sortie.perception.training.train import device_named
     from sortie.perception.training.train import train as train_detector
+    from sortie.scenarios.plugins.reference import resolve
     from sortie.sim.cli import tables
     from sortie.sim.playback.training import TrainingLog
 
     half_extent_m = float(range_.value)
     with user_errors():  # before scenes are rendered, which takes minutes
+        if str(warm_start) in FUSIONS:
+            warm_start = shipped(str(warm_start))
         recipe = Recipe(
             steps=steps,
             seed=seed,
@@ -86,7 +95,7 @@ def train(
             warm_start=warm_start.name if warm_start else "",
         )
         if fusion not in FUSIONS:
-            raise ValueError(f"fusion is {fusion!r}, must be one of {', '.join(FUSIONS)}")
+            resolve("fusion", fusion, None, FUSIONS)
         device_named(device)
         if warm_start is not None and not warm_start.is_file():
             raise ValueError(f"{warm_start}: no such weights")

@@ -15,6 +15,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+import sortie
 from sortie.policies.contract import FleetView, Policy
 from sortie.policies.registry import resolve
 from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
@@ -23,16 +24,23 @@ from sortie.policies.verification.proof import BUDGET_S, DRONES, PLANE, ProofVer
 from sortie.policies.verification.properties import PROMISES
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
 from sortie.policies.verification.views import to_json
+from sortie.scenarios.plugins.reference import Params
 from sortie.scenarios.plugins.user_calls import DECISION_S, watched
-from sortie.scenarios.reading.load import dump, loads
+from sortie.scenarios.reading.load import build, dump, loads
 from sortie.scenarios.schema import PolicySection, Scenario
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
+from sortie.sim.check.kits import KITS
+from sortie.sim.check.kits import verify as verify_model
+from sortie.sim.check.over_time import COURSES, Subject, TimeVerdict, judge_over_time
 from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import split_policies
 from sortie.sim.folders import RunError, write_text
 from sortie.sim.studies.overhead import SCENARIO, SECONDS, host_s, measure
 from sortie.sim.studies.plane_cost import machine
 
+Kept = tuple[str, FleetView | None, Scenario]
+"""What failed, a view that shows it if one alone does, and a scenario that flies it."""
+WRITTEN = "# A counterexample, written by sortie verify.\n"
 COLOURS = {
     "holds": "green", "fails": "red", "proved": "green", "proved over the reals": "green", "refuted": "red",
     "searched": "yellow", "drawn": "yellow",
@@ -40,7 +48,13 @@ COLOURS = {
 
 
 def verify(
-    policy: Annotated[str, typer.Argument(help="A policy's name, name(key=value), or path/to/file.py:function.")],
+    model: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[KIND] REF",
+            help=f"A kind of model, by default policy (others: {', '.join(KITS)}), and a name, name(key=value), or path/to/file.py:Name.",
+        ),
+    ],
     invariants: Annotated[
         Path | None,
         typer.Option(
@@ -53,20 +67,63 @@ def verify(
         typer.Option(help="Time for the search of all properties together, s; what it covered is printed.", min=0),
     ] = BUDGET_S,
     views: Annotated[int, typer.Option(help="Number of random views that the kit tries.", min=10)] = VIEWS,
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="For lines about time: its dwell time, ages and shield apply, and it is flown too."),
+    ] = None,
+    courses: Annotated[
+        int, typer.Option(help="Number of drawn courses of views for each line about time.", min=1)
+    ] = COURSES,
+    flights: Annotated[int, typer.Option(help="Number of flights of the scenario for each of them.", min=0)] = 10,
     out_dir: Annotated[Path, typer.Option("--out", help="Folder for counterexamples.")] = Path("runs/verify"),
 ) -> None:
-    """Try a policy on random views, prove its properties, and save a counterexample of each that fails.
+    """Test a policy or another model against the rules of its kind. Exit code 1 if a rule fails.
 
-    Each verdict says what it covers: *proved* for all views of fleets up to a size, *proved over the reals*, *searched*,
-    or *drawn* views alone. Exit code 1 if a rule fails or a property is refuted. A counterexample is a view as JSON, and a scenario that
-    shows it to the policy in flight: `sortie check` on it fails until the policy is mended.
+    A policy is tried on random views, and its properties are proved. The options apply to policies alone. Each verdict says
+    what it covers: *proved* for all views of fleets up to a size, *proved over the reals*, *searched*, or *drawn* views alone.
+    Lines about time (`within 0.5 s: …`, `climbs_in(dwell) <= 1`) are judged on what the gates enforce, after staleness
+    rules and damping, over courses of views. Exit code 1 too if a property is refuted. A counterexample is a view as JSON,
+    and a scenario that shows it to the policy in flight: `sortie check` on it fails until the policy is mended.
     """
-    section = _section(policy)
+    kind, reference = model if len(model) == 2 else ("policy", model[0])
+    if len(model) > 2 or (model[0] in KITS and len(model) == 1):
+        raise RunError(f"verify {' '.join(model)}, must be [KIND] REF, as in: sortie verify link houses.py:Blocked")
+    if kind != "policy":
+        return _verify_model(kind, reference)
+    policy, section = reference, _section(reference)
+    flown = None if scenario is None else sortie.load(scenario)
     decide = resolve(section.name, section.params)
     rules = _invariants(section.name, decide, invariants)
     _ensure_own(out_dir / slug(policy))
+    over_time = [rule for rule in rules if rule.over_time]
     with watched(DECISION_S):
-        broken = _try(policy, section, decide, rules, drones, budget, views, out_dir)
+        broken, kept = _try(
+            policy, section, decide, [r for r in rules if not r.over_time], drones, budget, views, bool(over_time)
+        )
+        if over_time:
+            subject = Subject(decide, section.name, section.params)
+            verdicts = judge_over_time(
+                subject, over_time, drones=drones, budget_s=budget, scenario=flown, courses=courses, flights=flights
+            )
+            out.print(_verdicts(f"{escape(policy)}: over time, as the gates enforce it", verdicts))
+            broken += sum(v.outcome == "refuted" for v in verdicts)
+            kept += [(v.name, v.view, v.scenario) for v in verdicts if v.scenario is not None]
+        _keep(out_dir / slug(policy), kept)
+    if broken:
+        err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
+        raise typer.Exit(1)
+
+
+def _verify_model(kind: str, reference: str) -> None:
+    """Print what a kind's kit says of a model. Exit code 1 if a rule fails."""
+    name, params = _called(reference, kind)
+    table = Table("rule", "verdict", "what", title=f"{escape(reference)}: the conformance kit of kind {kind}")
+    with watched(DECISION_S):
+        checks = verify_model(kind, name, params)
+    for check in checks:
+        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), escape(check.what))
+    out.print(table)
+    broken = len(failing(checks))
     if broken:
         err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
         raise typer.Exit(1)
@@ -116,29 +173,33 @@ def _try(
     drones: int,
     budget: float,
     views: int,
-    kept: Path,
-) -> int:
-    """Print and keep what the kit and the proofs say; how many rules and properties are broken."""
+    has_more: bool,
+) -> tuple[int, list[Kept]]:
+    """Print what the kit and the proofs say; how many rules and properties are broken, and what shows it."""
     table = Table("rule", "verdict", "what", title=f"{escape(policy)}: the conformance kit, {views} drawn views")
     checks = conform(decide, count=views)
     for check in checks:
         table.add_row(check.name, _verdict("holds" if check.holds else "fails"), escape(check.what))
     out.print(table)
-    table = Table("property", "verdict", "what", title=f"{escape(policy)}: proofs")
     verdicts = prove(decide, rules, max_drones=drones, budget_s=budget)
-    for verdict in verdicts:
-        table.add_row(escape(verdict.name), _verdict(verdict.outcome), escape(verdict.what))
-    out.print(table)
-    if not rules:
+    out.print(_verdicts(f"{escape(policy)}: proofs", verdicts))
+    if not rules and not has_more:
         out.print("No invariants: the plane's rules alone were checked. --invariants FILE names some.", soft_wrap=True)
-    else:
+    elif rules:
         out.print(
             "This judges what the policy decides. Staleness rules and damping come after it; a flight with the same lines in "
             "`policy.invariants` judges what the gates enforce.",
             soft_wrap=True,
         )
-    _keep(kept / slug(policy), _counterexamples(decide, section, checks, verdicts))
-    return len(failing(checks)) + sum(v.outcome == "refuted" for v in verdicts)
+    kept = list(_counterexamples(decide, section, checks, verdicts))
+    return len(failing(checks)) + sum(v.outcome == "refuted" for v in verdicts), kept
+
+
+def _verdicts(title: str, verdicts: Sequence[ProofVerdict | TimeVerdict]) -> Table:
+    table = Table("property", "verdict", "what", title=title)
+    for verdict in verdicts:
+        table.add_row(escape(verdict.name), _verdict(verdict.outcome), escape(verdict.what))
+    return table
 
 
 def _verdict(word: str) -> str:
@@ -147,11 +208,17 @@ def _verdict(word: str) -> str:
 
 def _section(policy: str) -> PolicySection:
     """`name(key=value, …)` as a scenario's section, parsed and checked as one is."""
-    name, bracket, rest = policy.partition("(")
+    name, params = _called(policy, "policy")
+    return build({"name": "verify", "policy": {"name": name, "params": dict(params)}}).policy
+
+
+def _called(reference: str, kind: str) -> tuple[str, Params]:
+    """`name(key=value, …)` as the name and its parameters, written as in YAML."""
+    name, bracket, rest = reference.partition("(")
     if bracket and not rest.endswith(")"):
-        raise RunError(f"policy {policy!r}: the bracket is not closed, as in best-2(received_budget=0.1)")
+        raise RunError(f"{kind} {reference!r}: the bracket is not closed, as in best-2(received_budget=0.1)")
     params = [f"policy.params.{p.strip()}" for p in rest[:-1].split(",") if p.strip()]
-    return loads("name: verify", overrides=[f"policy.name={name.strip()}", *params]).policy
+    return name.strip(), loads("name: verify", overrides=params).policy.params
 
 
 def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant, ...]:
@@ -170,7 +237,7 @@ def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant
 
 def _counterexamples(
     decide: Policy, section: PolicySection, checks: Sequence[Check], verdicts: Sequence[ProofVerdict]
-) -> Iterator[tuple[str, FleetView, Scenario]]:
+) -> Iterator[Kept]:
     """Of everything that failed and has one: what failed, the view and the scenario."""
     shown = functools.partial(replay_scenario, policy=section.name, params=section.params)
     aged = PLANE[1]
@@ -190,22 +257,21 @@ def _counterexamples(
 def _ensure_own(folder: Path) -> None:
     """Refuse a folder that holds something else than counterexamples, before they are replaced by new ones."""
     for file in sorted(folder.iterdir()) if folder.is_dir() else ():
-        view = file.with_suffix(".json")  # a scenario lies beside its view
-        if (
-            file.suffix not in (".json", ".yaml")
-            or not view.is_file()
-            or '"ego": ' not in view.read_text("utf-8", "replace")[:20]
-        ):
+        begin = file.read_text("utf-8", "replace")[:100] if file.suffix in (".json", ".yaml") else ""
+        if not (begin.startswith(WRITTEN) if file.suffix == ".yaml" else '"ego": ' in begin[:20]):
             raise RunError(f"{folder}: holds {file.name}, which is no counterexample; name another --out or move it")
 
 
-def _keep(folder: Path, found: Iterable[tuple[str, FleetView, Scenario]]) -> None:
+def _keep(folder: Path, found: Iterable[Kept]) -> None:
     """Write each view, and its scenario where the fault shows in flight."""
     shutil.rmtree(folder, ignore_errors=True)
     for name, view, scenario in found:
         path = unused(folder, scenario.name)
-        write_text(path.with_suffix(".json"), to_json(view))
-        out.print(f"counterexample of [bold]{escape(name)}[/bold]: {path}.json", soft_wrap=True)
+        if view is not None:
+            write_text(path.with_suffix(".json"), to_json(view))
+        out.print(
+            f"counterexample of [bold]{escape(name)}[/bold]{'' if view is None else f': {path}.json'}", soft_wrap=True
+        )
         if shows_in_flight(scenario):
-            write_text(path.with_suffix(".yaml"), dump(scenario))
+            write_text(path.with_suffix(".yaml"), WRITTEN + dump(scenario))
             out.print(f"  fails until the policy is mended: sortie check {path}.yaml", soft_wrap=True)

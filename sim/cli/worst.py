@@ -35,10 +35,12 @@ def worst(
         varied = (f"{row[name]:.4g}" if isinstance(row[name], float) else str(row[name]) for name in found.varied)
         table.add_row(str(row["run"]), row["policy"], *varied, f"{row[metric]:.4g}")
     out.print(table)
-    commands = [(f"{folder}", f"{row['run']}") for row in found.rows]
-    for at, run_ in commands[:1]:
+    if found.rows:
+        first = found.rows[0]["run"]
         out.print(
-            f"see the first with: sortie fly --from-campaign {at} --run {run_} --view", soft_wrap=True, markup=False
+            f"see the first with: sortie fly --from-campaign {folder} --run {first} --view",
+            soft_wrap=True,
+            markup=False,
         )
-    for at, run_ in commands[:fly]:
-        fly_again(campaign=Path(at), run=int(run_), out_dir=folder / "worst" / f"run-{run_}")
+    for row in found.rows[:fly]:
+        fly_again(campaign=folder, run=row["run"], out_dir=folder / "worst" / f"run-{row['run']}")

@@ -40,6 +40,11 @@ class Audit:
         """Counts, and decisions by policy as `decisions_of NAME`."""
         return {**self.counts, **{f"{DECISIONS_OF}{name}": n for name, n in self.decisions.items()}}
 
+    @property
+    def now_s(self) -> float:
+        """The flight's clock."""
+        return self._env.now
+
     def took_over(self, drone: int, before: str, after: str, reason: str) -> None:
         """A drone's policy changed."""
         self.counts["policy_changes"] += 1

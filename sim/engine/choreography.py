@@ -24,7 +24,9 @@ class Choreography:
     """Moves drones to the viewpoints that their policies request, as far as safety allows."""
 
     def __init__(self, scenario: Scenario, world: World, *, posed_by_trace: bool) -> None:
-        """Args: `posed_by_trace`: some drone flies a recorded pose. Its plans are unknown, so no drone may move.
+        """Args: `posed_by_trace`: some drone flies a recorded pose.
+
+        Viewpoints keep their distances within one formation. So no drone may move where others fly apart from it.
 
         Raises:
             MotionError: a slot's own way leaves the fence.
@@ -32,7 +34,10 @@ class Choreography:
         self._world, self._base = world, world.motion
         self._course = course_of(scenario.fleet, np.asarray(world.motion.time_s))
         self._bounds = bounds_of(scenario.fleet)
-        self._fixed = posed_by_trace
+        apart = bool(scenario.fleet.groups) or scenario.fleet.mobility != "formation"
+        self._fixed = "flies a recorded pose" if posed_by_trace else "flies apart from the formation" * apart
+        """Why no drone may move; empty where they may."""
+        self._outside = set(range(scenario.fleet.drones)).difference(scenario.fleet.in_formation)
         self._frame = 0
         self._comes = {e.drone for e in scenario.events if isinstance(e, DroneJoins)}.union(
             *(group.reserve for group in scenario.mission.groups)
@@ -58,10 +63,11 @@ class Choreography:
         """Decide the open requests; granted moves begin with this frame. Call it first in a frame."""
         self._frame = frame
         flies = [d.airborne and i not in self._world.homebound for i, d in enumerate(self._world.drones)]
-        requesting = [i for i in sorted(self._requests) if flies[i] and frame >= self._again_at.get(i, 0)]
+        asked = sorted(self._requests.keys() - self._outside)
+        requesting = [i for i in asked if flies[i] and frame >= self._again_at.get(i, 0)]
         if self._fixed:
             for drone in requesting:
-                self._report_once(drone, "holds its slot: a drone of the fleet flies a recorded pose")
+                self._report_once(drone, f"holds its slot: a drone of the fleet {self._fixed}")
             return
         answers: dict[int, Move | str | None] = {}
         moved = False
@@ -78,7 +84,9 @@ class Choreography:
     def _granted(self, drone: int) -> Move | str | None:
         """The answer to a request: a move, which is then part of the plan, or the reason for refusal."""
         x_m, y_m, _ = self._requests[drone]
-        gone = [i for i, d in enumerate(self._world.drones) if not (d.airborne or i in self._comes)]
+        gone = [
+            i for i, d in enumerate(self._world.drones) if i in self._outside or not (d.airborne or i in self._comes)
+        ]
         answer = grant(drone, (x_m, y_m), self.plans, self._course, self._bounds, self._frame, gone)
         if isinstance(answer, Move):
             self.plans[drone] = (*self.plans[drone], answer)

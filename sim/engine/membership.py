@@ -6,6 +6,7 @@ import math
 from functools import partial
 
 from sortie.fleet.flight.descent import descending, level_again
+from sortie.fleet.flight.steps import landing_s
 from sortie.scenarios.schema import DroneJoins, DroneLeaves, DroneLost, Scenario
 from sortie.sim.engine.world import World, at, with_frame
 
@@ -32,6 +33,11 @@ class Membership:
         """Drones that are yet to join for the first time; nobody takes over from them."""
         for drone in sorted(self._awaited.union(*self._reserves)):
             world.ground(drone)
+        for group in scenario.fleet.groups:
+            end_s = landing_s(group)
+            if end_s is not None:
+                for drone in group.drones:
+                    at(world.env, with_frame(end_s, self._frame_s), partial(self.go_home, drone, "its legs end"))
 
     def renew(self, frame: int) -> None:
         """Send home those whose charge says so, and replace those who left. Call it first in a frame."""

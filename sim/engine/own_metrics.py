@@ -8,6 +8,7 @@ from numbers import Real
 from typing import Protocol
 
 from sortie.scenarios.plugins.reference import PluginError, checked_call, resolve
+from sortie.scenarios.schema import Scenario
 from sortie.sim.results.record import SortieRecord
 
 
@@ -18,16 +19,30 @@ class OwnMetric(Protocol):
         """The figure, from `record.tables` (Arrow tables by name) and `record.scenario`; None where there is none."""
 
 
-def own_metrics(record: SortieRecord) -> Mapping[str, float | None]:
-    """What the scenario's metrics come to.
+def loaded(scenario: Scenario) -> Mapping[str, OwnMetric]:
+    """The scenario's metrics by name, loaded before the flight, so that one that is missing is told at once.
 
     Raises:
-        PluginError: a metric that is not there, fails, or returns something else than a finite number or None.
+        PluginError: a metric that is not there, does not load, or has no such parameter.
     """
-    found: dict[str, float | None] = {}
-    for name, metric in record.scenario.metrics.items():
-        value = checked_call("metric", resolve("metric", metric.model, metric.params), record)
-        if value is not None and not (isinstance(value, Real) and math.isfinite(value)):
-            raise PluginError(f"metric {name} ({metric.model}): returns {value!r:.60}, must be a finite number or None")
-        found[name] = None if value is None else float(value)
-    return found
+    return {name: resolve("metric", metric.model, metric.params) for name, metric in scenario.metrics.items()}
+
+
+def own_metrics(metrics: Mapping[str, OwnMetric], record: SortieRecord) -> Mapping[str, float | None]:
+    """What metrics come to. Errors as for `own_metric`."""
+    models = record.scenario.metrics
+    return {name: own_metric(f"{name} ({models[name].model})", metric, record) for name, metric in metrics.items()}
+
+
+def own_metric(name: str, metric: OwnMetric, record: SortieRecord) -> float | None:
+    """What one metric comes to.
+
+    Raises:
+        PluginError: it fails, or returns something else than a finite number or None.
+    """
+    value = checked_call("metric", metric, record)
+    if value is None:
+        return None
+    if not (isinstance(value, Real) and math.isfinite(value)):
+        raise PluginError(f"metric {name}: returns {value!r:.60}, must be a finite number or None")
+    return float(value)

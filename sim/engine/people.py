@@ -45,6 +45,7 @@ class People:
         self._walkers, self._camera, self._join = scene.walkers, perception.thermal, perception.join
         self._delays_s, self._frame_s = scenario.compute_delays_s, scenario.frame_s
         self._scene, self._rows, self._key = scene, recorder.rows, key
+        self._without_camera = {station.drone for station in scenario.fleet.ground if not station.camera}
         self._has_trucks = perception.scene.trucks > 0.0
         self._lately: list[deque[Sighting]] = [deque() for _ in range(scenario.fleet.drones)]
         self._looks: list[deque[Look]] = [deque() for _ in range(scenario.fleet.drones)]
@@ -58,7 +59,7 @@ class People:
     def look(self, capture: Capture, frame: int) -> None:
         """A drone's thermal camera looks."""
         camera = self._camera
-        if camera is None:
+        if camera is None or capture.drone in self._without_camera:
             return
         at_m, scene = self._walkers.at(capture.t_s), self._scene
         trucks = scene.trucks(capture.t_s) if self._has_trucks else None

@@ -30,7 +30,7 @@ from sortie.policies.contract import (
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
 from sortie.policies.verification.conformance import raised_part
-from sortie.policies.verification.enforced import Cap, Steps, judge, put_right
+from sortie.policies.verification.enforced import Cap, Steps, effective, judge, put_right
 from sortie.policies.verification.invariants import (
     Invariant,
     InvariantError,
@@ -39,6 +39,7 @@ from sortie.policies.verification.invariants import (
     parse,
     violations,
 )
+from sortie.policies.verification.past import Past
 from sortie.policies.verification.shield import MARK, check_shieldable, enforce
 from sortie.policies.verification.views import ViewError, from_json
 from sortie.scenarios.plugins.user_calls import is_guarded
@@ -56,6 +57,16 @@ class NamedPolicy(NamedTuple):
     """Size of the request or answer that its method sends on every link in every frame, before payloads."""
 
 
+class Replay(NamedTuple):
+    """A view that is shown in place of what a drone heard."""
+
+    at_s: float
+    drone: int
+    view: FleetView
+    to_drone: bool
+    """Whether the drone's staleness rules and its guard read it too, not the policy alone."""
+
+
 class PolicyPlan(NamedTuple):
     """A scenario's policies, resolved and checked before anything flies."""
 
@@ -64,7 +75,9 @@ class PolicyPlan(NamedTuple):
     commands: tuple[tuple[float, str, tuple[int, ...]], ...] = ()
     rules: tuple[Invariant, ...] = ()
     shielded: bool = False
-    replays: tuple[tuple[float, int, FleetView], ...] = ()
+    replays: tuple[Replay, ...] = ()
+    dwell_s: float = 0.0
+    """The dwell time, which lines about time may name."""
     of_makes: Mapping[int, NamedPolicy] = {}
     """By drone: the policy of its make, where that has one; it decides in place of `first`."""
 
@@ -101,19 +114,20 @@ def plan_of(section: PolicySection, first: NamedPolicy | None = None) -> PolicyP
     commands = () if first is not None else tuple((c.at_s, c.command, c.drones) for c in section.commands)
     try:
         rules = parse(section.invariants)
-        replays = tuple((r.at_s, r.drone, from_json(r.view).frozen) for r in section.replays)
+        replays = tuple(
+            Replay(r.at_s, r.drone, from_json(r.view).frozen, r.read_by == "drone") for r in section.replays
+        )
         if section.shield:
             check_shieldable(rules)
     except InvariantError as error:
         raise PolicyError(f"policy.invariants: {error}") from error
     except ViewError as error:
         raise PolicyError(f"policy.replays: {error}") from error
-    for k, (_, drone, view) in enumerate(replays):
-        if view.ego != drone:
-            raise PolicyError(f"policy.replays.{k}.view: its ego is {view.ego}, must be drone {drone}")
-    return PolicyPlan(
-        first or named_policy(section.name, section.params), changes, commands, rules, section.shield, replays
-    )
+    for k, replay in enumerate(replays):
+        if replay.view.ego != replay.drone:
+            raise PolicyError(f"policy.replays.{k}.view: its ego is {replay.view.ego}, must be drone {replay.drone}")
+    first = first or named_policy(section.name, section.params)
+    return PolicyPlan(first, changes, commands, rules, section.shield, replays, section.dwell_s)
 
 
 def plan_for(scenario: Scenario) -> PolicyPlan:
@@ -176,6 +190,7 @@ class Pilot:
         audit: Audit,
         request_viewpoint: Callable[[int, Reposition | None], None] | None = None,
         keep: Keep | None = None,
+        steer: Callable[[int, FleetView], None] | None = None,
     ) -> None:
         """Put a pilot together.
 
@@ -185,8 +200,9 @@ class Pilot:
             audit: records what breaks invariants, and who decides.
             request_viewpoint: takes the viewpoints that the policy chooses; None where no policy of the plan does.
             keep: takes every decision; None keeps none.
+            steer: shows the view to the drone's planner; None where no drone has one.
         """
-        self.drone, self._request, self._keep = drone, request_viewpoint, keep
+        self.drone, self._request, self._keep, self._steer = drone, request_viewpoint, keep, steer
         self.policy = plan.of_makes.get(drone, plan.first)
         self._viewpoint = viewpoint_of(self.policy.decide)
         changes = enumerate(plan.changes)
@@ -195,7 +211,9 @@ class Pilot:
         self._rules, self._shielded, self._audit = plan.rules, plan.shielded, audit
         self._asks_fresh = any(rule.needs_fresh for rule in plan.rules)
         self._phase: TaskPhase | None = None
-        self._shown: FleetView | None = None
+        self._past = Past(plan.rules, plan.dwell_s)
+        self._shown: Replay | None = None
+        self._is_shown = any(r.to_drone and r.drone == drone for r in plan.replays)
         self._last_shown: tuple[FleetView, Sequence[Directive]] | None = None
         self._fresh: Sequence[Directive] = ()  # of the latest decision, where an invariant asks for it
         self._replaced: dict[int, Directive] = {}  # by the shield at the gate, by peer
@@ -213,9 +231,21 @@ class Pilot:
         """Size of the request or answer that the present policy's method sends on every link, before payloads."""
         return self.policy.handshake_bytes
 
-    def show(self, view: FleetView) -> None:
+    def show(self, replay: Replay) -> None:
         """The next decision is made on this view."""
-        self._shown = view
+        self._shown = replay
+
+    @property
+    def reads(self) -> Callable[[FleetView], FleetView] | None:
+        """Gives what the drone reads in place of what it heard; None where the scenario shows it nothing."""
+        return self._read if self._is_shown else None
+
+    def _read(self, heard: FleetView) -> FleetView:
+        shown = self._shown
+        if shown is None or not shown.to_drone:
+            return heard
+        self._shown = None
+        return shown.view
 
     def __call__(self, view: FleetView) -> Sequence[Directive]:
         """The present policy's directives; with a shield, those that break an invariant are replaced."""
@@ -225,10 +255,12 @@ class Pilot:
         decisions = self._audit.decisions
         decisions[self.policy.name] = decisions.get(self.policy.name, 0) + 1
         shown, self._shown = self._shown, None
-        read, asked = view if shown is None else shown, None
+        read, asked = view if shown is None else shown.view, None
         if self._viewpoint is not None and self._request is not None:
             asked = ask_viewpoint(self.policy, self._viewpoint, read)
             self._request(self.drone, asked)
+        if self._steer is not None:
+            self._steer(self.drone, read)
         directives = ask(self.policy, read)
         if self._keep is not None:
             check_directives(directives, read)  # before its parts are read
@@ -236,7 +268,7 @@ class Pilot:
         if self._rules or shown is not None:
             directives = self._within_rules(read, directives)
         if shown is not None:
-            self._judge_shown(shown, directives)
+            self._judge_shown(shown.view, directives)
         return directives
 
     def _follow_phase(self, view: FleetView) -> None:
@@ -272,13 +304,15 @@ class Pilot:
             if directive != self._replaced.get(peer):
                 self._audit.stepped_in(self.policy.name, directive, "gate")
         self._replaced = replaced
-        self._audit.judged(self.drone, self.policy.name, judge(self._rules, view, links, enforced, self._fresh))
+        self._past.note(self._audit.now_s, [effective(d) for d in enforced])
+        broken = judge(self._rules, view, links, enforced, self._fresh, self._past)
+        self._audit.judged(self.drone, self.policy.name, broken)
         return enforced
 
     def _judge_shown(self, shown: FleetView, directives: Sequence[Directive]) -> None:
         """The invariants; one directive a link; and where ages alone rose since the last view shown, none may have risen."""
         failed = partial(self._audit.failed, self.drone)
-        for rule in self._rules:
+        for rule in (r for r in self._rules if not r.over_time):
             for d in violations(rule, shown, directives, self._fresh):
                 failed(
                     -1 if d is None else d.destination, self.policy.name, rule.text,
@@ -308,8 +342,8 @@ def schedule_policies(env: simpy.Environment, plan: PolicyPlan, pilots: Sequence
                 due.append((at_s, place, partial(_take_over, addressed, policy, f"command {word!r}", place)))
     for at_s, _, act in sorted(due, key=lambda entry: entry[:2]):
         at(env, with_frame(at_s, frame_s), act)
-    for at_s, drone, view in plan.replays:
-        at(env, at_s, partial(pilots[drone].show, view))
+    for replay in plan.replays:
+        at(env, replay.at_s, partial(pilots[replay.drone].show, replay))
 
 
 def _take_over(pilots: Sequence[Pilot], policy: NamedPolicy, reason: str, place: int) -> None:

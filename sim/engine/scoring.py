@@ -107,6 +107,7 @@ class Scorer:
         self._agents, self._recorder, self._planned, self._own_tracks = agents, recorder, planned, own_tracks
         self._people, self._has_trucks = people, scenario.perception.scene.trucks > 0.0
         self._delays_s = scenario.compute_delays_s
+        self._unscored = {station.drone for station in scenario.fleet.ground if not station.scored}
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
         recorder.unfold |= {
@@ -130,6 +131,8 @@ class Scorer:
         moment: Moment = now_s, []
         since_s = (frame - 1.5) * self._scenario.frame_s
         for agent in self._agents:
+            if agent.drone in self._unscored:
+                continue
             came_back = agent.here is not None and agent.here.t_s < since_s  # and has not sensed yet
             if came_back or not agent.status.airborne:
                 moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))

@@ -41,12 +41,13 @@ from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
 from sortie.sim.engine.own_events import OwnEvents
-from sortie.sim.engine.own_metrics import own_metrics
+from sortie.sim.engine.own_metrics import loaded, own_metrics
 from sortie.sim.engine.own_models import of_radio
 from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
+from sortie.sim.engine.steering import Steering, area_m
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, own_antennas, strongest_dbm
@@ -121,11 +122,12 @@ def run_sortie(
         if policies.of_users or runs_user_code(scenario)
         else nullcontext()
     ):
+        own = loaded(scenario)
         parts = build(scenario, policies, seed, replication, detector_of)
         files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited during the flight
         fly(parts, each_second, observer)
         record = _collect(parts, policies, name, seed, replication)
-        metrics = own_metrics(record)
+        metrics = own_metrics(own, record)
     wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
     return dataclasses.replace(record, own_files=files, metrics=metrics, wall=wall)
 
@@ -146,6 +148,7 @@ class Parts:
     own_events: OwnEvents
     choreography: Choreography | None
     """None where no policy chooses viewpoints."""
+    steering: Steering
     pilots: Sequence[Pilot]
     agents: Sequence[Agent]
     detector: Detector | None
@@ -175,7 +178,8 @@ def build(
 
     motion, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
     charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}
-    batteries = FleetBatteries(scenario.fleet.batteries, scenario.fleet.overrides, len(drones), charges)
+    mains = {station.drone for station in scenario.fleet.ground if station.mains}
+    batteries = FleetBatteries(scenario.fleet.batteries, scenario.fleet.overrides, len(drones), charges, mains)
     air = Air(
         env,
         AirSettings.of(
@@ -193,7 +197,7 @@ def build(
     scene = SceneModel(
         scenario.perception.scene,
         mission.target,
-        motion.bounds_m(),
+        area_m(scenario.fleet, motion.bounds_m()),
         mission.more_targets,
         scenario.perception.people,
     )
@@ -212,9 +216,12 @@ def build(
     if policies.chooses_viewpoints:
         posed = any(trace.pose is not None for trace in traces.values())
         choreography = Choreography(scenario, world, posed_by_trace=posed)
+    membership = Membership(scenario, world)
+    steering = Steering(scenario, world, membership, seed, replication)
     journal = Journal(env) if scenario.record.views or scenario.record.disagreement else None
     request = None if choreography is None else choreography.request
-    pilots = [Pilot(i, policies, audit, request, None if journal is None else journal.decided) for i in drones]
+    keep, steer = None if journal is None else journal.decided, steering.read if steering.anyone else None
+    pilots = [Pilot(i, policies, audit, request, keep, steer) for i in drones]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name, scenario.fleet.drones)
     detector = mixed(detector_of, scene, scenario, seed, replication)
     count_boxes = None if detector is None else detector.count_boxes
@@ -240,18 +247,18 @@ def build(
             phase_s=min(PHASE_SHARE * scenario.frame_s, PHASE_S) * stream(seed, replication, i, "phase").random(),
             handshake_bytes=pilots[i].handshake_bytes,
             guard=pilots[i].guard,
+            reads=pilots[i].reads,
         )
         for i in drones
     ]
     scorer = None
     if detector is not None:
         scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people)
-    membership = Membership(scenario, world)
     own_events = OwnEvents(scenario, world, seed, replication)
     schedule(scenario, world, transport, membership, own_events, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(
-        scenario, env, recorder, scene, batteries, air, world, transport, membership, own_events, choreography, pilots, agents, detector, scorer,
+        scenario, env, recorder, scene, batteries, air, world, transport, membership, own_events, choreography, steering, pilots, agents, detector, scorer,
         audit, notes, journal,
     )  # fmt: skip
 
@@ -272,6 +279,8 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
     if observer is not None:
         observer.begin(parts.scenario, parts.scene)
     moves = [] if parts.choreography is None else [parts.choreography.renew]
+    if parts.steering.anyone:
+        moves.append(parts.steering.renew)
     world.start(each_second, [parts.membership.renew, *moves, parts.own_events.step])
     for agent in parts.agents:
         agent.start()

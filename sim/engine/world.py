@@ -124,8 +124,9 @@ class World:
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         self._rotor_w = fleet_power_w(scenario.fleet, motion)
         self._cameras = cameras_of(scenario.fleet)
+        self._without_camera = {station.drone for station in scenario.fleet.ground if not station.camera}
         self._errors = errors
-        self._flight = FlightSenses(motion, scenario.frame_s, scene.height_field, self._cameras, errors)
+        self._flight = self._senses(motion)
         recorder.unfold["states"] = self._unfold_states
         self._delays_s = scenario.compute_delays_s
         self._busy_sensing = [min(1.0, delay_s * scenario.context.rate_hz) for delay_s in self._delays_s]
@@ -198,10 +199,12 @@ class World:
         """Replace the motion from the present frame on; earlier frames must be equal."""
         self.motion = motion
         self._rotor_w = fleet_power_w(self._scenario.fleet, motion)
-        self._flight = FlightSenses(
-            motion, self._scenario.frame_s, self.scene.height_field, self._cameras, self._errors
-        )
+        self._flight = self._senses(motion)
         self.air.reroute(motion.position_m, motion.up())
+
+    def _senses(self, motion: Trajectories) -> FlightSenses:
+        frame_s, field = self._scenario.frame_s, self.scene.height_field
+        return FlightSenses(motion, frame_s, field, self._cameras, self._errors, self._without_camera)
 
     def drain(self) -> None:
         """Drain the batteries for the time since the last call, and land the drones that are empty."""
@@ -224,7 +227,8 @@ class World:
         """Remove the drones with a battery that gave out."""
         for drone, (status, landed) in enumerate(zip(self.drones, self.batteries.landed, strict=True)):
             if landed and status.airborne:
-                self.remove(drone, "landed", self.batteries.landing_reason[drone])
+                flew = self._scenario.fleet.station(drone) is None
+                self.remove(drone, "landed" if flew else "power_lost", self.batteries.landing_reason[drone])
 
     @property
     def next_frame(self) -> int:

@@ -39,6 +39,7 @@ class Telemeter:
     def __init__(self, scenario: Scenario) -> None:
         self._frame_s = scenario.frame_s
         self._load = np.zeros(scenario.fleet.drones)
+        self._stations = {station.drone for station in scenario.fleet.ground}
 
     def add(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[int, Telemetry]]:
         """Each drone's state in each frame of the tables `states` and `descriptors`, in order of time."""
@@ -69,6 +70,7 @@ class Telemeter:
             energy_used_j=row["spent_j"],
             cpu_load=float(np.clip(self._load[drone], 0.0, 1.0)),
             landed=landed,
+            ground_station=drone in self._stations,
         )
 
 

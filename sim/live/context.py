@@ -30,11 +30,12 @@ from sortie.scenarios.schema import Lie, Scenario
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build, fly
+from sortie.sim.engine.steering import area_m
 from sortie.sim.engine.tracking import FleetTracking, TargetSeen
 from sortie.sim.engine.world import INSTANT_S, cars_in_reach
 
 _REPLAYED_EVENTS = frozenset(
-    {"drone_joins", "drone_leaves", "drone_lost", "landed", "stays_down", "battery_fault", "cell_failure", "link_drop", "link_back"}
+    {"drone_joins", "drone_leaves", "drone_lost", "landed", "power_lost", "stays_down", "battery_fault", "cell_failure", "link_drop", "link_back"}
 )  # fmt: skip
 _RESTED = Platform(1.0, 1.0, 1.0)
 Bounds = tuple[float, float, float, float]
@@ -91,7 +92,7 @@ def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) 
     context = scenario.context.model_copy(update={"roster": False})
     flown = scenario.model_copy(update={"perception": perception, "context": context, "events": honest})
     parts = build(flown, plan_for(flown), flown.seed)
-    bounds = parts.world.motion.bounds_m()
+    bounds = area_m(flown.fleet, parts.world.motion.bounds_m())
     fly(parts, progress)
     tables = parts.recorder.finish()
     return [

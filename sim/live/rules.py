@@ -48,5 +48,5 @@ def guard_of(scenario: Scenario, drone: int, env: simpy.Environment, recorder: R
     section, make = scenario.policy, scenario.fleet.make_of(drone)
     name = make.policy if make is not None and make.policy and section.of_makes else section.name
     rules = tuple(rule for rule in parse(section.invariants) if not rule.needs_fresh)
-    plan = PolicyPlan(NamedPolicy(name, silence), rules=rules, shielded=section.shield)
+    plan = PolicyPlan(NamedPolicy(name, silence), rules=rules, shielded=section.shield, dwell_s=section.dwell_s)
     return Pilot(drone, plan, Audit(env, recorder)).guard

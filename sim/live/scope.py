@@ -30,6 +30,7 @@ UNUSED = (
     "perception.detector",  # no network runs, and nothing is scored
     "perception.detector_params",
     "perception.fusion",
+    "perception.fusion_params",
     "perception.weights",
     "perception.recording",
     "perception.recorded_fusion",

@@ -103,11 +103,12 @@ def sheet(body: rrb.Container, *, live: bool = False) -> rrb.Blueprint:
 
 def scene_view(scenario: Scenario, root: str = "", name: str = "the fleet over the town") -> rrb.View:
     """The 3-D scene below `root`, from an eye that flies along."""
-    n, altitude_m = scenario.fleet.drones, scenario.fleet.formation.altitude_m
-    offsets = slots(scenario.fleet.formation.shape, n, scenario.fleet.formation.spacing_m)
+    fleet, n = scenario.fleet, scenario.fleet.drones
+    altitude_m = fleet.formation.altitude_m
+    offsets = slots(fleet.formation.shape, max(1, len(fleet.in_formation)), fleet.formation.spacing_m)
     widest_m = max(
         footprint_radius_m(height_m, cameras)
-        for height_m, cameras in zip(scenario.fleet.altitudes_m, cameras_of(scenario.fleet), strict=True)
+        for height_m, cameras in zip(fleet.altitudes_m, cameras_of(fleet), strict=True)
     )
     reach_m = float(np.abs(offsets).max()) + widest_m
     hidden: dict[str | rr.encodings.EntityPath, Any] = {

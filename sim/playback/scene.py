@@ -49,6 +49,8 @@ class Drawing:
         self._rate_hz, self._targets = scenario.context.rate_hz, len(scenario.mission.targets)
         self._groups = range(len(scenario.mission.phases_of))
         self._cameras = cameras_of(scenario.fleet)
+        self._stations = {station.drone: station for station in scenario.fleet.ground}
+        self._flying = [i for i in range(scenario.fleet.drones) if i not in self._stations] or [0]
         n = self._n
         self._links, self._received = LinkArrows(canvas, n, scenario.context.rate_hz), ReceivedCells(canvas, n)
         self._history: NDArray[np.float64] = np.zeros((0, n, 3))
@@ -65,10 +67,14 @@ class Drawing:
         self._town()
         for i in range(self._n):
             colour = c.drone_colour(i)
-            _drone(canvas, f"world/drones/{i}", colour)
-            ring = rr.LineStrips3D([CIRCLE], colors=[(*colour[:3], 200)], radii=[-1.5])
-            canvas.static(f"world/footprints/{i}", ring)
-            canvas.static(f"world/trails/{i}", rr.Points3D.from_fields(radii=[-1.6], colors=[colour]))
+            if i in self._stations:
+                _mast(canvas, f"world/drones/{i}", colour, self._stations[i].position_m[2])
+            else:
+                _drone(canvas, f"world/drones/{i}", colour)
+                canvas.static(f"world/trails/{i}", rr.Points3D.from_fields(radii=[-1.6], colors=[colour]))
+            if i not in self._stations or self._stations[i].camera:
+                ring = rr.LineStrips3D([CIRCLE], colors=[(*colour[:3], 200)], radii=[-1.5])
+                canvas.static(f"world/footprints/{i}", ring)
             for name, width in (("found", 2.0), ("missed", 1.5), ("false", 1.5)):
                 canvas.static(f"world/seen/{i}/{name}", rr.Boxes3D.from_fields(radii=[-width]))
         self._links.begin()
@@ -146,7 +152,7 @@ class Drawing:
 
     def _land(self, t_s: Floats, position: Floats, attitude: Floats, airborne: NDArray[np.bool_]) -> None:
         """Put drones that are down on the ground where they came down (the record keeps their height), in place."""
-        for i in range(self._n):
+        for i in self._flying:
             turns = np.flatnonzero(np.diff(airborne[:, i])) + 1
             for begin, end in pairwise([0, *turns.tolist(), len(t_s)]):
                 up = bool(airborne[begin, i]) if begin < end else True
@@ -187,8 +193,11 @@ class Drawing:
         for i in range(self._n):
             moves = rr.Transform3D.columns(translation=position[:, i], quaternion=attitude[:, i])
             canvas.columns(f"world/drones/{i}", t_s, moves)
+            station = self._stations.get(i)
             names = [
-                f"{i} · {s:.0%}" if up else f"{i} · down"
+                (f"{i} · {s:.0%}" if up else f"{i} · down")
+                if station is None
+                else f"{i} · {'ground' if station.mains else f'ground {s:.0%}'}{'' if up else ' · off'}"
                 for s, up in zip(soc[second, i], airborne[second, i], strict=True)
             ]
             canvas.columns(f"world/drones/{i}/name", t_s[second], rr.Points3D.columns(labels=names))
@@ -196,16 +205,18 @@ class Drawing:
             centre = np.column_stack([position[:, i, :2], np.full(len(t_s), 0.4)])
             scale = np.column_stack([radius, radius, np.ones(len(t_s))])
             canvas.columns(f"world/footprints/{i}", t_s, rr.Transform3D.columns(translation=centre, scale=scale))
+            if station is not None:
+                continue
             trail = track[:, i][(bead_frames - base)[kept]]
             canvas.columns(f"world/trails/{i}", t_s, rr.Points3D.columns(positions=trail).partition(lengths))
-        middle = position.mean(axis=1) * (1.0, 1.0, 0.0)
+        middle = position[:, self._flying].mean(axis=1) * (1.0, 1.0, 0.0)
         canvas.columns("world/fleet", t_s, rr.Transform3D.columns(translation=middle))
         self._frames += len(t_s)
         self._history = track[-(step * beads + 1) :]
 
     def _cars(self, t_s: Floats, position: Floats) -> None:
         near, lengths = [], []
-        for t, (x, y) in zip(t_s.tolist(), position[..., :2].mean(axis=1).tolist(), strict=True):
+        for t, (x, y) in zip(t_s.tolist(), position[:, self._flying, :2].mean(axis=1).tolist(), strict=True):
             cars = self._scene.moving_cars(t)
             cars = cars.where((cars.x_m - x) ** 2 + (cars.y_m - y) ** 2 <= CARS_WITHIN_M**2)
             near.append(cars)
@@ -308,6 +319,17 @@ def _drone(canvas: Canvas, path: str, colour: c.Rgba) -> None:
         colors=[(*colour[:3], 255)] * 4, fill_mode="solid",
     )  # fmt: skip
     canvas.static(f"{path}/rotors", rotors)
+    canvas.static(f"{path}/name", rr.Points3D([(0, 0, 5.0)], radii=[0.01], colors=[colour], show_labels=True))
+
+
+def _mast(canvas: Canvas, path: str, colour: c.Rgba, height_m: float) -> None:
+    """A ground station: a mast from the ground to its antenna, and a ball where the antenna is."""
+    mast = rr.Cylinders3D(
+        lengths=[max(height_m, 0.1)], radii=[0.25], centers=[(0, 0, -height_m / 2)], colors=[(150, 150, 155, 255)],
+        fill_mode="solid",
+    )  # fmt: skip
+    canvas.static(f"{path}/mast", mast)
+    canvas.static(f"{path}/antenna", rr.Points3D([(0, 0, 0)], radii=[1.2], colors=[colour]))
     canvas.static(f"{path}/name", rr.Points3D([(0, 0, 5.0)], radii=[0.01], colors=[colour], show_labels=True))
 
 

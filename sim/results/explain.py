@@ -12,7 +12,7 @@ from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import losses_in_words
 
 FEW = 3
-GROUNDED = ("landed", "drone_lost")
+GROUNDED = ("landed", "drone_lost", "power_lost")
 """Kinds of events by which a drone leaves the air."""
 
 

@@ -49,13 +49,21 @@ def mission_outcome(record: SortieRecord) -> dict[str, float | None]:
     in_view_share, out_of_view_s = _share_and_gap((in_view[k], tracked, width_s) for k, (_, tracked) in tracks.items())
     detected_share, undetected_s = _detected(record, t_s, {k: tracked for k, (_, tracked) in tracks.items()})
     return {
-        "flown_share": 1.0 - float(width_s @ (~flying).sum(axis=1)) / (n * float(width_s.sum())),
+        "flown_share": _flown_share(
+            np.delete(flying, [s.drone for s in record.scenario.fleet.ground], axis=1), width_s
+        ),
         "region_observed_share": region_share,
         "target_in_view_share": in_view_share,
         "target_longest_out_of_view_s": out_of_view_s,
         "target_detected_share": detected_share,
         "target_longest_undetected_s": undetected_s,
     }
+
+
+def _flown_share(flying: Bools, width_s: Floats) -> float:
+    """Share of drone-seconds flown, of [T, n]; 1 where nobody is to fly."""
+    every_s = flying.shape[1] * float(width_s.sum())
+    return 1.0 - float(width_s @ (~flying).sum(axis=1)) / every_s if every_s else 1.0
 
 
 def _flown(tables: Mapping[str, pa.Table], n: int) -> tuple[Floats, Bools, NDArray[np.int32]]:

@@ -82,7 +82,11 @@ class TrackingOutcome(TypedDict):
 
 
 class MissionOutcome(TypedDict):
-    flown_share: Annotated[float, "Share of drone-seconds flown, 0 … 1: 1 where no drone leaves the air.", SHARE]
+    flown_share: Annotated[
+        float,
+        "Share of drone-seconds flown, 0 … 1: 1 where no drone leaves the air. Ground stations do not count.",
+        SHARE,
+    ]
     region_observed_share: Annotated[
         float | None,
         "Share of the mission region's area in view, 0 … 1, averaged over the time in which there is a region. A place is "
@@ -158,7 +162,7 @@ class Bytes(TypedDict):
 class Drone(TypedDict):
     soc: Annotated[float, "State of charge, 0 … 1.", SHARE]
     voltage_v: Annotated[float, "At the pack's terminals."]
-    airborne: Annotated[bool, "Whether it still flew.", FLAG]
+    airborne: Annotated[bool, "Whether it still flew; of a ground station, whether it was on.", FLAG]
     energy_j: Annotated[float, "Spent to the very end, all causes."]
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from sortie.scenarios.reading.load import dump
 from sortie.scenarios.report_text import number, percent, size
+from sortie.scenarios.schema import Fleet, GroundStation
 from sortie.sim.folders import write_text
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
@@ -72,7 +73,7 @@ def page(record: SortieRecord) -> str:
 <h2>Who decided what, and why</h2>
 {_decisions(result)}
 <h2>In numbers</h2>
-{_numbers(result)}
+{_numbers(result, scenario.fleet)}
 <details><summary>The scenario as it was flown</summary><pre>{escape(dump(scenario))}</pre></details>
 {_own_files(result)}<footer>Fingerprint {result["fingerprint"]}: the same scenario, policy, seed and version give the same one.</footer>
 </main></body>
@@ -148,8 +149,8 @@ def _decisions(result: dict[str, Any]) -> str:
     return f"<table>{body}</table>"  # fmt: skip
 
 
-def _numbers(result: dict[str, Any]) -> str:
-    """Phases, then drones."""
+def _numbers(result: dict[str, Any], fleet: Fleet) -> str:
+    """Phases, then drones and ground stations."""
     head = "<tr><th>phase</th><th>AP full scene</th><th>AP mission</th><th>data</th><th>deadlines missed</th><th>descriptors lost</th></tr>"
     phases = "".join(
         f"<tr><td>{escape(p['phase'])}, {p['begin_s']:g}–{p['end_s']:g} s</td><td>{number(p['ap50']['full_scene'])}</td>"
@@ -157,10 +158,17 @@ def _numbers(result: dict[str, Any]) -> str:
         f"<td>{percent(p['context']['lost'])}</td></tr>"
         for p in result["phases"]
     )
-    drones = "".join(
-        f"<tr><td>drone {escape(i)}</td><td>{percent(d['soc'])}</td><td>{d['energy_j'] / 1e3:.1f} kJ</td>"
-        f"<td>{d['voltage_v']:.2f} V</td><td>{'flying' if d['airborne'] else 'down'}</td></tr>"
-        for i, d in result["drones"].items()
-    )
+    drones = "".join(_drone_row(i, d, fleet.station(int(i))) for i, d in result["drones"].items())
     other = "<tr><th>drone</th><th>charge left</th><th>energy</th><th>voltage</th><th>at the end</th></tr>"
     return f"<table>{head}{phases}</table><br><table>{other}{drones}</table>"
+
+
+def _drone_row(number: str, drone: dict[str, Any], station: GroundStation | None) -> str:
+    """A drone or a ground station at the end."""
+    energy = (
+        f"<td>{percent(drone['soc'])}</td><td>{drone['energy_j'] / 1e3:.1f} kJ</td><td>{drone['voltage_v']:.2f} V</td>"
+    )
+    if station is not None and station.mains:
+        energy = "<td>mains</td><td></td><td></td>"
+    name, up, down = ("drone", "flying", "down") if station is None else ("station", "on", "off")
+    return f"<tr><td>{name} {escape(number)}</td>{energy}<td>{up if drone['airborne'] else down}</td></tr>"

@@ -239,8 +239,10 @@ def _map(axes: Axes, record: SortieRecord) -> None:
     each = max(1, round(record.scenario.context.rate_hz / 2))
     for i in range(_drones(record)):
         own = (x[drone == i], y[drone == i])
-        axes.plot(own[0][::each], own[1][::each], color=colour(i), linewidth=1.0, label=f"drone {i}")
-        axes.plot(own[0][-1:], own[1][-1:], "o", color=colour(i), markersize=4)
+        standing = record.scenario.fleet.station(i) is not None
+        name, marker = (f"station {i}", "^") if standing else (f"drone {i}", "o")
+        axes.plot(own[0][::each], own[1][::each], color=colour(i), linewidth=1.0, label=name)
+        axes.plot(own[0][-1:], own[1][-1:], marker, color=colour(i), markersize=4)
     t_s = np.unique(_column(mission, "t_s"))[::each]
     for k, target in enumerate(record.scenario.mission.targets):
         way = np.array([TargetPath.of(target).pose(t)[:2] for t in t_s.tolist()])

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from sortie.scenarios.reading.load import ScenarioError, dump, loads
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.base import models_of_the_past
 from sortie.sim.folders import RunError, ensure_folder, replacing
 from sortie.sim.results import disagreement, rosters, views
 from sortie.sim.results.outcome import outcome
@@ -93,7 +94,7 @@ def ensure_same(path: Path, scenario: Scenario, seed: int, replication: int, fil
     try:
         about = json.loads((path / RECORD).read_text())
         old = {name: about[name] for name in new}
-        there = loads((path / SCENARIO).read_text(), source=str(path / SCENARIO)).model_dump(mode="json")
+        there = _scenario_of(path).model_dump(mode="json")
     except (OSError, ValueError, TypeError, LookupError) as error:
         raise OtherRunError(f"{path}: holds a run that cannot be read, {_INSTEAD}") from error
     found = _difference(old, new) or _difference(there, scenario.model_dump(mode="json"))
@@ -201,8 +202,14 @@ def _is_of_the_run(page: Path) -> bool:
         return False
 
 
+def _scenario_of(path: Path) -> Scenario:
+    """The scenario of a run. Packages that offered its models need not be installed."""
+    with models_of_the_past():
+        return loads((path / SCENARIO).read_text(), source=str(path / SCENARIO))
+
+
 def load(path: Path) -> SortieRecord:
-    """Read a run back.
+    """Read a run back. The models that flew need not be there.
 
     Raises:
         RunError: no run there, or one that is damaged.
@@ -211,7 +218,7 @@ def load(path: Path) -> SortieRecord:
         raise RunError(f"{path}: no run there ({OUTCOME} is missing)")
     try:
         about = json.loads((path / RECORD).read_text())
-        scenario = loads((path / SCENARIO).read_text(), source=str(path / SCENARIO))
+        scenario = _scenario_of(path)
         expected = dict(TABLES)
         if scenario.record.views:
             expected |= views.NEEDED

@@ -33,7 +33,7 @@ class Summary(JupyterMixin):
         return Group(*self._parts)
 
     def __str__(self) -> str:
-        console = Console(file=io.StringIO(), width=WIDTH)
+        console = Console(file=io.StringIO(), width=WIDTH, emoji=False)
         console.print(self)
         assert isinstance(console.file, io.StringIO)  # noqa: S101
         return console.file.getvalue()

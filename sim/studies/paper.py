@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,8 @@ class PaperSettings:
     """As it was given, for the report."""
     live: Path | None = None
     """What `sortie live --out` wrote: it answers two claims that a simulated flight cannot."""
+    fusion_params: Mapping[str, float] = field(default_factory=dict)
+    """Interventions on the network's fusion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,7 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
     """
     wall_s, cpu_s = time.perf_counter(), _cpu_s()
     on_the_bus = {} if job.live is None else measured_live(job.live)
-    instrument = CarNetInstrument.load(job.weights)
+    instrument = CarNetInstrument.load(job.weights, fusion_params=dict(job.fusion_params))
     frames = bench_frames(job.seed, job.frames, work / "bench", lambda done, of: progress("test scenes", done, of))
     measured = measure(
         instrument,
@@ -100,6 +102,8 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
         "fingerprint": instrument.fingerprint,
         "unsent": list(job.settings.unsent),
         "cells_by": job.settings.cells_by,
+        **job.settings.ways._asdict(),
+        "fusion_params": dict(job.fusion_params),
         "tau": job.settings.tau,
         "by": job.settings.by,
         "draws": job.settings.draws,

@@ -50,6 +50,7 @@ from sortie.fleet.messages.wire import decode_descriptor
 from sortie.fleet.plane import DroneStatus, Equipment, PlaneRules, equipment_of
 from sortie.fleet.probes import Probes
 from sortie.fleet.senses import FlightSenses, Sensed
+from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.staleness import DEGRADED_RATE_HZ, LinkHealth, cap_by_age
 from sortie.fleet.trust import Arrival, goodput_doubt, judge
 from sortie.perception.geometry import USUAL
@@ -161,21 +162,27 @@ def test_a_lost_cell_takes_its_voltage_energy_and_both_resistances() -> None:
     assert four.energy_left_j[0] == pytest.approx(three.energy_left_j[0])
 
 
-def test_a_fault_of_a_traced_pack_stays() -> None:
-    """Half is gone at once; from then on the trace's fall is of the half that is left."""
-    soc = [0.9, 0.8]
+def test_faults_of_a_traced_pack_stay_and_each_takes_of_what_is_left() -> None:
+    """Half is gone at once, later a fifth; from then on the trace's fall is of the two fifths that are left."""
+    soc = [0.9, 0.8, 0.7]
     energy = [float(energy_fraction(s)) for s in soc]
-    trace = BatteryTrace([0.0, 10.0], soc, energy, [], [], [], [])
+    trace = BatteryTrace([0.0, 10.0, 20.0], soc, energy, [], [], [], [])
     packs = FleetBatteries(Battery(capacity_wh=100), (), 1, {0: trace})
     packs.step(5.0, [0.0], [0.0], [0.0])
     half = packs.energy_left_j[0] / 2
     packs.fault(0, 0.5)
     assert packs.energy_left_j[0] == pytest.approx(half)
     packs.step(5.0, [0.0], [0.0], [0.0])
-    assert packs.energy_left_j[0] == pytest.approx(360_000 * energy[1] / 2)
-    assert packs.energy_j["fault"][0] == pytest.approx(half)
-    assert packs.spent_j[0] == pytest.approx(360_000 * (energy[0] - energy[1] / 2))
-    assert packs.energy_j[RECORDED][0] == pytest.approx(packs.spent_j[0] - half)
+    left = 360_000 * energy[1] / 2
+    assert packs.energy_left_j[0] == pytest.approx(left)
+    packs.fault(0, 0.2)
+    assert packs.energy_left_j[0] == pytest.approx(0.8 * left)
+    packs.step(10.0, [0.0], [0.0], [0.0])
+    assert packs.energy_left_j[0] == pytest.approx(360_000 * energy[2] * 0.4)
+    lost = half + 0.2 * left
+    assert packs.energy_j["fault"][0] == pytest.approx(lost)
+    assert packs.spent_j[0] == pytest.approx(360_000 * (energy[0] - 0.4 * energy[2]))
+    assert packs.energy_j[RECORDED][0] == pytest.approx(packs.spent_j[0] - lost)
 
 
 def test_who_is_on_the_ground_draws_nothing_and_takes_off_with_what_is_left() -> None:
@@ -191,17 +198,36 @@ def test_who_is_on_the_ground_draws_nothing_and_takes_off_with_what_is_left() ->
     assert packs.energy_left_j[0] < left
 
 
+def test_a_pack_that_takes_off_again_is_one_of_its_charge_that_never_flew() -> None:
+    """What was polarised is gone at rest; voltage, current and what is spent go on from the charge alone."""
+    of = Battery(capacity_wh=120, polarisation=Polarisation(resistance_mohm=8, time_s=30))
+    flew = FleetBatteries(of, (), 1)
+    for _ in range(60):
+        flew.step(1.0, [170.0], [1.0], [0.1])
+    flew.land(0, "told to")
+    flew.take_off(0)
+    fresh = FleetBatteries(of.model_copy(update={"initial_soc": flew.soc[0]}), (), 1)
+    for _ in range(5):
+        for packs in (flew, fresh):
+            packs.step(1.0, [170.0], [1.0], [0.1])
+        assert flew.voltage_v[0] == pytest.approx(fresh.voltage_v[0], rel=1e-6)
+        assert flew.current_a[0] == pytest.approx(fresh.current_a[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("heavy", [(), (2, 0)])
 @pytest.mark.parametrize("model", ["level", "momentum"])
-def test_every_drone_pays_for_its_own_load_in_level_flight_and_in_climb(model: Any) -> None:
-    frame = Airframe(power_model=model)
+def test_every_drone_pays_for_its_own_load_in_level_flight_and_in_climb(model: Any, heavy: tuple[int, ...]) -> None:
+    """Also where drones of two kinds have numbers in turn, and each another load."""
+    frame, large = Airframe(power_model=model), Airframe(power_model=model, mass_kg=4.0, disc_area_m2=0.9)
     fleet = Fleet(
-        airframe=frame, drones=4, overrides=tuple(DroneOverride(drone=i, payload_kg=0.4 * i) for i in range(4))
-    )
+        airframe=frame, drones=4, overrides=tuple(DroneOverride(drone=i, payload_kg=0.4 * i) for i in range(4)),
+        makes=({"name": "large", "drones": heavy, "airframe": large},) if heavy else (),
+    )  # fmt: skip
     motion = fly(fleet, 6.0, 0.1, 1)
     power_w = fleet_power_w(fleet, motion)
     assert (motion.velocity_mps[..., 2] > 0.05).any()
     for drone in range(4):
-        own = frame.model_copy(update={"payload_kg": 0.4 * drone})
+        own = (large if drone in heavy else frame).model_copy(update={"payload_kg": 0.4 * drone})
         if model == "momentum":
             wanted = momentum_power_w(
                 motion.velocity_mps[:, drone] - motion.wind_mps[:, drone], motion.acceleration_mps2[:, drone], own
@@ -315,6 +341,26 @@ def test_every_drone_senses_with_its_own_cameras() -> None:
     assert senses.at(0)[1].footprint_radius_m == pytest.approx(
         80 / 60 * tan * senses.at(0)[0].footprint_radius_m, rel=0.05
     )
+
+
+def test_a_fault_of_a_drone_s_pose_is_in_all_that_it_says_of_itself_and_in_nothing_that_is_true() -> None:
+    """East, north, height and heading: place, footprint, orientation and cells as it believes; its true pose as it flies."""
+    fleet = Fleet(drones=2)
+    motion, cameras = fly(fleet, 4.0, 0.1, 1), cameras_of(fleet)
+    plain = FlightSenses(motion, 0.1, PLAIN.height_field, cameras)
+    error = np.tile([3 * 12.8, -2 * 12.8, -20.0, 0.5], (40, 1))
+    wrong = FlightSenses(motion, 0.1, PLAIN.height_field, cameras, {1: error})
+    for frame in (0, 20, 39):
+        assert wrong.at(frame)[0] == plain.at(frame)[0]
+        was, now = plain.at(frame)[1], wrong.at(frame)[1]
+        assert now.capture.position_m == was.capture.position_m
+        assert now.capture.orientation_xyzw == was.capture.orientation_xyzw
+        assert np.subtract(now.capture.est_position_m, was.capture.est_position_m) == pytest.approx(error[frame, :3])
+        assert now.capture.est_yaw_rad - was.capture.est_yaw_rad == pytest.approx(0.5)
+        assert now.footprint_radius_m == pytest.approx(footprint_radius_m(now.capture.est_position_m[2], cameras[1]))
+        turn = Rotation.from_quat(now.orientation_xyzw) * Rotation.from_quat(was.orientation_xyzw).inv()
+        assert turn.as_rotvec() == pytest.approx([0.0, 0.0, 0.5], abs=1e-9)
+        assert (now.view.row, now.view.column) == (was.view.row - 2, was.view.column + 3)
 
 
 # --- clocks -----------------------------------------------------------------------------------------------
@@ -486,6 +532,24 @@ def test_who_sent_a_look_shortly_before_its_claim_looks(before_s: float, doubted
     assert mine._standings[1].reason.startswith("coverage" if doubted else "")
 
 
+@pytest.mark.parametrize("mine_s", [0.0, 2.0])
+@pytest.mark.parametrize("theirs_s", [0.0, 6.0, -6.0])
+def test_a_claim_is_held_against_what_came_before_it_by_one_clock(mine_s: float, theirs_s: float) -> None:
+    """Whoever's clock is off: a false goodput is found out, and a claim answers for nothing that came after it."""
+    for claimed_mbps, sent_s, doubted in ((1000.0, 9.9, True), (60.0, 9.9, False), (1000.0, 10.1, False)):
+        mine = memory()
+        mine.status.clock_skew_s = mine_s
+        mine.hold(descriptor(0, 10.0 + mine_s), 10.0)
+        for _ in range(WINDOW):
+            mine.clocks.heard(1, 0.03 + mine_s - theirs_s)
+        stamp_s = sent_s - 0.04 + theirs_s
+        mine.receive(Received(capture(1, sent_s - 0.04), payload(), sent_s + 0.002, stamp_s, phy_mbps=100.0))
+        poor = b"\x55" * 64  # no doubt in itself
+        mine.hold(descriptor(1, 9.95 + theirs_s, peer_goodput_mbps=(claimed_mbps,) * 4, coverage_grid=poor), 10.0)
+        mine.judge(10.2)
+        assert ("goodput" in mine._standings[1].reason) == doubted, (claimed_mbps, sent_s)
+
+
 def test_payloads_of_a_peer_that_is_not_heard_are_kept_for_two_seconds() -> None:
     mine = memory()
     mine.hold(descriptor(0, 0.0), 0.0)
@@ -645,6 +709,48 @@ def test_a_drone_that_lies_decides_by_the_truth_and_publishes_the_lie() -> None:
     assert {round(view.me.battery_soc, 6) for view in seen if view.me is not None} == {0.9}
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_lies_of_several_events_are_all_told(order: tuple[int, ...]) -> None:
+    rig = Rig(lambda view: [], dwell_s=0.0)
+    lies = [("coverage", "much"), ("goodput", "little"), ("battery", "little")]
+    for index in order:
+        about, claim = lies[index]
+        rig.memory.status.lies[index] = lambda d, about=about, claim=claim: falsified(d, about, claim)  # type: ignore[misc]
+    rig.env.run(until=0.05)
+    ((_, datagram),) = rig.published
+    told = decode_descriptor(datagram)
+    assert told.battery_soc == pytest.approx(0.05)
+    assert told.peer_goodput_mbps == pytest.approx((0.1,) * 4)
+    assert told.coverage_grid == b"\xff" * 64
+    del rig.memory.status.lies[1]
+    rig.env.run(until=0.15)
+    told = decode_descriptor(rig.published[-1][1])
+    assert told.battery_soc == pytest.approx(0.05)
+    assert told.peer_goodput_mbps == (50.0,) * 4
+
+
+def test_what_slows_perception_adds_up() -> None:
+    rig = Rig(lambda view: [FULL._replace(destination=p) for p in view.peers], dwell_s=0.0, compute_delay_s=0.04)
+    rig.memory.status.slower_s = {3: 0.01, 7: 0.03}
+    rig.hear(1)
+    rig.env.run(until=0.18)
+    assert [t_s - c.t_s for t_s, _, _, c in rig.sent] == pytest.approx([0.01 + 0.04 + 0.04])  # it acts 10 ms late
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_what_was_not_published_stays_new(every: int) -> None:
+    """Ground seen first in a frame without a descriptor is still new in the next one that has one, and in that one alone."""
+
+    class Sees(Rig):
+        def sense(self, frame: int) -> Sensed:
+            return super().sense(frame)._replace(view=View(0, 0, b"\xaa" * 64))
+
+    rig = Sees(lambda view: [], dwell_s=0.0, publish_every=every)
+    rig.env.run(until=1.0)
+    flags = [decode_descriptor(datagram).novelty_flags for _, datagram in rig.published]
+    assert flags == [0, 1] + [0] * (len(flags) - 2)
+
+
 def test_a_drone_without_a_detector_never_looks() -> None:
     rig = Rig(lambda view: [FULL._replace(destination=p) for p in view.peers], dwell_s=0.0)
     rig.memory.status.looks = False
@@ -716,3 +822,19 @@ def test_clocks_draw_offset_rate_and_growth_each_for_every_drone() -> None:
     np.fill_diagonal(correlation, 0.0)
     assert np.abs(correlation).max() < 0.2
     assert len(np.unique([oscillators(config, 3, 1, r) for r in range(3)])) == 27
+
+
+def test_dead_reckoning_walks_are_of_each_drone_event_seed_and_replication() -> None:
+    """Two losses of GNSS of the whole fleet, one after the other: by step, both axes."""
+    losses = [f"{{kind: gnss_loss, at_s: {at}, until_s: {at + 100}, position_walk_m: 3}}" for at in (0, 100)]
+    walked = loads(f"name: joints\nduration_s: 200\nfleet: {{drones: 3}}\nevents: [{', '.join(losses)}]")
+    each: dict[str, np.ndarray] = {}
+    for seed, replication in ((1, 0), (2, 0), (1, 1)):
+        errors = sensor_errors(walked, np.zeros((2000, 3, 3)), seed, replication)
+        for drone, (half, axis) in product(range(3), product(range(2), range(2))):
+            steps = np.diff(errors[drone][1000 * half : 1000 * (half + 1), axis])
+            each[f"{drone} event {half} axis {axis} {seed} {replication}"] = steps
+    correlation = np.corrcoef(np.array(list(each.values())))
+    np.fill_diagonal(correlation, 0.0)
+    worst = np.unravel_index(np.abs(correlation).argmax(), correlation.shape)
+    assert np.abs(correlation).max() < 0.16, [list(each)[k] for k in worst]

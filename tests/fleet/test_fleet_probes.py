@@ -14,10 +14,13 @@ def test_probes_count_the_descriptors_heard_and_missed() -> None:
     for k in range(30):
         if k % 5:  # every fifth is missed
             probes.heard(1, 0.003 * (k % 2) + 0.1 * k)
-    assert probes.share(1, 2.93) == pytest.approx(0.8)
-    assert probes.share(1, 3.42) == pytest.approx(0.5)  # 3.0 and four more are missed by now
-    assert probes.share(1, 3.98) == 0.0 == probes.share(1, 1e6)
-    assert probes.share(2, 3.0) is None
+
+    def share(now_s: float) -> float | None:
+        return heard_share(probes.fill(0, (0.0, 0.0), now_s)[0])
+
+    assert share(2.93) == pytest.approx(0.8)
+    assert share(3.42) == pytest.approx(0.5)  # 3.0 and four more are missed by now
+    assert probes.fill(0, (0.0, 0.0), 3.98) == (SILENT_MBPS, 0.0) == probes.fill(0, (0.0, 0.0), 1e6)
 
 
 def test_probes_stand_where_nothing_was_measured_and_have_no_rate() -> None:

@@ -10,9 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sortie.fleet.flight.frames import tangent_plane_m
 from sortie.fleet.flight.motion import fly
 from sortie.fleet.traces import COLUMNS, TraceError, follow, read_traces
-from sortie.scenarios.schema import Fleet, Route
+from sortie.scenarios.schema import Fleet, Origin, Route
 
 FLEET = Fleet(route=Route(waypoints_m=((0, 0), (200, 0))))
 
@@ -150,3 +151,73 @@ def test_the_columns_are_told_in_the_modules_words() -> None:
     import sortie.fleet.traces
 
     assert all(name in (sortie.fleet.traces.__doc__ or "") for name in COLUMNS)
+
+
+def test_the_tangent_plane_has_published_values_and_keeps_distances() -> None:
+    """Azimuth 33°, elevation 70°, 1,000 m away: the example of MATLAB's and pymap3d's geodetic2enu; and a degree of the
+    meridian and of the equator, whose lengths are tabled."""
+    away = tangent_plane_m([(42.002581974253744, -81.99775196006746, 1139.701799575106)], (42, -82, 200))[0]
+    az, el = np.radians((33, 70))
+    np.testing.assert_allclose(
+        away, 1000 * np.array([np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)]), atol=1e-6
+    )
+    metre = tangent_plane_m([(1e-4, 0, 0), (0, 1e-4, 0)], (0, 0, 0))
+    np.testing.assert_allclose(metre[:, :2] * 1e4, [(0, 110_574.3), (111_319.5, 0)], atol=0.1)
+    north = tangent_plane_m([(45 + 1e-4, 0, 0)], (45, 0, 0))[0, 1]
+    assert north * 1e4 == pytest.approx(111_131.8, abs=0.6)
+
+
+def test_a_flight_in_latitude_and_longitude_flies_in_metres(tmp_path: Path) -> None:
+    rows = "".join(f"{t},1,{47 + 1e-5 * t},{8 + 2e-5 * t},{500 + t}\n" for t in range(11))
+    path = written(tmp_path, "t_s,drone,lat_deg,lon_deg,alt_m\n0,0,47,8,499\n" + rows)
+    traces = read_traces(path, 3)
+    motion = follow(fly(FLEET, 10.0, 0.1, 1), traces, 0.1)
+    np.testing.assert_allclose(motion.position_m[0, 1], (0, 0, 1), atol=1e-9)  # above the lowest of all
+    north_m, east_m = 111_178.4 * 1e-4, 76_062.0 * 2e-4  # a degree of the ellipsoid at 47° and 499 m
+    np.testing.assert_allclose(motion.position_m[-1, 1, :2], np.array((east_m, north_m)) * 0.99, rtol=1e-4)
+    assert motion.position_m[-1, 1, 2] == pytest.approx(10.9)
+    np.testing.assert_array_equal(motion.position_m[:, 0], np.zeros((100, 3)))  # one row stands for a station
+    placed = read_traces(path, 3, Origin(latitude_deg=47, longitude_deg=8.001, altitude_m=400))[1].pose
+    assert placed is not None
+    np.testing.assert_allclose(placed.position_m[0], (-76.06, 0, 100), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("roll", "pitch", "heading", "forward", "left"),
+    [
+        (0, 0, 0, (0, 1, 0), (-1, 0, 0)),  # to the north
+        (0, 0, 90, (1, 0, 0), (0, 1, 0)),
+        (0, 30, 90, (np.cos(np.pi / 6), 0, 0.5), (0, 1, 0)),  # nose up
+        (30, 0, 0, (0, 1, 0), (-np.cos(np.pi / 6), 0, 0.5)),  # right side down
+    ],
+)
+def test_compass_attitudes_become_ours(
+    tmp_path: Path, roll: float, pitch: float, heading: float, forward: tuple[float, ...], left: tuple[float, ...]
+) -> None:
+    text = f"t_s,x_m,y_m,z_m,roll_deg,pitch_deg,heading_deg\n0,0,0,9,{roll},{pitch},{heading}\n"
+    pose = read_traces(written(tmp_path, text), 1)[0].pose
+    assert pose is not None
+    assert pose.orientation_xyzw is not None
+    body = Rotation.from_quat(pose.orientation_xyzw[0])
+    np.testing.assert_allclose(body.apply([1, 0, 0]), forward, atol=1e-12)
+    np.testing.assert_allclose(body.apply([0, 1, 0]), left, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "said"),
+    [
+        ("t_s,lat_deg,lon_deg", "0,47,8", "a place on the globe needs all of lat_deg, lon_deg, alt_m"),
+        ("t_s,lat_deg,lon_deg,alt_m", "0,86,8,0", "lat_deg in row 1 is 86, must be within -85 … 85"),
+        (
+            "t_s,x_m,y_m,z_m,lat_deg,lon_deg,alt_m",
+            "0,0,0,9,47,8,9",
+            "columns x_m and lat_deg say the same, must be one of them",
+        ),
+        ("t_s,yaw_deg,heading_deg", "0,1,1", "columns yaw_deg and heading_deg say the same, must be one of them"),
+    ],
+)
+def test_a_globe_that_does_not_fit_is_refused(tmp_path: Path, header: str, row: str, said: str) -> None:
+    path = written(tmp_path, f"{header}\n{row}\n")
+    with pytest.raises(TraceError) as refused:
+        read_traces(path, 1)
+    assert str(refused.value) == f"{path}: {said}"

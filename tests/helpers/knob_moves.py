@@ -225,6 +225,26 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "fleet.route.waypoints_m": ("north", ">"),
     "fleet.route.speed_mps": ("ground speed", 6 / 5),
     "fleet.route.turn_time_s": ("fastest turn", "<"),
+    "fleet.groups.drones": ("height", "<"),
+    "fleet.groups.formation": ("height of 1", ">"),
+    "fleet.groups.route": ("ground speed", ">"),
+    "fleet.groups.take_off": ("height of 1", "<"),
+    "fleet.groups.climb_mps": ("height of 1", "<"),
+    "fleet.groups.legs": ("height of 1", "<"),  # they do not climb
+    "fleet.ground.drone": ("height of 1", ">"),
+    "fleet.ground.position_m": ("height of 1", 10.0),
+    "fleet.ground.mains": ("charge of 1", "<"),
+    "fleet.ground.camera": ("cells seen by 1", ">"),
+    "fleet.ground.scored": ("fusions", ">"),
+    "fleet.groups.mobility_params": ("ground speed", ">"),
+    "fleet.mobility_params": ("ground speed", ">"),
+    "fleet.steering.reach_m": ("ground speed", "<"),
+    "fleet.steering.speed_mps": ("ground speed", "<"),
+    "fleet.steering.climb_mps": ("height", ">"),
+    "fleet.steering.acceleration_mps2": ("ground speed", "<"),
+    "fleet.steering.separation_m": ("closest pair", ">"),
+    "fleet.steering.altitude_m": ("height", "<"),
+    "fleet.steering.fence_m": ("ground speed", "<"),
     "fleet.motion.wind_mps": ("rotor", ">"),  # carried by the wind, a drone hovers in it
     "fleet.motion.gust_sigma_mps": ("rates of roll and pitch", ">"),
     "fleet.motion.gust_time_s": ("rates of roll and pitch", "<"),
@@ -243,6 +263,8 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "fleet.battery.cells": ("voltage", ">"),
     "fleet.battery.initial_soc": ("charge", "<"),
     "fleet.battery.cell_resistance_mohm": ("ohmic", ">"),
+    "fleet.battery.cell_model": ("voltage", ">"),
+    "fleet.battery.cell_params": ("voltage", ">"),
     "fleet.battery.drivetrain_efficiency": ("rotor", 8 / 7),
     "fleet.battery.avionics_w": ("avionics", 12 / 8),
     "fleet.battery.compute_idle_w": ("compute", ">"),
@@ -271,6 +293,9 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "fleet.airframe.drag_area_m2": ("rotor", ">"),
     "fleet.airframe.air_density_kgpm3": ("rotor", ">"),
     "fleet.airframe.power_params": ("rotor", 1 / 2),
+    "fleet.origin.latitude_deg": ("north", "<"),
+    "fleet.origin.longitude_deg": ("distance to drone 0", ">"),
+    "fleet.origin.altitude_m": ("height of 1", ">"),
     "fleet.trace": ("charge of 1", "<"),
     "fleet.makes.drones": ("snr from 1", ">"),  # drone 1 is no longer the weak sender
     "fleet.makes.battery": ("charge of 1", "<"),
@@ -398,6 +423,8 @@ UNSIGNED: dict[str, str] = {
     "fleet.motion.heading_error_deg": _BELIEF,
     "fleet.camera.pitch_deg": "the cells that it wins ahead it loses below",
     "fleet.airframe.power_model": _KIND,
+    "fleet.groups.mobility": _KIND,
+    "fleet.mobility": _KIND,
     "fleet.makes.airframe": _KIND,
     "fleet.makes.feature_space": _KIND,
     "fleet.makes.policy_params": "its maps are of another network, so its peers get boxes",
@@ -428,6 +455,7 @@ UNSIGNED: dict[str, str] = {
     "policy.replays.at_s": _KIND,
     "policy.replays.drone": _KIND,
     "policy.replays.view": _KIND,
+    "policy.replays.read_by": _KIND,
     **{
         f"events.{name}": _BELIEF for name in ("offset_m", "drift_mps", "offset_deg", "drift_degps", "position_walk_m")
     },
@@ -440,7 +468,7 @@ UNSIGNED: dict[str, str] = {
     **{
         f"perception.{name}": _KIND
         for name in (
-            "fusion", "recording", "recorded_fusion", "precision", "motion_compensation", "cells_by", "join", "unsent_cells",
+            "fusion", "fusion_params", "recording", "recorded_fusion", "precision", "motion_compensation", "cells_by", "join", "unsent_cells",
         )
     },
     **{

@@ -152,6 +152,15 @@ def test_a_box_goes_on_a_track_of_its_class_alone() -> None:
     assert dict(zip(tracks.id.tolist(), tracks.kind.tolist(), strict=True)) == {0: CAR, 1: PERSON}
 
 
+@pytest.mark.parametrize(("kind", "goes_on"), [(CAR, True), (TRUCK, True), (PERSON, False)])
+def test_nobody_walks_as_fast_as_cars_drive(kind: TargetClass, goes_on: bool) -> None:
+    """Seven metres in half a second: a car may have driven so far, and another person stands there."""
+    _, ids = followed_twice(boxes((kind, 0, 0, 0.9)), boxes((kind, 7.0, 0, 0.9)))
+    assert ids == [0 if goes_on else 1]
+    _, ids = followed_twice(boxes((kind, 0, 0, 0.9)), boxes((kind, 0.7, 0, 0.9)))
+    assert ids == [0]
+
+
 def test_late_boxes_are_moved_by_tracks_of_their_class_and_no_person_is_a_target() -> None:
     n = 2
     moving = np.array([[8.0, 0.0], [1.0, 0.0]])

@@ -28,11 +28,13 @@ import math
 from collections.abc import Callable
 from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from perception_examples import capture, cross
+from recording_examples import small
 from scipy.special import ndtr
 
 from sortie.perception import budget
@@ -40,14 +42,15 @@ from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.evaluation.selection import choose
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
-from sortie.perception.lateness import map_weight, own_age_s, weighed
+from sortie.perception.lateness import map_weight, own_age_s, reach_m, still_right, weighed
 from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.perception.network.detector import TorchDetector
+from sortie.perception.recordings.detector import RecordedDetector
 from sortie.perception.scene.render import Renderer
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.draws import Drawn, DrawSource
-from sortie.perception.surrogate.exchange import FeatureShares
+from sortie.perception.surrogate.exchange import FeatureShares, pair
 from sortie.perception.surrogate.features import CaptureColumns, Eyes
 from sortie.perception.thermal import NOBODY, look
 from sortie.perception.types import Boxes, Capture, Share
@@ -203,6 +206,93 @@ def test_ages_are_compared_with_the_freshest_look_at_hand() -> None:
     assert 0.0 < map_weight(0.7, 0.1) < map_weight(0.4, 0.1) < map_weight(0.1, 0.1) == 1.0
 
 
+@pytest.mark.parametrize(
+    ("made", "kind", "join"),
+    [*product(["surrogate", "recorded"], EVERY_KIND, ["nms", "average"]), *product(["torch"], EVERY_KIND, ["nms"])],
+)
+def test_a_share_as_old_as_the_ego_s_own_look_counts_as_if_both_were_of_now(
+    made: str, kind: str, join: Any, tmp_path: Path
+) -> None:
+    """Lateness is beside the freshest look at hand, and that is the ego's own: nothing is older than it."""
+    ego, peer = cross(10.0, 20.0, 0.3)[:2]
+    detector: Any = torch_detector() if made == "torch" else surrogate(join=join)
+    if made == "recorded":
+        path = small(tmp_path / "flown.npz", features=None)
+        detector = RecordedDetector(Perception(detector="recorded", recording=str(path), join=join))
+        ego, peer = (capture(10.0 * i, 0.0, drone=i, t_s=0.0) for i in range(2))
+    now, late = (detector.detect([(ego, [Share(peer, kind, 0.5, None, 0.8, (), age_s)])])[0] for age_s in (0.0, 0.4))
+    assert len(now) > 0
+    assert same(now, late)
+
+
+@pytest.mark.parametrize("join", ["nms", "average"])
+def test_an_own_look_that_is_older_than_what_came_loses_as_anything_late_does(join: Any) -> None:
+    """Alone at its places it keeps what its age leaves beside the fresher share, and no more."""
+    ego, peer = capture(0.0, 0.0, t_s=5.0), capture(0.0, 0.0, drone=1, t_s=5.5)
+    own, theirs = boxes_at((0, 0, 0.8), (30, 5, 0.6)), boxes_at((-40, 8, 0.5))
+    share = Share(peer, "detections", 0.0, None, 1.0, (), 0.1, boxes=theirs)
+    sources = EgoSources.of(ego, [share], own, False, [source_of(share, None)])
+    assert sources.age_s == pytest.approx(0.6)
+    (found,) = joined_many([sources], join)
+    left = float(np.divide(*still_right(reach_m(own.size_m[:1]), np.array([0.6, 0.1]))))
+    assert 0.3 < left < 0.9
+    wanted = {30: 0.6 * left, 0: 0.8 * left, -40: 0.5}
+    if join == "average":  # the other one looked there and saw nothing
+        wanted = {30: 0.6 * left / (1 + left), 0: 0.8 * left / (1 + left), -40: 0.5 / (1 + left)}
+    got = {round(float(x)): float(score) for (x, _), score in zip(found.xy_m, found.score, strict=True)}
+    assert got == pytest.approx(wanted, rel=1e-4)
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.4])
+@pytest.mark.parametrize(("own_s", "peer_s"), [(0.0, 0.0), (0.0, 0.7), (0.1, 0.7), (0.7, 0.1)])
+def test_who_saw_nothing_lately_says_as_much_as_its_boxes_would(own_s: float, peer_s: float, weight: float) -> None:
+    """In a mean over all who looked: a late look counts by what its age leaves, whether it has a box there or not."""
+    own = boxes_at((0, 0, 0.8))
+    left = still_right(reach_m(own.size_m), np.array([own_s, peer_s]))
+    mine, silent = np.minimum(left / still_right(reach_m(own.size_m), np.array(min(own_s, peer_s))), 1.0)
+    peer = SourceBoxes(boxes_at((40, 0, 0.5)), weight, (0.0, 0.0, 0.0), age_s=peer_s)
+    (found,) = joined_many([EgoSources((0.0, 0.0, 0.0), own, False, [peer], own_s)], "average")
+    here = found.score[np.abs(found.xy_m[:, 0]) < 1]
+    assert here == pytest.approx([0.8 * mine / max(mine + weight * silent, 1.0)], rel=1e-4)
+    elsewhere = found.score[np.abs(found.xy_m[:, 0] - 40) < 1]
+    assert elsewhere == pytest.approx([0.5 * weight * silent / max(mine + weight * silent, 1.0)], rel=1e-4)
+
+
+@pytest.mark.parametrize("made", [surrogate, torch_detector])
+def test_a_late_map_is_fused_as_one_of_so_much_less_weight(made: Any) -> None:
+    """Beside the ego's own look, which is younger; without one, beside the youngest map."""
+    ego, a, b = cross(10.0, 20.0, 0.3, t_s=5.0)[:3]
+    old = a._replace(t_s=4.7)
+
+    def found(who: Capture, *shares: Share) -> Boxes:
+        return made().detect([(who, shares)])[0]
+
+    late = found(ego, Share(old, "features", 0.3, None, 0.9, (), 0.395))
+    assert same(late, found(ego, Share(old, "features", 0.3, None, 0.9 * map_weight(0.395, 0.095))))
+    assert not same(late, found(ego, Share(old, "features", 0.3, None, 0.9)))
+    blind = ego._replace(looked=False)
+    young = Share(b, "features", 0.3, None, 0.9, (), 0.095)
+    late = found(blind, young, Share(old, "features", 0.3, None, 0.9, (), 0.395))
+    less = Share(old, "features", 0.3, None, 0.9 * map_weight(0.395, 0.095))
+    assert same(late, found(blind, young._replace(age_s=0.0), less))
+
+
+@pytest.mark.parametrize("made", [surrogate, torch_detector])
+def test_without_an_own_look_maps_count_beside_the_heaviest_of_them(made: Any) -> None:
+    """All weights halved are the same weights: there is no own map against which they would be less."""
+    blind, *peers = cross(10.0, 20.0, 0.3)[:4]
+    blind = blind._replace(looked=False)
+    whole, half = (
+        made().detect([(blind, [Share(c, "raw", 1.0, None, part * w) for c, w in zip(peers, (0.6, 1.0, 0.3), strict=True)])])[0]
+        for part in (1.0, 0.5)
+    )  # fmt: skip
+    assert len(whole) == len(half) > 3
+    np.testing.assert_allclose(half.xy_m, whole.xy_m, atol=1e-2)
+    np.testing.assert_allclose(half.score, whole.score, atol=1e-3)
+    other = made().detect([(blind, [Share(c, "raw", 1.0, None, 1.0) for c in peers])])[0]
+    assert not (len(other) == len(whole) and np.allclose(other.score, whole.score, atol=1e-3))
+
+
 # --- cells -------------------------------------------------------------------------------------------------------------
 
 
@@ -242,6 +332,21 @@ def test_only_boxes_that_were_cut_leave_places_open(boxes: int, kind: str) -> No
     assert source.boxes.score[0] == alone.score[0]
     near = source_of(share._replace(roi=Disc(0.0, 0.0, 20.0)), alone)
     assert not near.truncated  # few are inside, however many there are
+
+
+@pytest.mark.parametrize(("mine", "theirs"), [(0.0, 0.0), (0.3, -1.1), (2.5, 0.8)])
+def test_a_region_is_a_place_in_the_world_whoever_is_turned_how(mine: float, theirs: float) -> None:
+    """Which of the cars that both have are aimed at: those in the disc."""
+    disc = Disc(25.0, -10.0, 30.0)
+    ego, peer = capture(10.0, 20.0, yaw=mine), capture(30.0, 5.0, yaw=theirs, drone=1)
+    fleet, eyes = CaptureColumns.of([ego, peer]), Eyes(town())
+    looks = eyes.look(fleet)
+    pairs = pair(FeatureShares.of([(ego, [Share(peer, "features", 1.0, disc, 1.0)])], {ego: 0, peer: 1}), looks, fleet)
+    both = pairs.peer[:, 0] >= 0
+    inside = np.hypot(*(looks.world_m[pairs.look] - disc[:2]).T) <= disc.radius_m
+    assert 3 < np.count_nonzero(inside & both) < np.count_nonzero(both)
+    np.testing.assert_array_equal(pairs.aimed[both, 0], inside[both])
+    assert np.abs(pairs.shift_m[both]).max() < 0.2  # both know where they are
 
 
 def test_cells_that_went_missing_are_counted_among_those_that_were_allowed() -> None:
@@ -429,6 +534,29 @@ def test_each_drone_has_a_shared_false_positive_by_a_draw_of_its_own() -> None:
     assert not any(np.array_equal(by_drone[i], by_drone[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
     per_look = table.reshape(3, 12, -1)
     assert (per_look[:, 1:] != per_look[:, :-1]).any(axis=(1, 2)).all()
+
+
+def test_which_shared_false_positive_it_is_does_not_depend_on_its_band(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The draw that picks one of the network's is another than the one that picks the band."""
+    detector, asked = SurrogateDetector(town(), Perception(), 3), []
+    parameters = detector.parameters
+    detector.parameters = dataclasses.replace(
+        parameters, shared_false_positives=np.array([1.0, 0.9, 0.0, 0.0], np.float32)
+    )
+    plain = SurrogateDetector._pooled
+
+    def pooled(self: Any, yaw_rad: Any, band: np.ndarray, draws: np.ndarray) -> Any:
+        asked.append(np.stack([band, draws]))
+        return plain(self, yaw_rad, band, draws)
+
+    monkeypatch.setattr(SurrogateDetector, "_pooled", pooled)
+    for k in range(30):
+        detector.detect([(capture(0.0, 0.0, drone=k, t_s=0.5 * k), [])])
+    band, draws = np.concatenate(asked, axis=1)
+    assert len(band) > 100
+    assert len(np.unique(band)) > 3
+    assert len(np.unique(draws)) == len(draws)
+    assert abs(np.corrcoef(band, draws)[0, 1]) < 0.25
 
 
 # --- camera noise -----------------------------------------------------------------------------------------------------------------------

@@ -42,6 +42,7 @@ from sortie.policies.contract import (
     COVERAGE_CELL_M,
     FEATURE_CELLS,
     FEATURE_MAP_MEGABITS,
+    PERSON_FLAG,
     Descriptor,
     Directive,
     Disc,
@@ -53,6 +54,7 @@ from sortie.policies.contract import (
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
 from sortie.policies.geometry import footprint_overlap, peers_by_overlap
 from sortie.policies.registry import POLICIES, handshake_bytes, resolve, viewpoint_of
+from sortie.policies.verification.invariants import WORDS, Scope
 from sortie.policies.verification.views import draw_views
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS, WAITING_MBPS, probed_mbps
 
@@ -111,6 +113,24 @@ def test_detached_peers_change_nothing_but_their_own_links(name: str) -> None:
         if look is not None:
             assert look(old) == look(without)
     assert tested > 10
+
+
+@pytest.mark.parametrize("age_s", [0.1, 0.9, 1.5, 60.0])
+def test_what_a_view_says_of_the_fleet_leaves_out_who_is_detached(age_s: float) -> None:
+    """Every word of the invariants and every figure of the view that is about the fleet as a whole."""
+    view = fleet_of(4, phase=TaskPhase.TRACK)
+    view = aged(changed(view, [2], novelty_flags=PERSON_FLAG, priority_target_ids=(0,)), _2=age_s)
+    without = view._replace(
+        descriptors={i: d for i, d in view.descriptors.items() if i != 2},
+        age_s={i: a for i, a in view.age_s.items() if i != 2},
+    )
+    attached = age_s <= 1.0
+    assert view.human_in_region == attached
+    assert view.members == ((0, 1, 2, 3) if attached else without.members)
+    for name, word in WORDS.items():
+        if not word.of_link:
+            said, unsaid = (word.value(Scope(v, v.descriptors[0], [], {})) for v in (view, without))
+            assert said == unsaid or (attached and name in ("peers", "human_in_region")), name
 
 
 def test_the_middle_of_the_fleet_is_that_of_the_drones_that_are_there() -> None:
@@ -364,6 +384,18 @@ def test_every_receiver_gets_the_budget_to_the_cell(policy: Any, cells: int) -> 
 
 
 @pytest.mark.parametrize("policy", CHOOSE[1:])
+@pytest.mark.parametrize(("drones", "k"), [(2, 1), (2, 2), (2, 5), (3, 3), (5, 4), (5, 7)])
+def test_more_senders_than_there_are_leave_nothing_of_the_budget_over(policy: Any, drones: int, k: int) -> None:
+    """Each receiver gets it from those that there are."""
+    view, budget = fleet_of(drones), 0.4
+    got = dict.fromkeys(range(drones), 0)
+    for ego in range(drones):
+        for d in policy(of_ego(view, ego), k=k, received_budget=budget):
+            got[d.destination] += round(d.rho * FEATURE_CELLS)
+    assert got == dict.fromkeys(range(drones), math.floor(budget * (drones - 1) * FEATURE_CELLS))
+
+
+@pytest.mark.parametrize("policy", CHOOSE[1:])
 @pytest.mark.parametrize("k", [0, 1, 2, 3])
 def test_k_senders_serve_each_receiver_and_all_agree_who(policy: Any, k: int) -> None:
     """Though their clocks, and so their own stamps, differ."""
@@ -387,13 +419,18 @@ def test_random_senders_differ_by_receiver_epoch_and_salt() -> None:
 
     assert senders(0, 1.0) == senders(0, 9.9)
     epochs = [senders(0, 10.0 * e) for e in range(30)]
-    others = [tuple((i - r) % 5 for i in senders(r, 10.0 * e)) for r in (1, 2) for e in range(30)]
     salted = [senders(0, 10.0 * e, salt=1) for e in range(30)]
     assert len(set(epochs)) == len(set(salted)) == 6  # every pair of four comes up
-    same = [sum(a == b for a, b in zip(epochs, x, strict=True)) for x in (others[:30], others[30:], salted)]
+    # those of another receiver: by distance in the round of ids, and by place among its peers
+    others = [[senders(r, 10.0 * e) for e in range(30)] for r in range(1, 5)]
+    distance = [[tuple(sorted((i - r) % 5 for i in two)) for two in others[r - 1]] for r in range(1, 5)]
+    place = [[tuple(i if i < r else i - 1 for i in two) for two in others[r - 1]] for r in range(1, 5)]
+    mine = [tuple(i - 1 for i in two) for two in epochs]
+    same = [sum(a == b for a, b in zip(epochs, x, strict=True)) for x in (*distance, salted)]
+    same += [sum(a == b for a, b in zip(mine, x, strict=True)) for x in place]
     assert max(same) < 15
-    mine = [tuple(d.destination for d in baselines.random_k_receivers(changed(view, stamp_ns=e * 10**10)) if d.rho) for e in range(30)]  # fmt: skip
-    assert len(set(mine)) == 6
+    sent = [tuple(d.destination for d in baselines.random_k_receivers(changed(view, stamp_ns=e * 10**10)) if d.rho) for e in range(30)]  # fmt: skip
+    assert len(set(sent)) == 6
 
 
 # --- parameters ------------------------------------------------------------------------------------------------------

@@ -351,13 +351,13 @@ def test_bytes_are_conserved_and_goodput_stays_below_the_phy_rate(
 # --- context -----------------------------------------------------------------------------------------
 
 
-def test_broadcasts_reach_everyone_near_and_cost_one_event_each() -> None:
+def test_broadcasts_reach_everyone_near_and_cost_two_events_each() -> None:
     f = Flight(STILL, spread=0.0)
     f.fly(2.0, lambda t: f.publish(round(t * 10) % 5))
     assert len(f.heard) == 20
     assert all(ids == tuple(i for i in range(5) if i != sender) for _, sender, ids in f.heard)
     assert f.air.counters.receptions == 80
-    assert next(f.env._eid) <= 20 + 20 + 3  # one a frame to tick, one a broadcast, the process and the end
+    assert next(f.env._eid) <= 20 + 2 * 20 + 3  # one a frame to tick, two a broadcast, the process and the end
     assert f.air.airtime_s == pytest.approx([4 * 468e-6] * 5)
 
 

@@ -11,6 +11,7 @@ Joints, each with a test below:
 7. A route over several hops: its hops are spent where they are flown, and its goodput is that of its hops in sequence.
 8. A repair: it waits for the heartbeat and for the answer.
 9. Goodput: down at once, up by a share of the gap.
+10. Accounts: up to now, whatever was asked before.
 
 Draws that must be independent of each other:
 
@@ -72,7 +73,9 @@ def test_every_frame_is_the_link_budget_of_that_frame(antenna: Any, path_loss: A
     """With jammers, losses that differ by direction, tilted antennas of some drones: by hand, link by link."""
     n, frames = 4, 40
     own = {1: "isotropic"} if antenna == "dipole" else {2: "dipole"}
-    config = AirSettings(shadowing_sigma_db=0.0, antenna=antenna, own_antennas=own, path_loss=path_loss)  # type: ignore[arg-type]
+    config = AirSettings(
+        shadowing_sigma_db=0.0, antenna=antenna, own_antennas=own, path_loss=path_loss, ground_roughness_m=0.0,  # type: ignore[arg-type]
+    )  # fmt: skip
     at, up = moving(frames, n), tilting(frames, n)
     channel = Channel(config, at, 1, 0, 0.1, up)
     extra = np.arange(n * n, dtype=float).reshape(n, n)
@@ -182,6 +185,34 @@ def test_a_sender_knows_the_frame_before_whatever_has_changed_since() -> None:
         was = channel.now.square_db
 
 
+@pytest.mark.parametrize("by_trace", [False, True])
+def test_a_payload_goes_at_the_rate_of_the_frame_before_and_is_lost_to_the_present_one(
+    by_trace: bool, tmp_path: Path
+) -> None:
+    """A link that fades from one frame to the next, for four frames: its sender learns it a frame late, both times."""
+    weak = set(range(5, 9))
+    rows = [f"{0.1 * k:.1f},0,1,{8 if k in weak else 40},," for k in range(20)]
+    config = AirSettings(trace=trace(tmp_path, *rows)) if by_trace else CALM
+    flight = Hover(config, np.array([[0.0, 0.0, 60.0], [20.0, 0.0, 60.0]]))
+    planned: list[Any] = []
+
+    def tick(k: int) -> None:
+        flight.send(0, 1, 3000)
+        planned.append(flight.air.link_mbps()[0, 1])
+
+    for k in range(12):
+        flight.extra = None
+        if not by_trace and k in weak:
+            flight.extra = np.full((2, 2), 38.0)
+        flight.air.advance(flight.extra)
+        tick(k)
+        flight.env.run(until=0.1 * (k + 1))
+    mcs, snr_db = ({round(10 * r.t_sent_s): getattr(r, name) for r in flight.rows} for name in ("mcs", "snr_db"))
+    fast = mcs[0]
+    assert {k for k in range(12) if mcs[k] < fast} == {k for k in range(12) if planned[k] < planned[0]} == {6, 7, 8, 9}
+    assert {k for k in range(12) if snr_db[k] < 20} == weak
+
+
 # --- traces and bursts beside the models -------------------------------------------------------------
 
 
@@ -209,6 +240,18 @@ def test_losses_and_jammers_act_on_a_traced_link_as_on_a_modelled_one(tmp_path: 
     for (i, j), snr_db in wanted.items():
         assert over.known_snr_db(model)[i, j] == snr_db
         assert over.snr_of(i, j, 0.0, 0.0)[0] == snr_db
+
+
+def test_a_traced_loss_takes_from_the_rate_of_its_own_direction(tmp_path: Path) -> None:
+    """Whatever is lost is sent again, so that a link carries 1 − loss of what it does without; others are as modelled."""
+    flight = Hover(
+        AirSettings(shadowing_sigma_db=0.0, trace=trace(tmp_path, "0,0,1,,0.4,", "0,1,0,,0.1,", "0,2,0,,0,")), n=3
+    )
+    flight.fly(0.2)
+    mbps = flight.air.link_mbps()
+    whole = mbps[2, 0]
+    assert (mbps[0, 1], mbps[1, 0]) == (pytest.approx(0.6 * whole), pytest.approx(0.9 * whole))
+    assert mbps[0, 2] == pytest.approx(whole, rel=0.01)
 
 
 # --- who is gone ---------------------------------------------------------------------------------------
@@ -346,6 +389,21 @@ def test_no_goodput_is_above_what_the_link_carries_alone(payload: int) -> None:
     assert min(known) > 0.02 * carried.min()
 
 
+def test_accounts_do_not_depend_on_what_was_asked_before() -> None:
+    """Half-way through a transmission: each figure asked first, and after the others."""
+
+    def asked(*names: str) -> dict[str, Any]:
+        flight = Hover(CALM, n=2)
+        flight.air.advance()
+        flight.send(0, 1, 200_000, deadline_s=0.5)
+        flight.env.run(until=0.0213)
+        return {name: getattr(flight.air, name) for name in names}
+
+    together = asked("airtime_s", "utilisation")
+    assert asked("utilisation", "airtime_s") == together
+    assert asked("utilisation")["utilisation"] == together["utilisation"]
+
+
 def test_bytes_that_arrived_are_those_of_the_pieces_that_did() -> None:
     """Of 53 pieces the last is shorter, and counts as what it is, whether it comes or not."""
     flight = Hover(LOSSY, n=2)
@@ -419,7 +477,7 @@ def columns(n: int, seed: int = 1, replication: int = 0) -> Iterator[tuple[str, 
     """Shadowing and bursts of every pair of n drones, frame by frame."""
     frames, pairs = 3000, np.triu_indices(n, 1)
     settings = AirSettings(shadowing_time_s=0.02)  # hardly any memory
-    shadow = StreamShadowing(settings, seed, replication, n, 0.1).block(frames, frames)
+    shadow = StreamShadowing(settings, seed, replication, n, 0.1).block(frames)
     states = PairStates(BurstSettings(good_to_bad=0.5, bad_to_good=0.5, step_s=0.1), n, seed, replication, 0.1)
     bad = np.array([states.advance() for _ in range(frames)])
     for i, j in zip(*pairs, strict=True):

@@ -9,14 +9,17 @@ Joints, each with a test below:
 5. A make's network, weights and delay against the fleet's: in place of them, also where the value is zero or none.
 6. Peers of equal overlap: each ego begins after itself.
 7. Slots of every shape: who is where, and who stays when one more comes.
+8. A flight that is shortened: what begins before its end, of every list. A campaign's largest fleet, wherever it stands.
 
 Draws that must be independent of each other: streams of another seed, replication, entity or purpose.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +38,8 @@ from sortie.scenarios.link_state import (
     probed_mbps,
     state_of,
 )
-from sortie.scenarios.reading.load import ScenarioError, loads
+from sortie.scenarios.reading.campaign import load_campaign
+from sortie.scenarios.reading.load import ScenarioError, build, loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 
@@ -164,6 +168,52 @@ def test_every_function_of_a_goodput_agrees_about_the_states_of_a_link() -> None
     assert state_of(probed_mbps(0.0)) == LinkState.SILENT
 
 
+# --- shortened flights and varied ones -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("duration_s", "left"), [(4.0, 2), (2.0, 1), (2.1, 2), (1.9, 1), (10.0, 3)])
+def test_a_shortened_flight_keeps_what_begins_before_its_end(duration_s: float, left: int) -> None:
+    """Events, changes, commands and replays alike; what begins with the end, at 2 or 4 s, is after it."""
+    at = [{"at_s": t} for t in (1.0, 2.0, 4.0)]
+    whole = {
+        "name": "joints", "duration_s": 9.0, "events": [{"kind": "drone_lost", "drone": 0, **a} for a in at],
+        "policy": {
+            "name": "worked", "changes": [{"name": "silence", **a} for a in at] + [{"name": "worked", "command": "go"}],
+            "commands": [{"command": "go", **a} for a in at], "replays": [{"drone": 0, "view": "{}", **a} for a in at],
+        },
+    }  # fmt: skip
+    short = build(whole, {"duration_s": duration_s})
+    policy = short.policy
+    times = [[one.at_s for one in each] for each in (short.events, policy.changes, policy.commands, policy.replays)]
+    wanted = [1.0, 2.0, 4.0][:left]
+    assert times == [wanted, [*wanted, None], wanted, wanted]
+    with pytest.raises(ScenarioError, match="must be below duration_s = 4"):
+        build({**whole, "duration_s": 4.0})  # written so, it is a mistake
+
+
+@pytest.mark.parametrize("values", [[2, 7, 3], [7, 2, 3], [3, 2, 7]])
+def test_a_campaign_has_room_for_its_largest_fleet_and_longest_mission_wherever_they_stand(
+    values: list[int], tmp_path: Path
+) -> None:
+    """In a list, in a file's column, and at either end of a range."""
+    (tmp_path / "base.yaml").write_text(
+        "name: base\nfleet: {drones: 4}\nmission: {phases: [{at_s: 0, phase: search}]}\n"
+    )
+    (tmp_path / "column.csv").write_text("\n".join(["n", *map(str, values)]) + "\n")
+    phases = [[{"at_s": k, "phase": "search"} for k in range(n)] for n in values]
+    spreads: dict[str, Any] = {
+        "grid": {"kind": "grid", "values": values}, "choice": {"kind": "choice", "values": values},
+        "column": {"kind": "column", "file": "column.csv", "column": "n"},
+        "integers": {"kind": "integers", "low": min(values), "high": max(values)},
+    }  # fmt: skip
+    for spread in spreads.values():
+        vary = {"fleet.drones": spread, "mission.phases": {"kind": "grid", "values": phases}}
+        campaign = {"campaign": "c", "base": "base.yaml", "vary": vary, "metrics": ["wall_s"], "policies": ["worked"]}
+        (tmp_path / "c.yaml").write_text(json.dumps(campaign))
+        study = load_campaign(tmp_path / "c.yaml")
+        assert (study.drones, study.phases) == (7, 7)
+
+
 # --- makes ---------------------------------------------------------------------------------------------------
 
 
@@ -174,6 +224,8 @@ def test_every_function_of_a_goodput_agrees_about_the_states_of_a_link() -> None
         ({"detector": "surrogate"}, ("surrogate", None), ""),  # weights of another kind of detector are not its own
         ({"weights": "own.w"}, ("torch", "own.w"), "one"),
         ({"detector": "torch"}, ("torch", "fleet.w"), ""),
+        ({"weights": "fleet.w"}, ("torch", "fleet.w"), ""),  # named again, it is the same network
+        ({"weights": "fleet.w", "feature_space": "own"}, ("torch", "fleet.w"), "own"),
         ({"detector": "torch", "weights": "own.w"}, ("torch", "own.w"), "one"),
         ({"weights": "own.w", "feature_space": "shared"}, ("torch", "own.w"), "shared"),
         ({"detector": "surrogate", "feature_space": "other"}, ("surrogate", None), "other"),

@@ -620,7 +620,7 @@ FIGURES: dict[str, Figure] = {
     "inference_libraries": Figure(2, _inference_libraries, timed=True),
     "speed": Figure(12, _speed, timed=True),
     "difficulty": Figure(12, _difficulty),
-    "surrogate_in_flight": Figure(18, _surrogate_in_flight),
+    "surrogate_in_flight": Figure(45, _surrogate_in_flight),
     "arms": Figure(20, _arms),
     "handshakes": Figure(5, _handshakes),
     "requests": Figure(5, _requests),

@@ -197,7 +197,7 @@ def _children(pid: int) -> list[int]:
 def _still_running(session: int, most_s: float = 10.0) -> int:
     """How many processes of a session run on, after they had time to go."""
     end_s = time.monotonic() + most_s
-    while (found := _of_session(session)) and time.monotonic() < end_s:
+    while (found := of_session(session)) and time.monotonic() < end_s:
         time.sleep(0.2)
     for pid in found:
         with suppress(ProcessLookupError):
@@ -205,7 +205,8 @@ def _still_running(session: int, most_s: float = 10.0) -> int:
     return len(found)
 
 
-def _of_session(session: int) -> list[int]:
+def of_session(session: int) -> list[int]:
+    """A session's processes, but for those that have ended and wait to be asked how."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
+from sortie.perception.errors import InputError
 from sortie.perception.geometry import CHANNELS
 from sortie.perception.network.fusion.base import PerCell, weighted_sum
 
@@ -51,10 +52,35 @@ class DiscoNet(PerCell):
     def __init__(self) -> None:
         super().__init__()
         self.edge = EdgeWeights()
+        self.tune()
+
+    def tune(self, temperature: float = 1.0, silent_weight: float = 0.0, **params: Any) -> None:
+        """Intervene on the softmax.
+
+        Args:
+            temperature: the logits are divided by it; infinite gives equal weights.
+            silent_weight: added to a peer's logit in cells of which nothing was sent and that count as zeros.
+        """
+        super().tune(**params)
+        if not (isinstance(temperature, float | int) and temperature > 0.0):
+            raise InputError(f"perception.fusion_params.temperature is {temperature!r}, must be a number above 0")
+        if not (isinstance(silent_weight, float | int) and math.isfinite(silent_weight)):
+            raise InputError(f"perception.fusion_params.silent_weight is {silent_weight!r}, must be a finite number")
+        self.temperature, self.silent_weight = temperature, silent_weight
+
+    def weights(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
+        """Each agent's softmax weight, [agents, p]; as for `mix`."""
+        logit: Tensor = self.edge(features)
+        if self.temperature != 1.0:
+            logit = logit / self.temperature
+        if self.silent_weight:
+            silent = ~features.any(dim=-1)
+            silent[0] = False  # the ego is never silent
+            logit = logit + self.silent_weight * silent
+        return (logit + weight.clamp_min(1e-12).log()).masked_fill(~part, -math.inf).softmax(dim=0)
 
     def mix(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
-        logit = (self.edge(features) + weight.clamp_min(1e-12).log()).masked_fill(~part, -math.inf)
-        return weighted_sum(logit.softmax(dim=0), features)
+        return weighted_sum(self.weights(features, part, weight), features)
 
     def fold(self) -> None:
         edge: Any = self.edge

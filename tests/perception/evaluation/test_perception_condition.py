@@ -65,4 +65,7 @@ def test_conditions_that_differ_in_nothing() -> None:
     assert parse("best-2@0.49,norm").plain() == parse("best-2@0.49,norm")
     assert parse("all-4@0,masked").plain() == SINGLE
     assert parse("all-4@0").plain() == parse("all-4@0"), "four silent peers still dilute"
+    assert parse("best-2@0.1,zeros").plain() == parse("best-2@0.1,zeros"), "two absent peers dilute"
+    assert parse("all-4@0.1,zeros").plain() == parse("all-4@0.1"), "nobody is absent"
+    assert parse("best-2@0.1,masked,zeros").plain() == parse("best-2@0.1,masked")
     assert parse("best-2@0.4").plain(drones=3) == parse("all-2@0.4")

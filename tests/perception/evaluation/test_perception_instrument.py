@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.evaluate import evaluate
+from sortie.perception.evaluation.evaluate import Settings, evaluate, exchanges
 from sortie.perception.evaluation.instrument import CarNetInstrument, fingerprint
+from sortie.perception.geometry import FULL
 from sortie.perception.network.checkpoint import save_weights
 from sortie.perception.network.decode import decode
 from sortie.perception.network.fusion.base import takes_part
@@ -21,6 +23,7 @@ from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.network.warp import warp
+from sortie.scenarios.schema.base import Params
 
 
 @pytest.fixture(scope="module")
@@ -135,3 +138,28 @@ def test_from_images_to_ap(frames: SeenFrames) -> None:
             assert a.score == pytest.approx(b.score, abs=2e-5)
             assert a.truths == b.truths
     assert sum(len(u.score) for u in one.units[FULL_SHARING, "full"]) > 200
+
+
+def test_absent_peers_take_part_as_peers_who_sent_nothing(frames: SeenFrames) -> None:
+    view = CarNetInstrument(network("disconet")).look(frames, 0)
+    asked = (Sharing(0.05, "best-2"), Sharing(0.05, "best-2", absent="zeros"), Sharing(0.05, "best-2", unsent="masked"))
+    settings = Settings(1, 0.01, "rotated", 0)
+    (plain, few), (zeros, many), _ = exchanges(view, frames, 0, (0, 0), asked, settings, FULL, None)
+    assert few == many[:2]
+    assert many[2:] == [0, 0]
+    assert set(zeros.peers) == {1, 2, 3, 4}
+    assert zeros.peers[:2] == plain.peers
+    assert np.array_equal(zeros.sent[:2], plain.sent)
+    assert not zeros.sent[2:].any()
+    two, four = view.detect([plain, zeros], 0.01)
+    assert not np.array_equal(two[:, 5], four[:, 5])
+
+
+def test_knobs_of_the_fusion_are_in_the_fingerprint_and_change_boxes(frames: SeenFrames) -> None:
+    starved = Exchange(0, (1, 2, 3, 4), np.zeros((4, 64, 64), bool))
+    asked: list[Params] = [{}, {"temperature": math.inf}, {"silent_weight": 2.0}]
+    made = [CarNetInstrument(network("disconet"), fusion_params=params) for params in asked]
+    assert len({instrument.fingerprint for instrument in made}) == 3
+    scores = [instrument.look(frames, 0).detect([starved], 0.01)[0][:, 5] for instrument in made]
+    assert not np.array_equal(scores[0], scores[1])
+    assert not np.array_equal(scores[0], scores[2])

@@ -290,6 +290,6 @@ def test_the_registry_is_what_a_scenario_may_name() -> None:
     from sortie.scenarios.schema import Perception
 
     allowed = Perception.model_json_schema()["properties"]["fusion"]
-    assert set(allowed["enum"]) == set(FUSIONS)
+    assert set(allowed["anyOf"][0]["enum"]) == set(FUSIONS)
     assert allowed["default"] == DEFAULT
     assert all(f.about and "\n" not in f.about for f in FUSIONS.values())

@@ -147,10 +147,12 @@ def test_a_fusion_that_is_not_in_its_file_is_told(tmp_path: Path, fusion: str) -
 
 def test_a_fusion_file_that_does_not_load_is_told(tmp_path: Path) -> None:
     (tmp_path / "f.py").write_text("1 / 0")
-    with pytest.raises(PluginError, match=r"fusion file '.*f\.py' does not load: ZeroDivisionError: division by zero"):
-        resolve("fusion", f"{tmp_path / 'f.py'}:f")
-    with pytest.raises(PluginError, match=r"fusion file '.*g\.py' not found"):
-        resolve("fusion", f"{tmp_path / 'g.py'}:f")
+    with pytest.raises(
+        PluginError, match=r"recorded_fusion file '.*f\.py' does not load: ZeroDivisionError: division by zero"
+    ):
+        resolve("recorded_fusion", f"{tmp_path / 'f.py'}:f")
+    with pytest.raises(PluginError, match=r"recorded_fusion file '.*g\.py' not found"):
+        resolve("recorded_fusion", f"{tmp_path / 'g.py'}:f")
 
 
 def flown(tmp_path: Path, boxes: Any = None, **settings: Any) -> RecordedDetector:

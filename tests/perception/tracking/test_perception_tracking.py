@@ -169,6 +169,25 @@ def test_received_tracks_go_on_and_what_stands_stays() -> None:
     assert (tracks.moves == (np.hypot(*tracks.velocity_mps.T) > MOVES_AT * np.sqrt(tracks.covariance[:, 2]))).all()
 
 
+@pytest.mark.parametrize("coasts_s", [0.0, 0.4, 1.2])
+@pytest.mark.parametrize("age_s", [0.0, 0.3, 0.8])
+def test_a_received_track_is_as_certain_as_the_time_since_its_last_box_leaves_it(coasts_s: float, age_s: float) -> None:
+    """Coasting at its sender and travelling count alike; and so after its bytes were written and read."""
+    n, at = 2, np.full(2, 5.0)
+    velocity = np.array([[9.0, -4.0], [0.01, 0.0]])  # one drives, one stands
+    sent = Tracks(
+        np.zeros(n, np.int64), np.arange(n), at, np.array([[3.0, 4.0], [-8.0, 1.0]]), velocity,
+        np.tile([0.16, 0.0, 0.25], (n, 1)), np.tile([4.5, 1.9], (n, 1)), np.zeros(n), np.full(n, 0.8), np.full(n, 5),
+        np.full(n, 5), at - coasts_s, np.ones(n, bool),
+    )  # fmt: skip
+    late_s = coasts_s + age_s
+    for tracks in (sent, unpacked(packed(sent, (0.0, 0.0)), 0, (0.0, 0.0), 5.0)):
+        moved, variance = motion_of(tracks, age_s)
+        assert moved == pytest.approx(np.array([[9.0, -4.0], [0.0, 0.0]]), abs=0.01)
+        drives_m2 = SIGMA0_M**2 + 0.25 * late_s**2 + ACCELERATION_DENSITY * late_s**3 / 3
+        assert variance == pytest.approx([drives_m2, SIGMA0_M**2], rel=0.03)
+
+
 def test_late_boxes_take_the_velocity_of_the_receivers_own_track_where_it_was_then() -> None:
     """The car was at 20 m a second before its track's state of 28 m; a box near no track has none."""
     tracks = driving()

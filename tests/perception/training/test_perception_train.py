@@ -12,6 +12,8 @@ from safetensors.torch import load_file
 
 from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_scene_file
 from sortie.perception.network.checkpoint import load_weights, read_facts, save_weights
+from sortie.perception.network.detector import SHIPPED_WEIGHTS
+from sortie.perception.network.fusion.own import OwnFusion
 from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.training import train as training
 from sortie.perception.training.learn import Thinning, draw_batch, gradients, local_cars
@@ -174,3 +176,21 @@ def test_a_warm_start_takes_what_fits_and_names_the_rest(tmp_path: Path, caplog:
     with pytest.raises(ValueError, match="made for another range than ±51"):
         training._begin_from(small, tmp_path / "old.safetensors", logging.getLogger("sortie.train"))
     assert load_weights(tmp_path / "old.safetensors").config == ModelConfig()
+
+
+@pytest.mark.usefixtures("small")
+def test_a_fusion_of_ones_own_is_trained_with_its_encoder(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "import torch\n\nclass Mine(torch.nn.Module):\n    def __init__(self):\n        super().__init__()\n"
+        "        self.gain = torch.nn.Parameter(torch.tensor(0.5))\n"
+        "    def forward(self, agents, takes_part, weight):\n        return agents[:, 0] + self.gain * agents[:, 1:].sum(1)\n"
+    )
+    name, path = f"{tmp_path / 'mine.py'}:Mine", tmp_path / "w.safetensors"
+    train(path, Recipe(steps=1, cell_dropout=0.5), ModelConfig(fusion=name), warm_start=SHIPPED_WEIGHTS)
+    trained, shipped = load_weights(path, OwnFusion(name)), load_weights(SHIPPED_WEIGHTS)
+    assert trained.config.fusion == name
+    assert trained.fusion.model.gain != 0.5
+    assert not torch.equal(trained.head.out.weight, shipped.head.out.weight)
+    again = CarNet(ModelConfig(fusion=name), OwnFusion(name))
+    training._begin_from(again, path, logging.getLogger("sortie.train"))
+    assert torch.equal(again.fusion.model.gain, trained.fusion.model.gain)

@@ -6,7 +6,8 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, Disc, FleetView, Representation, TaskPhase
-from sortie.policies.verification.invariants import WORDS, InvariantError, find_violation, just_heard, parse, violations
+from sortie.policies.verification.invariants import InvariantError, just_heard, parse, violations
+from sortie.policies.verification.words import WORDS
 
 VIEW = fleet_of(3, soc=0.2, goodput=4.0)
 SHARED = [
@@ -106,14 +107,6 @@ def test_what_is_refused(line: str, message: str) -> None:
         parse(f"\n{line}")
     assert message in str(caught.value)
     assert str(caught.value).startswith("line 2, ")
-
-
-def test_a_complaint_names_the_directive_the_rule_and_what_was_decided() -> None:
-    found = find_violation(parse("rate_hz <= 5"), lambda view: SHARED, VIEW)
-    assert found == "directive 0→1 break 'rate_hz <= 5': →1 features ρ 0.25 10 Hz duty 40 % (one)".replace(
-        "break", "breaks"
-    )
-    assert find_violation(parse("rate_hz <= 10"), lambda view: SHARED, VIEW) is None
 
 
 def test_every_word_is_explained() -> None:

@@ -131,3 +131,33 @@ def test_in_the_air_it_starts_low_finds_the_ideal_rate_and_lags() -> None:
     assert late[0]
     assert sum(late) < 25
     assert not any(late[20:])
+
+
+def _crowded(control: str, senders: int) -> list[Transmission]:
+    """Each drone of a ring keeps a sample waiting for its neighbour, at an SNR that the top rate can bear."""
+    env = simpy.Environment()
+    config = AirSettings(rate_control=control, shadowing_sigma_db=0.0)
+    around = 2 * np.pi * np.arange(senders) / senders
+    places = np.column_stack([10 * np.cos(around), 10 * np.sin(around), np.full(senders, 60.0)])
+    air = Air(env, config, still(places), seed=1, frame_s=0.1)
+    rows: list[Transmission] = []
+
+    def frames() -> simpy.events.ProcessGenerator:
+        for _ in range(40):
+            air.advance()
+            for k in range(senders):
+                air.send(k, (k + 1) % senders, 163_840, kind="f", reliable=False, deadline_s=0.09, on_done=rows.append)
+            yield env.timeout(0.1)
+
+    env.process(frames())
+    env.run(until=4.0)
+    return rows
+
+
+def test_collisions_cost_some_rate_and_nothing_else() -> None:
+    """What collided counts as lost, at whatever rate: the control sinks below the ideal, but not to the bottom."""
+    late = {n: [r for r in _crowded("minstrel", n) if r.t_sent_s > 2.0] for n in (2, 12)}
+    mean = {n: np.mean([r.mcs for r in rows]) for n, rows in late.items()}
+    assert all(r.status == "delivered" for rows in late.values() for r in rows)
+    assert {r.mcs for r in _crowded("ideal", 12)} == {11}
+    assert 7.0 < mean[12] < mean[2] - 0.5

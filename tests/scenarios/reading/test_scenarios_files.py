@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from sortie.scenarios.reading.files import found_beside, named_files, placed, with_files
+from sortie.scenarios.reading.files import assigned, found_beside, named_files, placed, value_at, with_files
 from sortie.scenarios.reading.load import load, loads
+from sortie.scenarios.traces import SHIPPED, located
 
 TEXT = """
 name: own
@@ -74,6 +75,41 @@ def test_a_shipped_trace_is_one_that_is_here(tmp_path: Path) -> None:
     assert load("paper_context").radio.trace is not None
 
 
+def test_a_file_of_one_s_own_goes_before_a_shipped_one_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = Path("paper_120s/links.csv")
+    monkeypatch.chdir(tmp_path)
+    assert located(name) == SHIPPED / name
+    name.parent.mkdir()
+    assert located(name) == SHIPPED / name  # a folder is no trace
+    name.touch()
+    assert located(name) == name
+
+
+def test_a_scenario_whose_files_are_looked_for_is_left_as_it_was() -> None:
+    """Sections within sections and lists too: what is renamed is a copy."""
+    sections = loads(TEXT).model_dump(mode="json", exclude_none=True)
+    before = json.dumps(sections)
+    changed = with_files(sections, lambda name: f"there/{name}")
+    assert json.dumps(sections) == before
+    assert changed["policy"]["changes"][0]["name"] == "there/other.py:decide"
+
+
 def test_a_scenario_without_files_is_left_alone(tmp_path: Path) -> None:
     plain = loads("name: plain")
     assert found_beside(plain, tmp_path) is plain
+
+
+def test_a_field_alone_names_its_files_and_a_preset_names_none() -> None:
+    for field, value, files in (
+        ("fleet.airframe", "solo", []),
+        ("fleet.airframe.power_model", "watts.py:table", ["watts.py"]),
+        ("fleet.makes.1.airframe.power_model", "watts.py:table", ["watts.py"]),
+        ("radio.path_loss", "two_ray", []),
+        ("events", [{"kind": "own", "model": "rain.py:Front"}], ["rain.py"]),
+        ("radio.link_params.loss_db", 3.0, []),
+    ):
+        sections = assigned(field, value)
+        assert named_files(sections) == files
+        assert value_at(field, sections) == value

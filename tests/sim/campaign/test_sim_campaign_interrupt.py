@@ -10,11 +10,11 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from campaign_examples import CAMPAIGN, CLUSTER, plan, rows_on_disk, write
+from kill_campaign import of_session
 
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.signals import EndedError, ended_by_sigterm, undisturbed
@@ -57,7 +57,7 @@ def test_an_end_from_outside_is_one_line_and_leaves_nothing_running(
             assert driver.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.01)
-        assert len(_processes(driver.pid)) >= 1 + workers
+        assert len(of_session(driver.pid)) >= 1 + workers
         if number == signal.SIGINT:
             os.killpg(driver.pid, number)
         else:
@@ -65,20 +65,9 @@ def test_an_end_from_outside_is_one_line_and_leaves_nothing_running(
         said, _ = driver.communicate(timeout=60)
     assert said == f"{what}; what is finished is kept in {folder}, the same command goes on\n"
     assert driver.returncode == code
-    while _processes(driver.pid):  # multiprocessing's resource tracker goes last, by itself
+    while of_session(driver.pid):  # multiprocessing's resource tracker goes last, by itself
         assert time.monotonic() < deadline
         time.sleep(0.01)
-
-
-def _processes(session: int) -> list[int]:
-    """A session's processes, but for those that have ended and wait to be asked how."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            state, _, _, its, *_ = (folder / "stat").read_text().rpartition(")")[2].split()
-            if int(its) == session and state != "Z":
-                found.append(int(folder.name))
-    return found
 
 
 @pytest.mark.slow

@@ -353,6 +353,31 @@ def test_every_file_that_runs_read_is_in_the_key(tmp_path: Path) -> None:
         before = after
 
 
+def test_every_varied_model_is_in_the_key_wherever_it_is_named(tmp_path: Path) -> None:
+    """Fields two levels deep, entries of lists, and lists given whole; a model's name alone is no file."""
+    for name in ("loss", "watts", "rain", "hail", "snow", "mine"):
+        (tmp_path / f"{name}.py").write_text("def model(*_):\n    pass\n")
+    base = BASE + "events: [{kind: own, at_s: 0, model: 'rain.py:model'}]\nmetrics: {m: {model: 'mine.py:model'}}\n"
+    vary = """radio.path_loss: {kind: grid, values: [two_ray, 'loss.py:model']}
+  fleet.airframe.power_model: {kind: grid, values: [level, 'watts.py:model']}
+  events.0.model: {kind: choice, values: ['rain.py:model', 'hail.py:model']}
+  metrics: {kind: grid, values: [{m: {model: 'snow.py:model'}}]}"""
+    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", vary)
+    before = plan(tmp_path, text, base)
+    files = {str(tmp_path / f"{name}.py") for name in ("loss", "watts", "rain", "hail", "snow", "mine")}
+    assert set(before.spec["files"]) == files
+    flown = [json.loads(before.task(run))["scenario"] for run in range(before.runs)]
+    assert {s["radio"]["path_loss"] for s in flown} == {"two_ray", f"{tmp_path / 'loss.py'}:model"}
+    assert {s["fleet"]["airframe"]["power_model"] for s in flown} == {"level", f"{tmp_path / 'watts.py'}:model"}
+    assert {s["events"][0]["model"] for s in flown} == {f"{tmp_path / f}.py:model" for f in ("rain", "hail")}
+    assert {s["metrics"]["m"]["model"] for s in flown} == {f"{tmp_path / 'snow.py'}:model"}
+    for file in sorted(files):
+        Path(file).write_text(Path(file).read_text() + "\n")
+        after = plan(tmp_path, text, base)
+        assert after.key(0) != before.key(0), file
+        before = after
+
+
 def test_another_policy_than_the_bases_own_flies_to_the_end(tmp_path: Path) -> None:
     """As in `sortie compare`: the base's changes and commands are its own policy's."""
     base = BASE + "policy: {name: worked, changes: [{at_s: 0.2, name: silence}]}\n"

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -19,8 +20,10 @@ from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.reading.load import load
 from sortie.sim.check.checking import check_scenario
 from sortie.sim.check.discovery import is_scenario
-from sortie.sim.check.expectations import check
+from sortie.sim.check.expectations import Verdict, check
 from sortie.sim.check.golden import differences, golden_path, write_golden
+from sortie.sim.check.junit import Suite, junit
+from sortie.sim.check.once import Flown, flown_once
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
@@ -326,3 +329,103 @@ def _pytest(folder: Path, *options: str) -> tuple[int, list[str]]:
     lines = (done.stdout or done.stderr).splitlines()
     last = [line.partition(" in ")[0].strip("= ") for line in lines[-1:]]
     return done.returncode, last if done.returncode == 0 and not options else lines[:-1] + last
+
+
+COUNT = """
+from pathlib import Path
+
+def count(record):
+    with Path(__file__).with_suffix(".txt").open("a") as file:
+        file.write("one\\n")
+    return 1.0
+"""
+
+
+def project(folder: Path) -> None:
+    """A project with a scenario that expects six things, and another whose metric fails; both count their flights."""
+    (folder / "good.py").write_text(COUNT)
+    (folder / "bad.py").write_text(COUNT.replace("return 1.0", "raise KeyError('no such thing')"))
+    expect = "".join(f"  - {{metric: switches, at_least: -{i}}}\n" for i in range(6))
+    for name in ("good", "bad"):
+        (folder / f"{name}.yaml").write_text(
+            f"{SHORT}metrics: {{flights: {{model: '{name}.py:count'}}}}\nexpect:\n{expect}"
+        )
+
+
+def test_a_scenario_is_flown_once_whatever_the_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "tmp").mkdir()
+    (tmp_path / "project").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
+    project(tmp_path / "project")
+    _, lines = _pytest(tmp_path / "project", "-n", "2")
+    assert lines[-1] == "6 failed, 6 passed"
+    assert "PluginError: metric count: KeyError: 'no such thing' (bad.py, line 7)" in "\n".join(lines)
+    assert [(tmp_path / "project" / f"{name}.txt").read_text() for name in ("good", "bad")] == ["one\n"] * 2
+    assert not list((tmp_path / "tmp").glob("sortie-check-*")), "what the workers shared is gone"
+
+
+def test_verdicts_come_to_the_other_workers_as_they_were(tmp_path: Path) -> None:
+    verdicts = (Verdict("a ≥ 1", "0", False, "it must", "a", "facts", 3), Verdict("b", "2", True, ""))
+    flown, calls = Flown(verdicts, ("sortie fly x", ""), "wrote it"), list[int]()
+
+    def fly() -> Flown:
+        calls.append(1)
+        return flown
+
+    assert [flown_once(tmp_path, tmp_path / "x.yaml", fly) for _ in range(3)] == [flown] * 3
+    assert len(calls) == 1
+    for folder in (None, tmp_path / "gone"):
+        flown_once(folder, tmp_path / "x.yaml", fly)
+    flown_once(tmp_path, tmp_path / "y.yaml", fly)
+    assert len(calls) == 4
+
+
+def test_the_ini_option_says_which_files_are_scenarios(tmp_path: Path) -> None:
+    inside = tmp_path / "scenarios" / "more"
+    inside.mkdir(parents=True)
+    good = SHORT + "\n".join(EXPECT.splitlines()[:3]) + "\n"
+    for file in (tmp_path / "elsewhere.yaml", tmp_path / "scenarios" / "one.yaml", inside / "two.yaml"):
+        file.write_text(good)
+    (tmp_path / "pytest.ini").write_text("[pytest]\nsortie_scenarios = scenarios/*.yaml\n")
+    code, lines = _pytest(tmp_path, "--collect-only")
+    assert (code, lines[0]) == (0, "scenarios/one.yaml::deadline_miss_rate ≤ 0.5")
+    assert lines[-1] == "1 test collected"
+    (tmp_path / "pytest.ini").write_text("[pytest]\nsortie_scenarios = scenarios/**/*.yaml elsewhere.yaml\n")
+    (tmp_path / "scenarios" / "one.yaml").write_text("name: [1]\n")  # said to be one, so it must be one
+    code, lines = _pytest(tmp_path, "--collect-only")
+    assert (code, lines[-1]) == (2, "2 tests collected, 1 error")
+    assert any("one.yaml:1: name: " in line for line in lines)
+
+
+def test_verdicts_as_junit_xml(tmp_path: Path) -> None:
+    (tmp_path / "bad.yaml").write_text(SHORT + EXPECT)
+    file = tmp_path / "reports" / "sortie.xml"
+    done = CliRunner().invoke(app, ["check", str(tmp_path / "bad.yaml"), "--junit", str(file)])
+    assert done.exit_code == 1
+    (suite,) = ElementTree.parse(file).getroot()  # noqa: S314 - our own file
+    assert {k: suite.get(k) for k in ("tests", "failures", "errors")} == {"tests": "2", "failures": "1", "errors": "0"}
+    first, second = suite
+    assert (first.get("name"), len(first)) == ("deadline_miss_rate ≤ 0.5", 0)
+    (failure,) = second
+    assert failure.get("message").startswith("bytes.data_sent ≥ 1e+12, got ")
+    lines = failure.text.splitlines()
+    assert lines[0] == "because: it cannot"
+    assert lines[1].startswith("the record: payloads: ")
+    assert lines[2].startswith("see it: sortie fly ")
+
+
+def test_a_flight_that_fails_is_an_error_in_the_xml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "good.yaml").write_text(SHORT + EXPECT)
+    (tmp_path / "bad.yaml").write_text(SHORT + "metrics: {m: {model: 'none.py:x'}}" + EXPECT)
+    done = CliRunner().invoke(app, ["check", "good.yaml", "bad.yaml", "--junit", "r.xml"])
+    assert done.exit_code == 1
+    good, bad = ElementTree.parse("r.xml").getroot()  # noqa: S314 - our own file
+    assert (good.get("tests"), good.get("errors"), bad.get("tests"), bad.get("errors")) == ("2", "0", "1", "1")
+    assert bad[0][0].get("message") == "metric file 'none.py' not found"
+
+
+def test_text_that_xml_cannot_hold_is_replaced() -> None:
+    text = junit([Suite("a\x00<b>", None, "half \ud800 & \x1b[31m")])
+    (suite,) = ElementTree.fromstring(text)  # noqa: S314 - our own text
+    assert (suite.get("name"), suite[0][0].get("message")) == ("a�<b>", "half � & �[31m")

@@ -421,6 +421,12 @@ def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: P
         ("policies", ["worked", "random-2", "silence", "when2com-style", "Missing: learned keys and queries"]),
         ("scenarios", ["track_target", "paper_replay", "person_crossing", "search_grid", "two_makes"]),
         ("detectors", ["torch", "none"]),
+        ("detector", ["torch", "none"]),
+        ("fusion", ["disconet", "element-wise maximum"]),
+        ("path_loss", ["two_ray", "radio.ground_roughness_m"]),
+        ("power", ["level", "momentum theory"]),
+        ("event", ["jam(at_s=…, until_s=None, position_m=…, power_dbm=20.0)"]),
+        ("link", ["no link is built in or installed; name one of your own: path/to/file.py:Name"]),
         (
             "invariants",
             ["human_in_region", "same_network", "rate_hz  rate, Hz (of each link)", "any_link", "detections"],

@@ -45,7 +45,7 @@ def scenario(tmp_path: Path) -> Path:
         (("compare", "example.yaml", "--policies", "silence", "--readme", "example.yaml"), "must hold <!-- compare"),
         (("learn", "--out", "."), ".: is a folder, must be a file"),
         (("live", "example.yaml", "--out", "."), ".: is a folder, must be a file"),
-        (("train", "--fusion", "mean"), "fusion is 'mean', must be one of"),
+        (("train", "--fusion", "mean"), "unknown fusion 'mean', known: none, late,"),
         (("train", "--peak-lr", "nan"), "peak_lr is nan, must be above 0 and at most 1"),
         (("train", "--device", "tpu"), "device is 'tpu', must be one of cpu"),
         (("train", "--device", "cuda:99"), "device is 'cuda:99', must be one of cpu"),
@@ -127,3 +127,9 @@ def test_the_overhead_of_a_policy_with_parameters(capsys: pytest.CaptureFixture[
     printed = " ".join(capsys.readouterr().out.split())
     assert "best-2" in printed
     assert "silence" in printed
+
+
+def test_a_name_between_colons_is_printed_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Rich would print an emoji for `:link:`."""
+    assert command("fly", "track_target", "--set", "radio.link=oops:Link") == 2
+    assert "radio.link=oops:Link: radio.link" in capsys.readouterr().err

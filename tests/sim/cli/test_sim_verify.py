@@ -248,3 +248,43 @@ def test_invariants_that_are_no_text_are_refused(tmp_path: Path, capsys: pytest.
     path.write_text(f"INVARIANTS = ['rate_hz <= 5']\n{ALIASES['alias']}")
     assert command("verify", f"{path}:decide", *QUICK, "--out", tmp_path / "out") == 2
     assert capsys.readouterr().err == f"error: {path}:decide: INVARIANTS is of type list, must be text\n"
+
+
+def test_a_line_about_time_gets_a_scenario_that_flies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rules, out = tmp_path / "rules.txt", tmp_path / "out"
+    rules.write_text("when peers >= 1: within 0.5 s: any_link(representation >= detections)\nclimbs_in(dwell) <= 1\n")
+    told = ("verify", "silence", *QUICK, "--invariants", rules, "--courses", 20, "--out", out)
+    assert command(*told) == 1
+    printed = capsys.readouterr().out
+    assert "over time, as the gates enforce it" in printed
+    assert printed.count("proved") == 3, "the plane's two properties and the count of climbs"
+    (scenario,) = out.rglob("*.yaml")
+    assert "read_by: drone" in scenario.read_text()
+    assert command("check", scenario) == 1
+    assert "violation" in capsys.readouterr().out
+    assert command(*told) == 1, "its own counterexamples are replaced"
+
+
+FLOWN = """
+name: dropping
+duration_s: 3
+fleet: {drones: 2, formation: {shape: line, spacing_m: 25}}
+perception: {detector: none}
+policy: {name: silence, dwell_s: 0.2}
+events: [{kind: link_drop, at_s: 1, until_s: 2.5, drone: 1, loss_db: 120}]
+"""
+
+
+def test_a_scenario_is_flown_for_a_line_about_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only in flight: a peer is detached after 1 s of silence, which no course of one decision has."""
+    monkeypatch.setattr(console.out, "width", 1000)
+    (tmp_path / "dropping.yaml").write_text(FLOWN)
+    rules, out = tmp_path / "rules.txt", tmp_path / "out"
+    rules.write_text("within 0.3 s: age_s < 0.9\n")
+    told = ("--invariants", rules, "--courses", 1, "--scenario", tmp_path / "dropping.yaml", "--flights", 1)
+    assert command("verify", "silence", *QUICK, *told, "--out", out) == 1
+    assert "s of a flight of dropping: " in capsys.readouterr().out
+    (scenario,) = out.rglob("*.yaml")
+    assert command("check", scenario) == 1

@@ -12,6 +12,14 @@ def constant(air_velocity_mps, acceleration_mps2, climb_mps, mass_kg, *, power_w
     return np.full_like(climb_mps, power_w)
 
 
+def straight(soc, *, empty_v=3.0, full_v=4.2):
+    return empty_v + (full_v - empty_v) * soc
+
+
+def falling(soc):
+    return 4.0 - 0.5 * soc
+
+
 def negative(air_velocity_mps, acceleration_mps2, climb_mps, mass_kg):
     return np.full_like(climb_mps, -1.0)
 
@@ -141,3 +149,35 @@ def drifts(times_s, positions_m, rng, *, mps=5.0):
     error = np.zeros((len(times_s), 4))
     error[:, 1] = mps * times_s
     return error
+
+
+def largest(agents, takes_part, weight, *, gain=1.0):
+    peers = (takes_part * weight[:, :, None, None])[:, 1:, None] * (agents[:, 1:] - agents[:, :1]).relu()
+    return agents[:, 0] + gain * peers.amax(1)
+
+
+def spiral(times_s, starts_m, rng, *, speed_mps=4.0):
+    """Everybody flies a spiral about its start."""
+    angle = 0.5 * np.sqrt(times_s)
+    way = np.stack([np.cos(angle) - 1.0, np.sin(angle), 0 * angle], axis=-1) * speed_mps * np.sqrt(times_s)[:, None]
+    return starts_m + way[:, None]
+
+
+class Goes:
+    """Commands what its parameters say: once a time, in turn, the names in `do`."""
+
+    def __init__(self, drone, start_m, rng, *, do="GoTo", x_m=30.0, y_m=0.0, z_m=60.0, only=-1, says=""):
+        from sortie.fleet.flight import steering
+
+        self.steering, self.do, self.place, self.drone = steering, do.split(), (x_m, y_m, z_m), drone
+        self.only, self.says, self.views = only, says, []
+
+    def command(self, view):
+        self.views.append(view)
+        if self.says:
+            return self.says
+        if self.only not in (-1, self.drone):
+            return None
+        name = self.do[min(len(self.views) // 8, len(self.do) - 1)]
+        arguments = {"GoTo": self.place, "Velocity": self.place}.get(name, ())
+        return getattr(self.steering, name)(*arguments)

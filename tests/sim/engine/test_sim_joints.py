@@ -7,7 +7,7 @@ Joints, each with a test below:
 3. Delays, stamps and rates of one drone: its own, not the first drone's, the receiver's or the fastest.
 4. A drone that is lost, lands, goes home, waits or comes back: what it does, what reaches it, what it spends, where it is.
 5. Energy of computing and headrooms: of the frames in which perception ran.
-6. Events that overlap: each end undoes its own begin.
+6. Events that overlap: each end undoes its own begin. A way that changes in flight: rotors, senses and faults follow it.
 7. Ids of drones where some are gone.
 8. Groups, phases and targets: each group's own.
 9. What a thermal camera found: known after the drone's own delay.
@@ -29,6 +29,7 @@ import pyarrow.compute as pc
 import pytest
 from sim_examples import PATIENT, example
 
+from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.memory import PeerMemory, Received
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
@@ -37,7 +38,7 @@ from sortie.radio.rates import STANDARDS
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import plan_for
-from sortie.sim.engine.sortie import Parts, build, run_sortie
+from sortie.sim.engine.sortie import Parts, build, fly, run_sortie
 from sortie.sim.results.record import Recorder, SortieRecord
 
 
@@ -361,6 +362,55 @@ def test_losses_of_weaker_senders_stay_when_an_event_ends() -> None:
         assert (extra[1, 0], extra[0, 1], extra[1, 2]) == (there, back, 6.0)
 
 
+def test_what_blinds_and_slows_a_drone_ends_one_by_one() -> None:
+    """Each event's own part, while another of its kind goes on; other drones are as they were."""
+    flight = parts(
+        "events=[{kind: slow_perception, at_s: 1, drone: 1, extra_s: 0.01, until_s: 3},"
+        "{kind: slow_perception, at_s: 2, drone: 1, extra_s: 0.02, until_s: 4},"
+        "{kind: slow_perception, at_s: 1, drone: 3, extra_s: 0.04},"
+        "{kind: camera_blocked, at_s: 1, drone: 1, until_s: 3}, {kind: camera_blocked, at_s: 2, drone: 1, until_s: 4}]"
+    )
+    seen = []
+    for at_s in (0.5, 1.5, 2.5, 3.5, 4.5):
+        flight.env.run(until=at_s)
+        drones = flight.world.drones
+        seen.append(
+            (round(sum(drones[1].slower_s.values()), 9), len(drones[1].blocked), sum(drones[3].slower_s.values()))
+        )
+    assert seen == [(0.0, 0, 0.0), (0.01, 1, 0.04), (0.03, 2, 0.04), (0.02, 1, 0.04), (0.0, 0, 0.04)]
+    assert not any(flight.world.drones[i].slower_s or flight.world.drones[i].blocked for i in (0, 2, 4))
+
+
+@pytest.mark.parametrize(
+    "leaves", ["", ", {kind: drone_leaves, at_s: 1.5, drone: 2}, {kind: drone_joins, at_s: 3, drone: 2}"]
+)
+def test_a_fleet_that_flies_another_way_pays_for_it_and_believes_as_before(leaves: str) -> None:
+    """A drone goes home and comes back: rotors draw what the way as it was flown asks for, and faults of sensors stay."""
+    flight = parts(
+        "duration_s=5", "mission.descent_mps=10",
+        f"events=[{{kind: position_fault, at_s: 1, drone: 1, offset_m: [10, -4, 2]}}, {{kind: heading_fault, at_s: 1, drone: 2, offset_deg: 20}}{leaves}]",
+    )  # fmt: skip
+    fly(flight)
+    world, motion, scenario = flight.world, flight.world.motion, flight.scenario
+    for frame, wrong in ((5, False), (14, True), (25, True), (45, True)):
+        for drone, off_m, off_rad in ((0, (0, 0, 0), 0.0), (1, (10, -4, 2), 0.0), (2, (0, 0, 0), math.radians(20))):
+            here = world.sensed(drone, frame).capture
+            assert here.position_m == tuple(motion.position_m[frame, drone])
+            error_m = np.subtract(here.est_position_m, motion.est_position_m[frame, drone])
+            assert error_m == pytest.approx(off_m if wrong else (0, 0, 0))
+            turn = here.est_yaw_rad - motion.est_yaw_rad[frame, drone]
+            assert np.mod(turn + 1, 2 * np.pi) - 1 == pytest.approx(off_rad if wrong else 0.0)
+    power_w, states = fleet_power_w(scenario.fleet, motion), flight.recorder.finish()["states"]
+    airborne = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, 5))
+    used_j = (power_w * airborne).sum(axis=0) * scenario.frame_s / scenario.fleet.battery.drivetrain_efficiency
+    flown = [i for i in range(5) if airborne[:, i].all()]
+    assert len(flown) >= 4
+    for drone in flown:
+        assert flight.batteries.energy_j["rotor"][drone] == pytest.approx(used_j[drone], rel=1e-9)
+    if leaves:
+        assert flight.batteries.energy_j["rotor"][2] == pytest.approx(used_j[2], rel=0.03)  # it landed within a frame
+
+
 # --- ids, groups, people ----------------------------------------------------------------------------------------------
 
 
@@ -387,6 +437,35 @@ def test_the_link_that_limits_a_fleet_is_named_by_its_drones_where_some_are_gone
             assert {row["bottleneck_sender"], row["bottleneck_receiver"]} == {slow, best}
             assert row["bottleneck_mbps"] == pytest.approx(5 + (slow + best) / 10)
             assert row["cut_drones"] == []
+
+
+@pytest.mark.parametrize("gone", [0, 2])
+def test_who_is_cut_off_is_named_by_its_number_where_some_are_gone(gone: int) -> None:
+    record = run_sortie(
+        example(
+            "radio.relay_max_hops=2", "duration_s=4",
+            f"events=[{{kind: drone_lost, at_s: 1.5, drone: {gone}}}, {{kind: link_drop, at_s: 1.5, drone: 3, loss_db: 150}}]",
+        )
+    )  # fmt: skip
+    cut = {row["t_s"]: (row["connected"], row["cut_drones"]) for row in record.tables["topology"].to_pylist()}
+    assert cut == {0.0: (True, []), 1.0: (True, []), 2.0: (False, [3]), 3.0: (False, [3])}
+
+
+@pytest.mark.parametrize("skew_s", [0.0, -0.06, 0.06])
+def test_the_ages_of_a_record_are_true_whatever_drones_believe(skew_s: float) -> None:
+    """A clock that is off by less than its peers can see: they take the payloads for older or younger than they are."""
+    events = f"events=[{{kind: clock_skew, at_s: 0, drone: 1, skew_s: {skew_s}}}]" if skew_s else "events=[]"
+    record = run_sortie(example("duration_s=4", "perception.detector=surrogate", events, *PATIENT), to_all)
+    sent = {
+        (row["peer"], row["drone"], round(row["captured_s"], 6)): row["t_done_s"]
+        for row in record.tables["transmissions"].to_pylist()
+    }
+    count = 0
+    for row in record.tables["fusions"].to_pylist():
+        for peer, age_s in zip(row["peers"], row["ages_s"], strict=True):
+            assert sent[row["drone"], peer, round(row["t_s"] - age_s, 6)] <= row["t_s"]
+            count += peer == 1
+    assert count > 5
 
 
 def test_each_group_has_its_own_phase_region_and_target() -> None:

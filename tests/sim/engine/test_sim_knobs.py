@@ -21,7 +21,7 @@ from sim_examples import example
 
 from sortie.policies.contract import Descriptor, FleetView, TaskPhase
 from sortie.policies.verification.views import to_json
-from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema import FlightGroup, Scenario
 from sortie.scenarios.schema.fleet import Make
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.record import SortieRecord
@@ -44,6 +44,8 @@ DRIFT = "events=[{kind: clock_drift, at_s: 1, drone: 1, drift_ppm: -100000}]"
 SKEW = "events=[{kind: clock_skew, at_s: 1, drone: 1, skew_s: -0.5}]"
 TIRED = "fleet.overrides=[{drone: 1, initial_soc: 0.5, capacity_wh: 50, cell_resistance_mohm: 20, cycles: 10, payload_kg: 0.1}]"
 MADE = "fleet.makes=[{name: slow, drones: [1], airframe: solo, battery: {}, computer: {}, camera: {}, antenna: isotropic, tx_power_dbm: 10, policy: all-4, policy_params: {received_budget: 0.2}, feature_space: theirs}]"
+APART = "fleet.groups=[{drones: [1], formation: {altitude_m: 40}, route: {waypoints_m: [[0, 40]]}, legs: [{to_m: [60, 40], altitude_m: 60}]}]"
+STATION = "fleet.ground=[{drone: 1, position_m: [0, 20, 3]}]"
 FAR = "fleet.formation.spacing_m=150"  # links weak enough that rates, retries and repairs matter
 HEAVY = ("policy.name=all-4", "policy.params={received_budget: 0.4}")  # fills the medium
 QUIET_TOO = "radio.preamble_detection_dbm=-110"
@@ -64,11 +66,24 @@ FAST = (*LOOKS, "fleet.viewpoints.speed_mps=15", "fleet.viewpoints.acceleration_
 FENCE = "fleet.viewpoints.fence_m=[-100, -50, 100, 150]"
 
 BURSTS = "radio.bursts.good_to_bad=0.3"
+GLOBE = (
+    f"fleet.trace={Path(__file__).parent / 'globe.csv'}",
+    "fleet.origin={latitude_deg: 47, longitude_deg: 8, altitude_m: 450}",
+)
 LINKS = str(Path(__file__).parent / "links.csv")
 OWN = Path(__file__).parent / "own_models.py"
-WALL, NOISY, POWER, ALL_SEEN, STORM, DRIFTS = (
-    f"{OWN}:{name}" for name in ("wall", "Noisy", "constant", "Omniscient", "Storm", "drifts")
+WALL, NOISY, POWER, CURVE, ALL_SEEN, STORM, DRIFTS = (
+    f"{OWN}:{name}" for name in ("wall", "Noisy", "constant", "straight", "Omniscient", "Storm", "drifts")
 )
+GOES = f"fleet.mobility={OWN}:Goes"
+UP = (
+    "fleet.mobility_params={x_m: -60, z_m: 150}",
+    GOES,
+    "fleet.steering.altitude_m=[10, 400]",
+    "fleet.steering.acceleration_mps2=8",
+)
+AHEAD = (GOES, "fleet.mobility_params={x_m: 300, only: 1}", "fleet.steering.acceleration_mps2=8")
+MEET = (GOES, "fleet.mobility_params={x_m: -60, only: 1}", "fleet.steering.acceleration_mps2=8")
 AWAY = "events=[{kind: position_fault, at_s: 1, drone: 1, offset_m: [0, 40, 0]}]"
 ASTRAY = "events=[{kind: heading_fault, at_s: 1, drone: 1, offset_deg: 30}]"
 SLOW = "events=[{kind: slow_perception, at_s: 1, drone: 1, extra_s: 0.02}]"
@@ -113,6 +128,8 @@ def decide(view):
 """Everybody asks to be half as far from drone 0."""
 TIRED_VIEW = [tired(0), tired(1)]
 REPLAY = f"policy.replays=[{{at_s: 2, drone: 0, view: {TIRED_VIEW[0]}}}]"
+STALE = json.dumps(json.loads(TIRED_VIEW[0]).replace('"age_s": 0.0', '"age_s": 0.5').replace("0.15", "0.5"))
+SHOWN_STALE = f"policy.replays=[{{at_s: 2, drone: 0, view: {STALE}}}]"
 
 # field: (new value, settings that both sorties get)
 TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -125,6 +142,30 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.route.waypoints_m": ("[[-60, 0], [60, 20]]", ()),
     "fleet.route.speed_mps": ("6", ()),
     "fleet.route.turn_time_s": ("8", (TURN,)),
+    "fleet.groups.drones": ("[1, 2]", (APART,)),
+    "fleet.groups.formation": ("{altitude_m: 70}", (APART,)),
+    "fleet.groups.route": ("{waypoints_m: [[0, 40]], speed_mps: 12}", (APART, "fleet.groups.0.climb_mps=10")),
+    "fleet.groups.take_off": ("true", (APART,)),
+    "fleet.groups.climb_mps": ("1", (APART,)),
+    "fleet.groups.legs": ("[{to_m: [-60, 40]}]", (APART,)),
+    "fleet.ground.drone": ("2", (STATION,)),
+    "fleet.ground.position_m": ("[0, 20, 30]", (STATION,)),
+    "fleet.ground.mains": ("false", (STATION,)),
+    "fleet.ground.camera": ("true", (STATION,)),
+    "fleet.groups.mobility": ("random_waypoint", ("fleet.groups=[{drones: [1]}]",)),
+    "fleet.groups.mobility_params": (
+        "{slowest_mps: 9.9}",
+        ("fleet.groups=[{drones: [1], mobility: random_waypoint}]",),
+    ),
+    "fleet.mobility": ("random_waypoint", ()),
+    "fleet.mobility_params": ("{fastest_mps: 20, slowest_mps: 19}", ("fleet.mobility=random_waypoint",)),
+    "fleet.steering.reach_m": ("5", AHEAD),
+    "fleet.steering.speed_mps": ("2", AHEAD),
+    "fleet.steering.climb_mps": ("8", UP),
+    "fleet.steering.acceleration_mps2": ("1", AHEAD),
+    "fleet.steering.separation_m": ("15", MEET),
+    "fleet.steering.altitude_m": ("[10, 62]", UP),
+    "fleet.steering.fence_m": ("[-90, -60, -30, 60]", AHEAD),
     "fleet.motion.wind_mps": ("[5, 0]", ()),
     "fleet.motion.gust_sigma_mps": ("2", ()),
     "fleet.motion.gust_time_s": ("5", ()),
@@ -145,6 +186,8 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.battery.cells": ("6", ()),
     "fleet.battery.initial_soc": ("0.8", ()),
     "fleet.battery.cell_resistance_mohm": ("20", ()),
+    "fleet.battery.cell_model": (CURVE, ()),
+    "fleet.battery.cell_params": ("{full_v: 4.4}", (f"fleet.battery.cell_model={CURVE}",)),
     "fleet.battery.drivetrain_efficiency": ("0.7", ()),
     "fleet.battery.avionics_w": ("12", ()),
     "fleet.battery.compute_idle_w": ("12", ()),
@@ -178,6 +221,9 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "fleet.sensor_params": ("{mps: 20}", (f"fleet.sensor={DRIFTS}",)),
     "fleet.airframe.power_params": ("{power_w: 150}", (f"fleet.airframe.power_model={POWER}",)),
     "fleet.trace": ("TRACE", ()),
+    "fleet.origin.latitude_deg": ("47.0004", GLOBE),
+    "fleet.origin.longitude_deg": ("7.999", GLOBE),
+    "fleet.origin.altitude_m": ("400", GLOBE),
     "fleet.makes.drones": ("[2]", (MADE,)),
     "fleet.makes.airframe": ("zeng_2019", (MADE,)),
     "fleet.makes.battery": ("{capacity_wh: 50}", (MADE,)),
@@ -304,6 +350,7 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
     "policy.shield": ("true", ("policy.invariants=rate_hz <= 5",)),
     "policy.replays.at_s": ("3", (REPLAY,)),
     "policy.replays.drone": ("1", (REPLAY,)),
+    "policy.replays.read_by": ("drone", (SHOWN_STALE,)),
     "policy.replays.view": (TIRED_VIEW[0].replace("0.15", "0.5"), (REPLAY,)),
     "events.kind": ("battery_fault", ()),  # covered by every event below: the kind is what makes it one
     "events.at_s": ("2", (DROP,)),
@@ -333,7 +380,9 @@ TRAFFIC: dict[str, tuple[str, tuple[str, ...]]] = {
 # These act through the detector, so their sorties fly with it, shortly.
 SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.fusion": ("late", ()),
+    "perception.fusion_params": ("{gain: 0}", (f"perception.fusion={OWN}:largest",)),
     "fleet.makes.detector": ("surrogate", (MADE,)),
+    "fleet.ground.scored": ("true", (STATION,)),
     "perception.recording": ("OTHER", ("perception.detector=recorded", "perception.recording=RECORDING")),
     "perception.recorded_fusion": ("FUSION", ("perception.detector=recorded", "perception.recording=RECORDING")),
     "perception.weights": ("WEIGHTS", ()),
@@ -367,7 +416,7 @@ def leaves(model: type[BaseModel], prefix: str = "") -> set[str]:
     """Dotted names of every leaf field; list items share their list's name, union members their field's."""
     found: set[str] = set()
     for name, field in model.model_fields.items():
-        inner = [] if model is Make else sections(field.annotation)  # a make's sections stand whole for the fleet's
+        inner = [] if model in (Make, FlightGroup) else sections(field.annotation)  # they stand whole for the fleet's
         for section in inner:
             found |= leaves(section, f"{prefix}{name}.")
         if not inner:
@@ -419,6 +468,8 @@ def place(field: str, shared: tuple[str, ...]) -> str:
     return (
         field.replace("fleet.overrides.", "fleet.overrides.0.")
         .replace("fleet.makes.", "fleet.makes.0.")
+        .replace("fleet.groups.", "fleet.groups.0.")
+        .replace("fleet.ground.", "fleet.ground.0.")
         .replace("perception.people.", "perception.people.0.")
         .replace("mission.groups.phases.", "mission.groups.phases.1.")
         .replace("mission.groups.", "mission.groups.0.")

@@ -11,8 +11,10 @@ import pytest
 from sim_examples import example
 
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.plugins.reference import installed
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
+from sortie.sim.results.report import page
 from sortie.sim.results.run_folder import load, save
 
 SOURCE = Path(__file__).parent / "own_models.py"
@@ -77,7 +79,9 @@ def test_an_edited_file_has_another_digest(models: str) -> None:
         ("radio.link=mine.py:constant", r"^link constant: TypeError: "),
         ("perception.detector=mine.py:Half", r"^detector mine.py:Half has no 'truth', must have detect, truth, count_boxes, camera_views$"),
         ("perception.detector=mine.py:Short", r"^detector mine.py:Short: detect returns \[\], must be Boxes for each of the jobs$"),
-        ("fleet.airframe.power_model=mine.py:negative", r"^power negative: returns -1 W, must be finite and ≥ 0$"),
+        ("fleet.airframe.power_model=mine.py:negative", r"^power negative: returns -1 W, must be ≥ 0$"),
+        ("fleet.battery.cell_model=mine.py:falling", r"^cell falling: falls from 4 to 3.99997 V at a charge of 0.000, must not fall as the charge rises$"),
+        ("fleet.battery={cell_model: mine.py:straight, cell_params: {empty_v: 0}}", r"^cell straight: 0 V at a charge of 0.000, must be above 0$"),
         ("fleet.airframe.power_model=mine.py:scalar", r"^power scalar: returns shape \(\), must be \(30, \d\)$"),
     ],
 )  # fmt: skip
@@ -176,3 +180,33 @@ def test_a_saved_run_keeps_its_metrics_without_their_file(models: str, tmp_path:
 def test_a_metric_that_is_no_number_is_told(function: str, message: str, models: str) -> None:
     with pytest.raises(SortieError, match=message):
         fly(f"metrics={{all: {{model: '{models}:{function}'}}}}")
+
+
+def test_a_run_is_read_without_the_package_that_offered_its_models(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every kind of name; a new flight still needs them."""
+    shutil.copy(SOURCE, tmp_path / "drizzle.py")
+    about = tmp_path / "drizzle-1.2.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: drizzle\nVersion: 1.2\n")
+    offers = {"path_loss": "wall", "link": "Noisy", "detector": "Omniscient", "power": "constant", "sensor": "drifts",
+              "event": "Storm", "metric": "sent"}  # fmt: skip
+    (about / "entry_points.txt").write_text("".join(f"[sortie.{k}]\nmine = drizzle:{n}\n" for k, n in offers.items()))
+    names = (
+        "radio={path_loss: mine, link: mine}", "perception={detector: mine, fusion: none}", "fleet.airframe={power_model: mine}",
+        "fleet.sensor=mine", "events=[{kind: own, at_s: 1, model: mine}]", "metrics={m: {model: mine}}",
+    )  # fmt: skip
+    with monkeypatch.context() as there:
+        there.syspath_prepend(str(tmp_path))
+        installed.cache_clear()
+        record = run_sortie(example("duration_s=2", *names))
+        save(record, tmp_path / "run")
+    installed.cache_clear()
+    again = load(tmp_path / "run")
+    assert again.fingerprint == record.fingerprint
+    assert outcome(again) == outcome(record)
+    assert again.scenario.radio.path_loss == "mine"
+    assert "Fingerprint" in page(again)
+    with pytest.raises(SortieError, match="mine"):
+        example("duration_s=2", *names)

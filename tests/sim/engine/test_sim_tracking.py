@@ -15,6 +15,7 @@ from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scene, Target
+from sortie.sim.engine import tracking as tracking_module
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.engine.tracking import CUE_S, WARM_UP_S, FleetTracking, TargetSeen
 from sortie.sim.results.outcome import outcome
@@ -102,6 +103,23 @@ def test_nothing_is_detected_for_trackers_that_nobody_asks_and_old_looks_are_not
     tracking.tracks(0)
     looks_s = [0.1 * frame for frame in load("track_target", ["duration_s=10"]).tracked_frames]
     assert own.asked == sum(t_s >= looks_s[-1] - WARM_UP_S - 1e-6 for t_s in looks_s) < len(looks_s) / 2
+
+
+@pytest.mark.parametrize("every_s", [0.1, 0.4, 0.8, 2.0])
+def test_a_target_s_velocity_is_that_of_its_cues_however_rarely_they_come(
+    every_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tracking, _ = tracker()
+    asked = []
+    monkeypatch.setattr(
+        tracking_module, "followed", lambda tracks, cues, before, t_s: asked.append((t_s, cues[0])) or {}
+    )
+    for k in range(round(8 / every_s)):
+        t_s = k * every_s
+        tracking.follows(0, 0, (8.0 * t_s, -3.0 * t_s), t_s)
+    assert len(asked) >= 3
+    for t_s, cue in asked:
+        assert cue == pytest.approx((8.0 * t_s, -3.0 * t_s, 8.0, -3.0))
 
 
 def test_a_drone_that_looks_no_more_stops_naming_the_target() -> None:

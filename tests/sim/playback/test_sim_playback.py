@@ -670,3 +670,15 @@ def test_a_recording_is_named_after_the_policy_that_flew(tmp_path: Path, monkeyp
     monkeypatch.setattr(rr.RecordingStream, "send_recording_name", lambda self, name: named.append(name))
     save_rrd(run_sortie(example("duration_s=0.5", "mission.phases=[{}]"), "silence", 4), tmp_path / "a.rrd")
     assert named == ["example · silence · seed 4"]
+
+
+def test_a_ground_station_is_drawn_as_a_mast_that_leaves_no_trail(tmp_path: Path) -> None:
+    station = "fleet.ground=[{drone: 2, position_m: [0, 0, 6]}]"
+    save_rrd(run_sortie(example("fleet.drones=3", "duration_s=1", station)), tmp_path / "s.rrd")
+    drawn = read(tmp_path / "s.rrd")
+    parts = {path for path in drawn if path.startswith("/world/drones/2/")}
+    assert {"/world/drones/2/mast", "/world/drones/2/antenna"} <= parts
+    assert not parts & {"/world/drones/2/rotors", "/world/drones/2/body"}
+    assert "/world/trails/2" not in drawn
+    assert "/world/footprints/2" not in drawn or not any("Strips" in name for name in drawn["/world/footprints/2"])
+    assert "/world/drones/1/rotors" in drawn

@@ -134,6 +134,22 @@ def test_two_drones_far_apart_observe_what_lies_below_them(y_m: float, share: fl
     assert mission(*APART, region(0, y_m, 20))["region_observed_share"] == share
 
 
+def test_each_drone_observes_through_its_own_cameras() -> None:
+    """Of two drones far apart one has narrow pictures: below it as in a narrow fleet, below the other as in a usual one."""
+    narrow = "{field_of_view_deg: 30}"
+    make = f"fleet.makes=[{{name: narrow, drones: [1], camera: {narrow}}}]"
+    kinds = {"usual": (), "narrow": (f"fleet.camera={narrow}",), "mixed": (make,)}
+    first, second = (
+        {
+            k: mission(*APART, "duration_s=1", region(0, y_m, 90), *more)["region_observed_share"]
+            for k, more in kinds.items()
+        }
+        for y_m in (0, 400)
+    )
+    assert first["narrow"] < 0.8 * first["usual"]
+    assert (first["mixed"], second["mixed"]) == (first["usual"], second["narrow"])
+
+
 def test_two_drones_far_apart_observe_twice_the_area_of_one() -> None:
     """The region's disc reaches beyond both of their squares."""
     two = mission(*APART, "duration_s=2", region(0, 200, 350))["region_observed_share"]

@@ -24,21 +24,23 @@ agreements are stuck afterwards, and the pair sends nothing from its 64th frame 
 LOADS = (
     Case("5 in a cross, 13 kB to all", payload_bytes=13_120, pairs=20, mcs=9, stop_s=6.0, load=0.06),
     Case("5 in a cross, 50 kB to all", payload_bytes=50_000, pairs=20, mcs=9, stop_s=6.0, load=0.24),
-    Case("5 in a cross, 164 kB to two", payload_bytes=163_840, pairs=10, mcs=9, stop_s=6.0, load=0.39),
+    Case("5 in a cross, 164 kB to two each", payload_bytes=163_840, pairs=10, mcs=9, stop_s=6.0, load=0.39),
     Case("5 in a cross, 164 kB to all", payload_bytes=163_840, pairs=20, mcs=9, stop_s=6.0, load=0.79),
-    Case("5 in a cross, 655 kB to 6", payload_bytes=655_360, pairs=6, mcs=9, stop_s=6.0, load=0.94),
-    Case("5 in a cross, 655 kB to 10", payload_bytes=655_360, pairs=10, mcs=9, stop_s=6.0, load=1.57),
+    Case("5 in a cross, 655 kB over 6 links", payload_bytes=655_360, pairs=6, mcs=9, stop_s=6.0, load=0.94),
+    Case("5 in a cross, 655 kB over 10 links", payload_bytes=655_360, pairs=10, mcs=9, stop_s=6.0, load=1.57),
     Case("25 in a grid, descriptors alone", "grid", 25),
-    Case("25 in a grid, 13 kB to 40", "grid", 25, 20.0, 13_120, 40, stop_s=2.2, load=0.20),
-    Case("25 in a grid, 13 kB to 119", "grid", 25, 20.0, 13_120, 119, stop_s=2.2, load=0.60),
-    Case("25 in a grid, 50 kB to 47", "grid", 25, 20.0, 50_000, 47, stop_s=2.2, load=0.90),
-    Case("25 in a grid, 13 kB to 297", "grid", 25, 20.0, 13_120, 297, stop_s=2.2, load=1.50),
-    Case("25 in a grid, 164 kB to 24", "grid", 25, 20.0, 163_840, 24, stop_s=2.2, load=1.51),
-    Case("12 in a line, 30 kB to 24, MCS 5", "line", 12, 20.0, 30_000, 24, 5, load=0.39),
+    Case("25 in a grid, 13 kB over 40 links", "grid", 25, 20.0, 13_120, 40, stop_s=2.2, load=0.20),
+    Case("25 in a grid, 13 kB over 119 links", "grid", 25, 20.0, 13_120, 119, stop_s=2.2, load=0.60),
+    Case("25 in a grid, 50 kB over 47 links", "grid", 25, 20.0, 50_000, 47, stop_s=2.2, load=0.90),
+    Case("25 in a grid, 13 kB over 297 links", "grid", 25, 20.0, 13_120, 297, stop_s=2.2, load=1.50),
+    Case("25 in a grid, 164 kB over 24 links", "grid", 25, 20.0, 163_840, 24, stop_s=2.2, load=1.51),
+    Case("12 in a line, 30 kB over 24 links, MCS 5", "line", 12, 20.0, 30_000, 24, 5, load=0.39),
     Case("3 in a line of 460 m, 164 kB to the middle, MCS 3", "line", 3, 230.0, 163_840, 2, 3, stop_s=6.0, load=0.22),
     Case("the same with RTS/CTS", "line", 3, 230.0, 163_840, 2, 3, rts=True, stop_s=6.0, load=0.22),
-    Case("8 in a grid, 80 kB to 16, fading by frame", "grid", 8, 20.0, 80_000, 16, 7, fade="frame", load=0.43),
-    Case("8 in a grid, 80 kB to 16, fading by exchange", "grid", 8, 20.0, 80_000, 16, 7, fade="ppdu", load=0.43),
+    Case("8 in a grid, 80 kB over 16 links, fading by frame", "grid", 8, 20.0, 80_000, 16, 7, fade="frame", load=0.43),
+    Case(
+        "8 in a grid, 80 kB over 16 links, fading by exchange", "grid", 8, 20.0, 80_000, 16, 7, fade="ppdu", load=0.43
+    ),
 )
 """Descriptors and payloads of a sortie."""
 

@@ -83,7 +83,7 @@ def sortie_plan(
     plan = Plan(positions_m)
     for k in range(round(stop_s / FRAME_S)):
         plan.descriptors += [(k * FRAME_S + 0.08 * rng.random(), i, DESCRIPTOR_BYTES) for i in range(n)]
-        ready_s = 0.036 + 0.004 * rng.random(n)
+        ready_s = (0.036 + 0.004 * rng.random(n)).tolist()  # numpy's numbers would slow the whole clock down
         plan.payloads += [(k * FRAME_S + ready_s[s], s, r, payload_bytes) for s, r in pairs]
     plan.descriptors.sort()
     plan.payloads.sort(key=lambda row: row[0])  # stable: each sender's in the order of `pairs`

@@ -1,0 +1,250 @@
+"""Lines about time: looked for by simulation, proved where the states are few, and shown by a flight where they fail.
+
+A line such as `when human_in_region: within 0.5 s: any_link(representation >= detections)` is about a policy, the staleness
+rules and damping together. The search drives them over drawn courses of views (`closed_loop`), keeps the courses that come
+nearest to breaking the line, and changes those. A course that breaks it becomes a scenario in which a drone is shown these
+views; it counts only if its flight breaks the line as well. With a scenario, that scenario is flown too, with other seeds
+and with links that drop.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from sortie.policies.contract import FleetView, Policy, PolicyError
+from sortie.policies.verification.courses import (
+    Course,
+    Values,
+    changed_course,
+    constants_of,
+    draw_course,
+    shrink_course,
+)
+from sortie.policies.verification.invariants import Invariant, Recent
+from sortie.policies.verification.proof import Outcome
+from sortie.policies.verification.search import Budget
+from sortie.policies.verification.views import to_json
+from sortie.policies.verification.words import DWELL
+from sortie.scenarios.reading.load import loads
+from sortie.scenarios.schema import Scenario
+from sortie.scenarios.streams import stream
+from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes, first_break
+from sortie.sim.check.counterexample import breaks, slug
+from sortie.sim.check.few_states import NotFinite, prove_over_time
+from sortie.sim.engine.sortie import run_sortie
+
+COURSES = 400
+"""How many courses are tried for each line."""
+_FROM_BEST = 0.6
+"""Share of courses that change one of the best."""
+_BEST = 8
+_LONGEST = 600
+"""Decisions of the longest course: as many views as a scenario may show."""
+DROPS = 3
+
+
+class TimeVerdict(NamedTuple):
+    """The verdict on one line about time."""
+
+    name: str
+    outcome: Outcome
+    what: str
+    view: FleetView | None = None
+    """Of a line that a course refutes: the view at whose decision it is broken."""
+    scenario: Scenario | None = None
+    """Of a refuted line: a scenario whose flight breaks it."""
+
+
+class Subject(NamedTuple):
+    """Whose lines are judged."""
+
+    policy: Policy
+    name: str
+    params: Mapping[str, Any]
+
+
+def judge_over_time(
+    subject: Subject,
+    rules: Sequence[Invariant],
+    *,
+    drones: int,
+    budget_s: float,
+    scenario: Scenario | None = None,
+    courses: int = COURSES,
+    flights: int = 0,
+    seed: int = 0,
+) -> list[TimeVerdict]:
+    """The verdict on each line about time.
+
+    Args:
+        subject: the policy.
+        rules: lines about time.
+        drones: the largest fleet of courses and proofs.
+        budget_s: wall-clock time for the proofs of all lines together, and again for all courses and flights.
+        scenario: whose dwell time, staleness rules and shield apply, and which is flown too; None takes the defaults.
+        courses: how many for each line.
+        flights: how many of the scenario.
+        seed: of the courses.
+    """
+    base = loads("name: verify") if scenario is None else scenario
+    times, spent, proving = PlaneTimes.of(base), Budget(budget_s), Budget(budget_s)
+    verdicts = []
+    for rule in rules:
+        found, tried = _search(subject, rule, base, times, drones, courses, spent, seed)
+        flown = 0
+        if found is None and scenario is not None:
+            found, flown = _fly(subject, rule, scenario, flights, spent)
+        if found is not None:
+            verdicts.append(found)
+            continue
+        said = f"{tried} courses of up to {drones} drones" + (f" and {flown} flights keep it" if flown else " keep it")
+        said += f", at a dwell time of {times.dwell_s:g} s" + (", with the shield" if times.shielded else "")
+        try:
+            covered = prove_over_time(subject.policy, rule, times, drones, proving)
+            verdicts.append(TimeVerdict(rule.text, "proved", f"{covered}; {said}"))
+        except NotFinite as why:
+            verdicts.append(TimeVerdict(rule.text, "searched", f"{said}; not proved: {why}"))
+    return verdicts
+
+
+# --- courses -------------------------------------------------------------------------------------
+
+
+def _search(
+    subject: Subject,
+    rule: Invariant,
+    base: Scenario,
+    times: PlaneTimes,
+    drones: int,
+    courses: int,
+    budget: Budget,
+    seed: int,
+) -> tuple[TimeVerdict | None, int]:
+    """The verdict if a course breaks the line, and how many courses were tried."""
+    decisions = min(_LONGEST, math.ceil((3 * _longest_s(rule, times) + 2 * times.dwell_s + 1.0) / times.frame_s))
+    values = Values.of(constants_of(subject.policy, [rule]))
+    best: list[tuple[float, int, Course]] = []
+    for number in range(courses):
+        rng = stream(seed, number, (), "verify.over_time")
+        if best and rng.random() < _FROM_BEST:
+            course = changed_course(best[int(rng.integers(len(best)))][2], seed, number, values)
+        else:
+            size, limit = int(rng.integers(2, max(3, drones + 1))), times.detached_after_periods
+            still = Course(size, decisions, times.frame_s, times.period_s, limit, {}, {})
+            course = draw_course(seed, number, still, values)
+        pressure, view = _run(subject.policy, rule, times, course)
+        if view is not None:
+            verdict = _refuted(subject, rule, base, times, course)
+            if verdict is not None:
+                return verdict, number + 1
+        heapq.heappush(best, (pressure, number, course))
+        if len(best) > _BEST:
+            heapq.heappop(best)
+        if budget.is_spent:
+            return None, number + 1
+    return None, courses
+
+
+def _longest_s(rule: Invariant, times: PlaneTimes) -> float:
+    spans = [n.span for n in rule.nodes if isinstance(n, Recent)] + ([] if rule.within is None else [rule.within])
+    return max(times.dwell_s if span == DWELL else span for span in spans)
+
+
+def _run(policy: Policy, rule: Invariant, times: PlaneTimes, course: Course) -> tuple[float, FleetView | None]:
+    """How near a course comes to breaking a line, and the view at which it does."""
+    loop, pressure = ClosedLoop(policy, [rule], times), 0.0
+    for k, view in enumerate(course.views()):
+        try:
+            if loop.step(view, k * times.frame_s):
+                return math.inf, view
+        except PolicyError:  # the contract's rules report it
+            return 0.0, None
+        pressure = max(pressure, loop.past.pressure())
+    return pressure, None
+
+
+def _refuted(
+    subject: Subject, rule: Invariant, base: Scenario, times: PlaneTimes, course: Course
+) -> TimeVerdict | None:
+    """The verdict with the smallest course found; None if a flight of it keeps the line."""
+    course = shrink_course(course, lambda c: first_break(subject.policy, rule, times, c.views()) is not None)
+    views = list(course.views())
+    loop = ClosedLoop(subject.policy, [rule], times)
+    broken = [v for k, view in enumerate(views) for v in loop.step(view, k * times.frame_s)]
+    what = f"broken by {broken[0].cause} after {(len(views) - 1) * times.frame_s:.2f} s of a course: {broken[0].what}"
+    scenario = course_scenario(subject, rule, what, base, views)
+    return TimeVerdict(rule.text, "refuted", what, views[-1], scenario) if breaks(scenario) else None
+
+
+def course_scenario(
+    subject: Subject, rule: Invariant, what: str, base: Scenario, views: Sequence[FleetView]
+) -> Scenario:
+    """A sortie in which drone 0 reads these views, one a frame, under the dwell time, ages and shield of `base`."""
+    period_s = base.frame_s
+    return Scenario.model_validate(
+        {
+            "name": slug(rule.text),
+            "description": f"{rule.text}: {what}"[:2000],
+            "duration_s": period_s * (len(views) + 0.5),
+            "fleet": {"drones": max(len(v.descriptors) for v in views), "formation": {"shape": "grid"}},
+            "context": base.context.model_dump(
+                include={"rate_hz", "publish_every", "degraded_after_periods", "detached_after_periods"}
+            ),
+            "perception": {"detector": "none"},
+            "policy": {
+                "name": subject.name,
+                "params": dict(subject.params),
+                "dwell_s": base.policy.dwell_s,
+                "shield": base.policy.shield,
+                "invariants": rule.text,
+                "replays": [
+                    {"at_s": k * period_s, "drone": 0, "view": to_json(view), "read_by": "drone"}
+                    for k, view in enumerate(views)
+                ],
+            },
+            "expect": [{"metric": "policies.invariant_violations", "equals": 0, "because": rule.text}],
+        }
+    )
+
+
+# --- flights -------------------------------------------------------------------------------------
+
+
+def _fly(
+    subject: Subject, rule: Invariant, scenario: Scenario, flights: int, budget: Budget
+) -> tuple[TimeVerdict | None, int]:
+    """The verdict if a flight of the scenario breaks the line, and how many were flown."""
+    for number, flown in enumerate(flights_of(subject, rule, scenario, flights)):
+        record = run_sortie(flown)
+        if record.totals["invariant_violations"]:
+            first = min(record.tables["violations"].to_pylist(), key=lambda row: (row["t_s"], row["drone"]))
+            what = f"broken by {first['cause']} at {first['t_s']:.2f} s of a flight of {scenario.name}: {first['text']}"
+            return TimeVerdict(rule.text, "refuted", what, None, flown), number + 1
+        if budget.is_spent:
+            return None, number + 1
+    return None, flights
+
+
+def flights_of(subject: Subject, rule: Invariant, scenario: Scenario, count: int) -> Iterator[Scenario]:
+    """The scenario as it is, then with other seeds and with links that drop for a while."""
+    data = scenario.model_dump(mode="json", exclude_unset=True)
+    data["policy"] = data.get("policy", {}) | {
+        "name": subject.name, "params": dict(subject.params), "invariants": rule.text,
+    }  # fmt: skip
+    data["expect"] = [{"metric": "policies.invariant_violations", "equals": 0, "because": rule.text}]
+    for number in range(count):
+        rng = stream(scenario.seed, number, (), "verify.flights")
+        drops = []
+        for _ in range(int(rng.integers(1, DROPS + 1)) if number else 0):
+            at_s, lasts_s = rng.uniform(0, scenario.duration_s), rng.uniform(0.2, 4.0)
+            drops.append(
+                {
+                    "kind": "link_drop", "at_s": round(at_s, 2), "until_s": round(at_s + lasts_s, 2),
+                    "drone": int(rng.integers(scenario.fleet.drones)), "loss_db": 120,
+                }
+            )  # fmt: skip
+        events = [*data.get("events", []), *drops]
+        yield Scenario.model_validate({**data, "seed": scenario.seed + number, "events": events})

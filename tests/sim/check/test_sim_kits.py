@@ -1,0 +1,243 @@
+"""Conformance kits of models from outside: sound models pass, and each rule fails for a model that breaks it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from cli_examples import command
+from places import ROOT
+
+from sortie.scenarios.plugins.reference import PluginError, installed
+from sortie.sim.check.kits import KITS, verify
+from sortie.sim.check.model_rules import plain
+
+BROKEN = """
+import numpy as np
+
+def loss(d):
+    return 80 + 20 * np.log10(np.maximum(d, 1.0))
+
+def changes(d, a, b, ghz):
+    d += 1.0
+    return loss(d)
+
+def random(d, a, b, ghz):
+    return loss(d) + np.random.random(np.shape(d))
+
+calls = []
+
+def counts(d, a, b, ghz):
+    calls.append(1)
+    return loss(d) + len(calls)
+
+def tallest(d, a, b, ghz):
+    return loss(d) + np.max(a, initial=0.0) + np.max(b, initial=0.0)
+
+def downhill(d, a, b, ghz):
+    return loss(d) + 0.1 * a
+
+def near(d, a, b, ghz):
+    return 80 + 20 * np.log10(d + 1e-9)
+
+class Shared:
+    offset = [0.0]
+    def __init__(self, drones, frame_s, rng):
+        pass
+    def snr_db(self, t_s, positions_m, snr_db):
+        self.offset[0] = 0.0 if t_s == 0.0 else self.offset[0] + 1.0
+        return snr_db - self.offset[0]
+
+def squad(air, acceleration, climb, mass):
+    return np.full_like(climb, 100.0 * len(mass))
+
+def free_fall(air, acceleration, climb, mass):
+    return 100.0 * mass + 50.0 * climb
+
+def two_frames(times_s, positions_m, rng):
+    return np.zeros((len(times_s), 4)) + times_s[1]
+
+def rises(times_s, starts_m, rng):
+    starts_m += 1.0
+    return np.repeat(starts_m[None], len(times_s), axis=0)
+
+class Wanders:
+    def __init__(self, drone, start_m, rng):
+        pass
+    def command(self, view):
+        from sortie.fleet.flight.steering import Velocity
+        return Velocity(np.random.normal(), 1.0)
+
+def mean_of_all(agents, takes_part, weight):
+    return agents.mean(1)
+
+def last_peer(agents, takes_part, weight):
+    return agents[:, 0] + 0.1 * takes_part[:, -1, None] * agents[:, -1]
+
+def all_egos(agents, takes_part, weight):
+    return agents[:, 0] + 0.1 * (takes_part[:, 1:, None] * agents[:, 1:]).sum(1).mean(0)
+
+class Late:
+    def __init__(self, rng):
+        pass
+    def step(self, fleet):
+        fleet.jam((0.0, 0.0, np.random.random()), 30.0)
+
+def many(record):
+    return [1.0]
+
+def any_number(record):
+    return np.random.random()
+
+class Blind:
+    def __init__(self, scene, perception, seed, replication, *, size=2):
+        from sortie.perception.types import Boxes
+        self.boxes, self.size = Boxes, size
+    def detect(self, jobs):
+        import numpy as np
+        n = len(jobs)
+        one = self.boxes(np.zeros((n, 2)), np.ones((n, self.size)), np.zeros(n), np.ones(n))
+        return [one] * n
+    def truth(self, t_s, ego):
+        return self.boxes.empty()
+    def count_boxes(self, capture, roi):
+        return 0
+    def camera_views(self, capture):
+        raise ValueError("none")
+"""
+
+
+@pytest.fixture(autouse=True)
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("broken.py").write_text(BROKEN)
+    for page in (ROOT / "docs" / "guide").glob("*.md"):
+        for name, text in re.findall(r"^```python\n# file: (\S+)\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S):
+            Path(name).write_text(text)
+
+
+SOUND = [
+    ("path_loss", "foliage.py:weissberger", {"depth_m": 40}),
+    ("link", "houses.py:Blocked", {}),
+    ("detector", "nearby.py:Nearby", {}),
+    ("detector", "surrogate", {}),
+    ("fusion", "mean.py:Mean", {}),
+    ("power", "measured.py:wind_tunnel", {}),
+    ("cell", "phosphate.py:tremblay", {}),
+    ("sensor", "receiver.py:biased", {}),
+    ("mobility", "spiral.py:spiral", {"apart_m": 30}),
+    ("mobility", "gauss_markov", {}),
+    ("mobility", "orbit.py:Orbit", {}),
+    ("event", "rain.py:RainFront", {}),
+    ("metric", "first.py:detection_s", {}),
+]
+
+
+@pytest.mark.parametrize(("kind", "reference", "params"), SOUND, ids=[f"{k}-{r}" for k, r, _ in SOUND])
+def test_the_guides_models_keep_every_rule(kind: str, reference: str, params: dict[str, float]) -> None:
+    checks = verify(kind, reference, params)
+    assert len(checks) >= 4
+    assert not [(c.name, c.what) for c in checks if not c.holds]
+
+
+def test_every_kind_is_tried() -> None:
+    assert {kind for kind, _, _ in SOUND} == set(KITS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "fails"),
+    [
+        ("path_loss", "changes", {"arguments unchanged": "changes its argument 1"}),
+        ("path_loss", "random", {"same answer again": "one link: another answer than the first time; take random numbers from what is given"}),
+        ("path_loss", "counts", {"no memory": "frames by links: another answer"}),
+        ("path_loss", "tallest", {"links apart": "the loss of a link depends on the other links of the same call"}),
+        ("path_loss", "downhill", {"both directions alike": "another loss from the second end to the first"}),
+        ("path_loss", "near", {"answers": "distance 0: path_loss near: -100.0 dB at 0 m, must be at least 40.7 dB"}),
+        ("link", "Shared", {"sorties apart": "two objects made alike and used in turn disturb each other"}),
+        ("power", "squad", {"drones apart": "a drone's power depends on the other drones"}),
+        ("power", "free_fall", {"answers": "descent: power free_fall: returns -50 W, must be ≥ 0"}),
+        ("sensor", "two_frames", {"answers": "one frame: sensor two_frames: IndexError: index 1 is out of bounds for axis 0 with size 1 (broken.py, line"}),
+        ("fusion", "mean_of_all", {"absent peers": "a peer that takes part in no cell", "ego alone": "another map than the ego's"}),
+        ("fusion", "last_peer", {"order of peers": "the map depends on the order of the peers"}),
+        ("fusion", "all_egos", {"egos apart": "an ego's map depends on the other egos of the same call"}),
+        ("mobility", "rises", {"arguments unchanged": "changes its argument 2"}),
+        ("mobility", "Wanders", {"same answer again": "no region: another answer"}),
+        ("mobility", "squad", {"answers": "one drone: mobility squad: TypeError"}),
+        ("event", "Late", {"same answer again": "from 0.5 s to the end: another answer"}),
+        ("metric", "many", {"answers": "traffic alone: metric broken.py:many: returns [1.0], must be a finite number or None"}),
+        ("metric", "any_number", {"same answer again": "traffic alone", "no memory": "a drone is lost: another answer than the first time; keep nothing"}),
+        ("detector", "Blind", {"egos apart": "an ego's boxes depend on the other egos of the same call"}),
+    ],
+)  # fmt: skip
+def test_each_rule_fails_for_a_model_that_breaks_it(kind: str, name: str, fails: dict[str, str]) -> None:
+    found = {c.name: c.what for c in verify(kind, f"broken.py:{name}") if not c.holds}
+    for rule, what in fails.items():
+        assert found[rule].startswith(what), found
+
+
+def test_boxes_of_a_wrong_shape_are_told() -> None:
+    (check,) = verify("detector", "broken.py:Blind", {"size": 3})
+    assert check.what == "alone: detector broken.py:Blind: detect returns size_m of shape (1, 3), must be (1, 2)"
+
+
+def test_a_kind_or_a_model_that_is_not_there_is_an_error() -> None:
+    with pytest.raises(ValueError, match="no kind of model is called 'radar', must be policy, path_loss, link, "):
+        verify("radar", "x")
+    with pytest.raises(PluginError, match=r"path_loss file 'broken\.py' has no function or class 'none'"):
+        verify("path_loss", "broken.py:none")
+
+
+def test_the_command_prints_the_rules_and_says_by_its_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("verify", "path_loss", "foliage.py:weissberger(depth_m=40)") == 0
+    assert "links apart" in capsys.readouterr().out
+    assert command("verify", "path_loss", "broken.py:downhill") == 1
+    assert "1 does not hold" in capsys.readouterr().err
+    for wrong, message in (
+        (("power", "measured.py:wind_tunnel(kg=2)"), "has no parameter 'kg', it has: measured_kg"),
+        (("link",), "verify link, must be [KIND] REF"),
+        (("link", "a", "b"), "verify link a b, must be [KIND] REF"),
+        (("path_loss", "foliage.py:weissberger(depth_m=40"), "the bracket is not closed"),
+    ):
+        assert command("verify", *wrong) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_a_policy_may_be_verified_with_its_kind_or_without(capsys: pytest.CaptureFixture[str]) -> None:
+    """The kit itself is tested in test_sim_verify.py."""
+    for words in (("policy", "broken.py:nobody"), ("broken.py:nobody",)):
+        assert command("verify", *words) == 2
+        assert "policy file 'broken.py' has no function 'nobody'" in capsys.readouterr().err
+
+
+def test_values_are_compared_by_what_they_hold() -> None:
+    import numpy as np
+
+    assert plain({"a": np.array([1.0, np.nan])}) == plain({"a": np.array([1.0, np.nan])})
+    assert plain(np.zeros(2)) != plain(np.zeros(2, np.float32))
+    assert plain([1, None, "x"]) != plain([1, None, "y"])
+
+
+def test_an_installed_model_is_listed_with_its_parameters_and_verified(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "drizzle.py").write_text(
+        'import numpy as np\n\ndef wet(distance_m, a, b, ghz, *, db=2.0):\n    """Rain everywhere."""\n'
+        "    return 60 + 20 * np.log10(np.maximum(distance_m, 1.0)) + db\n"
+    )
+    about = tmp_path / "drizzle-1.2.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: drizzle\nVersion: 1.2\n")
+    (about / "entry_points.txt").write_text("[sortie.path_loss]\nwet = drizzle:wet\nbroken = nowhere:x\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    installed.cache_clear()
+    try:
+        assert command("list", "path_loss") == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert "wet(db=2.0)  Rain everywhere. (drizzle 1.2)" in lines
+        assert any(
+            line.startswith("broken  (drizzle 1.2) path_loss 'broken' of drizzle does not load: Mod") for line in lines
+        )
+        assert command("verify", "path_loss", "wet(db=0)") == 0
+    finally:
+        installed.cache_clear()

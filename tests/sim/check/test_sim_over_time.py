@@ -1,0 +1,125 @@
+"""Lines about time over the closed loop: courses against flights, searches, counterexamples that fly, and proofs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sortie.policies.registry import resolve
+from sortie.policies.verification.courses import Course, Values, constants_of, draw_course
+from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.search import Budget
+from sortie.scenarios.reading.load import loads
+from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes
+from sortie.sim.check.few_states import NotFinite, prove_over_time
+from sortie.sim.check.over_time import Subject, course_scenario, judge_over_time
+from sortie.sim.engine.sortie import run_sortie
+
+TIMES = PlaneTimes(0.1, 0.1, 0.4, 3.0, 10.0, shielded=False)
+STILL = Course(3, 30, 0.1, 0.1, 10.0, {}, {})
+POLICIES = """
+from sortie import Directive, Representation
+
+def send(view, rate_hz):
+    rung = Representation.DETECTIONS if rate_hz else Representation.NONE
+    return [Directive(view.ego, p, rung, rate_hz=rate_hz, reason="r") for p in view.peers]
+
+def two_rates(view):
+    return send(view, 2.0 if view.me is not None and view.me.battery_soc < 0.3 else 5.0)
+
+def silent_when_tired(view):
+    return send(view, 0.0 if view.me is not None and view.me.battery_soc < 0.123 else 5.0)
+
+def by_charge(view):
+    return send(view, 30.0 * view.me.battery_soc if view.me is not None else 0.0)
+
+def flips(view):
+    return send(view, 0.0 if any(view.me.goodput_to(p) < 33.0 for p in view.peers) else 5.0)
+"""
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("policies") / "mine.py"
+    path.write_text(POLICIES)
+    return path
+
+
+@pytest.mark.parametrize(("policy", "shield"), [("worked", False), ("worked", True), ("adaptive", False)])
+@pytest.mark.parametrize("number", range(3))
+def test_a_flight_of_a_course_enforces_what_the_loop_enforces(policy: str, shield: bool, number: int) -> None:
+    decide, (rule,) = resolve(policy), parse("when human: within 0.3 s: any_link(rate_hz >= 5)")
+    base = loads("name: base", overrides=["policy.dwell_s=0.4"])
+    base = base.model_copy(update={"policy": base.policy.model_copy(update={"shield": shield})})
+    course = draw_course(5, number, STILL, Values.of(constants_of(decide)))
+    views, loop, times = list(course.views()), ClosedLoop(decide, [rule], PlaneTimes.of(base)), PlaneTimes.of(base)
+    expected, last, breaks = [], {}, []
+    for k, view in enumerate(views):
+        breaks += [k] * bool(loop.step(view, k * times.frame_s))
+        for d in loop.enforced:
+            if d != last.get(d.destination, d._replace(representation=0, rho=0.0, rate_hz=0.0, roi=None)):
+                expected.append((k, d.destination, int(d.representation), round(d.rate_hz, 3)))
+            last[d.destination] = d
+    record = run_sortie(course_scenario(Subject(decide, policy, {}), rule, "", base, views))
+    rows = [row for row in record.tables["directives"].to_pylist() if row["drone"] == 0]
+    rungs = ["none", "tracks", "detections", "features", "raw"]
+    flown = [(int(r["t_s"] / 0.1), r["peer"], rungs.index(r["representation"]), round(r["rate_hz"], 3)) for r in rows]
+    assert flown == expected
+    assert flown
+    assert record.totals["violated_ticks"] == len(breaks)
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "outcome"),
+    [
+        ("silent_when_tired", "when peers >= 1: within 1.5 s: any_link(rate_hz > 0)", "refuted"),
+        ("two_rates", "when peers >= 1: within 1.5 s: any_link(rate_hz > 0)", "proved"),
+        ("two_rates", "within 0.5 s: rate_hz > 0", "refuted"),  # the dwell time after take-off
+        ("two_rates", "climbs_in(dwell) <= 1", "proved"),
+        ("flips", "climbs_in(4) <= 1", "refuted"),
+        ("by_charge", "climbs_in(dwell) <= 1", "searched"),
+    ],
+)
+def test_the_verdict_of_a_line_about_time(name: str, line: str, outcome: str, file: Path) -> None:
+    reference = f"{file}:{name}"
+    subject = Subject(resolve(reference), reference, {})
+    base = loads("name: base", overrides=["policy.dwell_s=1.0"])
+    (verdict,) = judge_over_time(subject, parse(line), drones=2, budget_s=60, scenario=base, courses=150)
+    assert verdict.outcome == outcome, verdict.what
+    if outcome == "refuted":
+        assert verdict.scenario is not None
+        assert run_sortie(verdict.scenario).totals["invariant_violations"] > 0
+        assert "of a course: →1 " in verdict.what
+    else:
+        assert "150 courses of up to 2 drones keep it, at a dwell time of 1 s" in verdict.what
+        assert ("all sequences of views of up to 2 drones" in verdict.what) == (outcome == "proved")
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "why"),
+    [
+        ("by_charge", "climbs_in(dwell) <= 1", "a number of the view goes into them"),
+        ("two_rates", "climbs_in(0.5) <= 1", "a sequence of views breaks it"),
+        ("two_rates", "within 0.7 s: rate_hz > 0", "a sequence of views breaks it"),
+        ("two_rates", "when peers >= 1: within 0.3 s: any_link(rate_hz > 0)", "a sequence of views breaks it"),
+        ("two_rates", "rate_hz <= fresh.rate_hz and climbs_in(1) <= 9", "fresh directives"),
+        ("two_rates", "count_links(climbs_in(1) > 1) <= 1", "counts of changes together with functions over links"),
+    ],
+)
+def test_what_no_proof_is_given_for(name: str, line: str, why: str, file: Path) -> None:
+    with pytest.raises(NotFinite, match=why):
+        prove_over_time(resolve(f"{file}:{name}"), parse(line)[0], TIMES, 2, Budget(60))
+
+
+@pytest.mark.parametrize(("limit_s", "is_proved"), [(0.3, False), (0.4, True)])
+def test_the_longest_wait_for_a_link_is_proved_to_the_frame(limit_s: float, is_proved: bool, file: Path) -> None:
+    """Dwell 0.4 s: a link that carries nothing and is asked for 2 or 5 Hz from its first decision on waits exactly that."""
+    (rule,) = parse(f"when age_periods <= 3: within {limit_s} s: rate_hz > 0")
+    decide = resolve(f"{file}:two_rates")
+    try:
+        prove_over_time(decide, rule, TIMES, 2, Budget(60))
+        proved = True
+    except NotFinite:
+        proved = False
+    assert proved == is_proved
