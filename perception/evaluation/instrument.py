@@ -17,6 +17,7 @@ from sortie.perception.geometry import CELLS, Geometry
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.decode import decode
 from sortie.perception.network.fusion.base import PerCell
+from sortie.perception.network.fusion.disconet import DiscoNet
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
 from sortie.perception.network.warp import Support, arriving, rows, support
@@ -102,6 +103,26 @@ class CarNetView:
             out += [
                 decode(one, floor, self._net.config.geometry).double().numpy() for one in self._net.head(maps).cpu()
             ]
+        return out
+
+    @torch.inference_mode()
+    def weight_on_zeros(self, ego: int, cells: NDArray[np.int64]) -> Floats:
+        """What all other drones together draw of DiscoNet's softmax weight in these cells [p] of an ego's grid (row by
+        row), where they sent nothing and count as zeros; [p].
+
+        Raises:
+            ValueError: the network's fusion is not DiscoNet.
+        """
+        fusion = self._net.fusion
+        if not isinstance(fusion, DiscoNet):
+            raise ValueError(f"fusion is {fusion.name}, must be disconet")
+        peers = tuple(i for i in range(len(self.features)) if i != ego)
+        own = self._table[ego * CELLS**2 + torch.from_numpy(cells).to(self._table.device)]
+        inside = self._support(ego, peers).inside.flatten(1)[:, cells]
+        part = torch.cat([torch.ones_like(inside[:1]), inside])
+        said = torch.cat([own[None], own.new_zeros(len(peers), *own.shape)])
+        share = fusion.weights(said, part, own.new_ones(1, 1).expand(part.shape))
+        out: Floats = share[1:].sum(dim=0).double().cpu().numpy()
         return out
 
     def _fuse(self, e: Exchange) -> torch.Tensor:

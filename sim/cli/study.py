@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.table import Table
 
 from sortie.sim.cli.console import out, stages
 from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing
@@ -111,6 +112,50 @@ def study_report(
     if not drawn:
         out.print("no figures: they need matplotlib, as in pip install 'sortie-sim\\[report]'")
     out.print(f"kept in [bold]{out_dir}[/bold]")
+
+
+@study.command("doses")
+def study_doses(
+    work: WorkOption = Path("runs/study"),
+    bench_dir: BenchOption = Path("runs/bench"),
+    frames: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Benchmark seed and frames, such as 7:0-239; can be given several times. Default: the plan's."
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Number of frames evaluated in parallel; default: one per core.", min=1)
+    ] = None,
+) -> None:
+    """Measure what more weight on silent peers does to the same networks, and whether the flip appears."""
+    from sortie.perception.evaluation import figures as common
+    from sortie.perception.study import dose_figure, doses
+    from sortie.perception.study.dose_run import measure
+    from sortie.scenarios.report_text import interval, signed
+
+    plan, rows = doses.read_plan(), list[doses.DoseRow]()
+    budgets = [f"two − four, {budget:g}" for budget in (0.0, *plan.budgets)]
+    heads = ("network", "dose", "weight on zeros", f"starved, {plan.starved:g}", *budgets)
+    with user_errors():
+        ranges = None if frames is None else [doses.FrameRange.parse(text) for text in frames]
+        with stages() as progress:
+            cores = workers or os.cpu_count() or 1
+            for row in measure(plan, work, bench_dir, frames=ranges, workers=cores, progress=progress):
+                rows.append(row)
+    table = Table(*heads, title=f"{rows[0].frames} frames; AP points with 95 % intervals over frames")
+    for row in rows:
+        effects = [interval(e.value, e.low, e.high, signed) for e in (row.starved, row.silent, *row.contrasts)]
+        table.add_row(row.network, row.dose.label, f"{row.weight_on_zeros:.2f}", *effects)
+    out.print(table)
+    found = doses.verdicts(rows)
+    for k, hypothesis in enumerate(plan.hypotheses):
+        holds = [name for name, several in found.items() if several[k]]
+        out.print(f"{hypothesis} [bold]Holds in {len(holds)} of {len(found)}[/bold]: {', '.join(holds) or 'none'}.")
+    if common.available():
+        path = work / "doses.png"
+        common.save(dose_figure.draw(plan, rows), path)
+        out.print(f"figure: [bold]{path}[/bold]")
 
 
 def _read_rows(path: Path) -> list[StudyRow]:
