@@ -77,3 +77,7 @@ class Difficulty:
     def layout(self, split: Split) -> Layout:
         """What the towns of a split are laid out like."""
         return self.unseen if split == "test" else self.seen
+
+
+VARIED = Difficulty(density="dense", altitude_m=(35.0, 90.0), yaw_sigma_deg=30.0)
+"""For training: cars close beside each other, fleets at any height, and drones that look different ways."""

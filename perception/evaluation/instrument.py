@@ -13,7 +13,7 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.evaluation.condition import CellsBy
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
-from sortie.perception.geometry import CELLS, Geometry
+from sortie.perception.geometry import Geometry
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.decode import decode
 from sortie.perception.network.fusion.base import PerCell
@@ -37,6 +37,8 @@ class CarNetInstrument:
         net.fusion.tune(**params)
         self.fingerprint = fingerprint(net) + "".join(f" {k}={v!r}" for k, v in sorted(params.items()))
         self.geometry: Geometry = net.config.geometry
+        self.fused_cells = net.config.fused_cells
+        """Cells along a side of the maps that are fused."""
         self._device = device
         self._net = folded(net).to(device)
 
@@ -79,17 +81,17 @@ class CarNetView:
         self._net, self._est = net, est
         self.features = features
         """[d, 80, 64, 64]: every drone's, on its own grid."""
-        self._table = features.permute(0, 2, 3, 1).reshape(-1, features.shape[1])
+        self._maps: torch.Tensor = net.spread(features)
+        self._n = net.config.fused_cells
+        self._table = self._maps.permute(0, 2, 3, 1).reshape(-1, self._maps.shape[1])
         self._under: dict[int, Support] = {}
         self._silent: dict[tuple[int, tuple[int, ...]], torch.Tensor] = {}
 
     @torch.inference_mode()
     def rank(self, by: CellsBy) -> NDArray[np.floating]:
         """Confidence: the highest score of the cell's head pixels, each drone alone; norm: of its feature vector."""
-        if by == "norm":
-            plane = self.features.norm(dim=1)
-        else:
-            plane = F.max_pool2d(self._net.head(self.features)[:, :1], 2)[:, 0]
+        heat = None if by == "norm" else self._net.head(self._maps)[:, :1]
+        plane = self.features.norm(dim=1) if heat is None else F.max_pool2d(heat, 2)[:, 0]
         out: NDArray[np.floating] = plane.cpu().numpy()
         return out
 
@@ -98,8 +100,8 @@ class CarNetView:
         """Each ego's boxes before suppression (see `contract.FrameView`)."""
         out: list[Floats] = []
         for at in range(0, len(exchanges), BATCH):
-            fused = torch.stack([self._fuse(e) for e in exchanges[at : at + BATCH]])  # [n, 4096, 80]
-            maps = fused.view(-1, CELLS, CELLS, fused.shape[-1]).permute(0, 3, 1, 2)
+            fused = torch.stack([self._fuse(e) for e in exchanges[at : at + BATCH]])  # [n, cells, channels]
+            maps = fused.view(-1, self._n, self._n, fused.shape[-1]).permute(0, 3, 1, 2)
             out += [
                 decode(one, floor, self._net.config.geometry).double().numpy() for one in self._net.head(maps).cpu()
             ]
@@ -107,8 +109,8 @@ class CarNetView:
 
     @torch.inference_mode()
     def weight_on_zeros(self, ego: int, cells: NDArray[np.int64]) -> Floats:
-        """What all other drones together draw of DiscoNet's softmax weight in these cells [p] of an ego's grid (row by
-        row), where they sent nothing and count as zeros; [p].
+        """What all other drones together draw of DiscoNet's softmax weight in these cells [p] of an ego's grid of fused
+        cells (row by row), where they sent nothing and count as zeros; [p].
 
         Raises:
             ValueError: the network's fusion is not DiscoNet.
@@ -117,7 +119,7 @@ class CarNetView:
         if not isinstance(fusion, DiscoNet):
             raise ValueError(f"fusion is {fusion.name}, must be disconet")
         peers = tuple(i for i in range(len(self.features)) if i != ego)
-        own = self._table[ego * CELLS**2 + torch.from_numpy(cells).to(self._table.device)]
+        own = self._table[ego * self._n**2 + torch.from_numpy(cells).to(self._table.device)]
         inside = self._support(ego, peers).inside.flatten(1)[:, cells]
         part = torch.cat([torch.ones_like(inside[:1]), inside])
         said = torch.cat([own[None], own.new_zeros(len(peers), *own.shape)])
@@ -126,11 +128,11 @@ class CarNetView:
         return out
 
     def _fuse(self, e: Exchange) -> torch.Tensor:
-        """[4096, 80]: what one ego makes of its own features and what it was sent."""
-        own = self._table[e.ego * CELLS**2 : (e.ego + 1) * CELLS**2]
+        """[cells, channels]: what one ego makes of its own features and what it was sent."""
+        own: torch.Tensor = self._table[e.ego * self._n**2 : (e.ego + 1) * self._n**2]
         if not e.peers:
             return own
-        sent = torch.from_numpy(e.sent.reshape(len(e.peers), -1)).to(own.device)
+        sent = self._net.sent(torch.from_numpy(e.sent.reshape(len(e.peers), -1))).to(own.device)
         under = self._support(e.ego, e.peers)
         weights, arrived = arriving(under, sent)
         inside, arrived = under.inside.flatten(1), arrived.flatten(1)
@@ -148,7 +150,7 @@ class CarNetView:
     def _support(self, ego: int, peers: tuple[int, ...]) -> Support:
         """Of these peers under the ego; all of a view's are worked out once."""
         if ego not in self._under:
-            self._under[ego] = support(self._est[ego], self._est, self._net.config.geometry.cell_m)
+            self._under[ego] = support(self._est[ego], self._est, self._net.config.fused_cell_m, self._n)
         every = self._under[ego]
         return Support(*(part[list(peers)] for part in every))
 
@@ -159,15 +161,18 @@ class CarNetView:
         return F.pad(weight, (1, 0), value=1.0)
 
     def _gather(self, e: Exchange, under: Support, weights: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
-        """[peers, p, 80]: what arrived at these cells of the ego's grid."""
+        """[peers, p, channels]: what arrived at these cells of the ego's grid."""
         k = len(e.peers)
-        first = torch.tensor(e.peers, device=at.device)[:, None, None] * CELLS**2
+        first = torch.tensor(e.peers, device=at.device)[:, None, None] * self._n**2
         taps = under.cells.view(k, -1, 4)[:, at] + first
         moved = rows(self._table, taps.view(-1, 4), weights.view(k, -1, 4)[:, at].view(-1, 4))
-        return moved.view(k, len(at), -1)
+        said: torch.Tensor = self._net.aligned(
+            moved.view(k, len(at), -1), under.offset.view(k, -1, 2)[:, at], under.turn
+        )
+        return said
 
     def _mix(self, said: torch.Tensor, part: torch.Tensor, trust: torch.Tensor) -> torch.Tensor:
-        """Fuse [1 + k, p, 80] cell by cell by the links' weights [1 + k]; the ego takes part everywhere."""
+        """Fuse [1 + k, p, channels] cell by cell by the links' weights [1 + k]; the ego takes part everywhere."""
         fusion = self._net.fusion
         assert isinstance(fusion, PerCell)  # noqa: S101 (tells the type checker)
         part = torch.cat([torch.ones_like(part[:1]), part])
@@ -198,7 +203,7 @@ class CarNetView:
         """The whole map, for a fusion that looks beyond its cell."""
         every = torch.arange(len(own), device=own.device)
         said = torch.cat([own[None], self._gather(e, under, weights, every)])
-        part = torch.cat([torch.ones_like(part[:1]), part]).view(1, -1, CELLS, CELLS)
-        agents = said.view(1, -1, CELLS, CELLS, own.shape[1]).permute(0, 1, 4, 2, 3)
+        part = torch.cat([torch.ones_like(part[:1]), part]).view(1, -1, self._n, self._n)
+        agents = said.view(1, -1, self._n, self._n, own.shape[1]).permute(0, 1, 4, 2, 3)
         fused: torch.Tensor = self._net.fusion(agents, part, trust[None])
         return fused[0].permute(1, 2, 0).reshape(own.shape)

@@ -78,6 +78,7 @@ def read_config(path: Path) -> ModelConfig:
         ),
         ("exchange", config.exchange, ("rectified", "signed")),
         ("decoder", config.decoder, ("shallow", "deep")),
+        ("grid", config.grid, ("coarse", "fine")),
         ("half_extent_m", config.half_extent_m, (102.4, 51.2)),
     ):
         if value not in allowed:

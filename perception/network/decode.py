@@ -13,11 +13,15 @@ REFERENCE_SIZE_M = (4.5, 1.85)
 
 
 def decode(out: Tensor, threshold: float, geometry: Geometry = FULL, limit: int = 200) -> Tensor:
-    """One head output [7, 128, 128] → boxes [m, 6] in the ego's frame: x forward, y left, length, width, yaw, score.
+    """One head output [7 or 8, 128, 128] → boxes [m, 6] in the ego's frame: x forward, y left, length, width, yaw, score.
 
-    Peaks are local maxima of the heat map over 3 × 3 cells, at or above `threshold`, at most `limit`, best first.
+    Peaks are local maxima of the heat map over 3 × 3 cells, at or above `threshold`, at most `limit`, best first. With
+    an eighth plane, how well each box fits, the map is the geometric mean of heat and fit (IoU-aware scores: Wu, Li and
+    Wang, *Image and Vision Computing* 97, 2020, with α = 0.5).
     """
     heat = out[0].sigmoid()
+    if len(out) > 7:
+        heat = (heat * out[7].sigmoid()).sqrt()
     hot = (heat >= threshold).flatten().nonzero().squeeze(1)
     # the neighbours of those alone: a maximum over the whole map takes twice as long as all the rest
     padded, wide = F.pad(heat, (1, 1, 1, 1), value=-1.0).flatten(), HEAD_PX + 2

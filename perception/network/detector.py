@@ -62,8 +62,10 @@ class _Encoded:
     """The results for one capture, computed or under way: its features [80, 64, 64], and on demand its boxes without peers."""
 
     features: Future[Tensor]
+    maps: Future[Tensor]
+    """The features as they are fused (`CarNet.spread`)."""
     out: Future[Tensor] | None = None
-    """The head's output [7, 128, 128] without peers."""
+    """The head's output [planes, 128, 128] without peers."""
     boxes: Future[Boxes] | None = None
     in_part: dict[tuple[float, Disc | None, tuple[int, ...]], Future[Tensor]] = field(default_factory=dict)
     """The head's output from the cells that a budget lets through alone, for late fusion of shared maps."""
@@ -195,7 +197,9 @@ class TorchDetector:
         def side_by_side(see: Callable[[int], None], over: Iterable[int]) -> list[None]:
             """Render, and encode what is rendered while the last views are on their way."""
             sights = {i: self._task(see, i) for i in over}
-            encoded.update({missing[i]: _Encoded(self._task(encode, i, seen)) for i, seen in sights.items()})
+            for i, seen in sights.items():
+                features = self._task(encode, i, seen)
+                encoded[missing[i]] = _Encoded(features, self._spread(features))
             try:
                 return [seen.result() for seen in sights.values()]
             finally:  # the moment's cars leave the scenery when nobody looks any more
@@ -209,6 +213,18 @@ class TorchDetector:
             self._kept.popitem(last=False)
         return {capture: self._kept[capture] for capture in wanted}
 
+    def _spread(self, features: Future[Tensor]) -> Future[Tensor]:
+        """The maps that are fused, [channels, cells, cells]."""
+        if self._net.config.grid == "coarse":
+            return features
+
+        def spread() -> Tensor:
+            with self._autocast():
+                maps: Tensor = self._net.spread(features.result()[None])[0]
+            return maps.float()
+
+        return self._task(spread)
+
     def _must_rank(self, share: Share) -> bool:
         """Whether the sender's own head is needed to choose the cells it sent."""
         if share.representation != "features" or self._config.cells_by != "confidence":
@@ -218,18 +234,18 @@ class TorchDetector:
     def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", torch.bfloat16, enabled=self._config.precision == "bfloat16")
 
-    def _head(self, features: Tensor) -> Tensor:
-        """[1, 80, 64, 64] → [7, 128, 128]."""
+    def _head(self, maps: Tensor) -> Tensor:
+        """Maps as they are fused [1, channels, cells, cells] → [planes, 128, 128]."""
         with self._autocast():
-            out: Tensor = self._net.head(features)[0]
+            out: Tensor = self._net.head(maps)[0]
         return out.float()
 
     def _head_alone(self, capture: Capture) -> Future[Tensor]:
         """The head's output without peers, computed once."""
         kept = self._kept[capture]
         if kept.out is None:
-            features = kept.features
-            kept.out = self._task(lambda: self._head(features.result()[None]))
+            maps = kept.maps
+            kept.out = self._task(lambda: self._head(maps.result()[None]))
         return kept.out
 
     def _look_alone(self, capture: Capture) -> Future[Boxes]:
@@ -241,7 +257,7 @@ class TorchDetector:
         return kept.boxes
 
     def _place(self, out: Tensor, pose: Pose) -> Boxes:
-        """The boxes of a head's output [7, 128, 128] in the world, suppressed."""
+        """The boxes of a head's output [planes, 128, 128] in the world, suppressed."""
         local = decode(out, self._config.score_threshold).numpy()
         return suppress(Boxes.placed(local, pose), NMS_IOU)
 
@@ -273,7 +289,7 @@ class TorchDetector:
         elif (alone := known[ego].boxes) is not None:
             own = alone.result()
         else:
-            own = self._place(self._head(known[ego].features.result()[None]), ego.est_pose)
+            own = self._place(self._head(known[ego].maps.result()[None]), ego.est_pose)
         late = [self._source(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
         return joined_many([EgoSources.of(ego, shares, own, out is not None, late)], self._config.join)[0]
 
@@ -283,21 +299,24 @@ class TorchDetector:
         x, y, yaw = ego.est_pose
         poses = [self._map_pose(s, now) for s in maps]
         there = torch.tensor([(px - x, py - y, pyaw) for px, py, pyaw in poses])
-        under = support(torch.tensor((0.0, 0.0, yaw)), there, FULL.cell_m)
-        weights, arrived = arriving(under, torch.stack([self._sent(s, known).flatten() for s in maps]))
+        config = self._net.config
+        under = support(torch.tensor((0.0, 0.0, yaw)), there, config.fused_cell_m, config.fused_cells)
+        sent = self._net.sent(torch.stack([self._sent(s, known).flatten() for s in maps]))
+        weights, arrived = arriving(under, sent)
         weight = torch.tensor([[s.weight for s in maps]])
         part = takes_part(arrived[None], under.inside[None], weight, self._config.unsent_cells)
         if not bool(part[:, 1:].any()):
             return None
-        tables = [known[s.capture].features.result().permute(1, 2, 0).reshape(CELLS**2, -1) for s in maps]
+        tables = [known[s.capture].maps.result().permute(1, 2, 0).flatten(0, 1) for s in maps]
         taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), strict=True))
 
         def said(at: Tensor) -> Tensor:
-            return torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
+            moved = torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
+            return self._net.aligned(moved, under.offset.flatten(1, 2)[:, at], under.turn)
 
         if not ego.looked:
             return self._head(self._fuse_without_own(said, part[0, 1:], arrived, weight[0]))
-        own, theirs = known[ego].features.result(), [known[s.capture].features.result() for s in maps]
+        own, theirs = known[ego].maps.result(), [known[s.capture].maps.result() for s in maps]
         weight = self._net.fusion.weigh(own[None], torch.stack(theirs)[None], weight)
         fused = self._net.fusion.fuse(own, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
         return self._head(fused)
@@ -359,7 +378,9 @@ class TorchDetector:
             features, sent = kept.features.result(), self._sent(share, known)
             if out is not None and bool(sent.all()):
                 return out.result()
-            return self._head((features * sent)[None])
+            with self._autocast():
+                maps: Tensor = self._net.spread((features * sent)[None]).float()
+            return self._head(maps)
 
         kept.in_part[_part(share)] = self._task(head)
 

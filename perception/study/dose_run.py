@@ -80,20 +80,20 @@ def frames_of(ranges: Sequence[FrameRange], root: Path, tell: Progress) -> Frame
 
 def weight_on_zeros(instrument: CarNetInstrument, data: Frames) -> float:
     """The mean of `CarNetView.weight_on_zeros` over all cells with a car of all egos; each car counts once an ego."""
+    grid = instrument.geometry, instrument.fused_cells
 
     def of_frame(f: int) -> NDArray[np.float64]:
         view, egos = instrument.look(data, f), range(data.est_pose.shape[1])
-        return np.concatenate(
-            [view.weight_on_zeros(ego, cells_with_cars(data, f, ego, instrument.geometry)) for ego in egos]
-        )
+        return np.concatenate([view.weight_on_zeros(ego, cells_with_cars(data, f, ego, *grid)) for ego in egos])
 
     return float(np.concatenate([of_frame(f) for f in range(len(data))]).mean())
 
 
-def cells_with_cars(data: Frames, f: int, ego: int, geometry: Geometry) -> NDArray[np.int64]:
-    """The cell (row by row) of each car in an ego's square, [cars]."""
+def cells_with_cars(data: Frames, f: int, ego: int, geometry: Geometry, n: int = CELLS) -> NDArray[np.int64]:
+    """The cell (row by row, of n × n) of each car in an ego's square, [cars]."""
     cars, pose = truth(data, f, ego, geometry).table(), data.true_pose[f, ego]
     at = np.stack(to_local(cars[:, 0], cars[:, 1], pose))
-    row, column = np.clip((at + geometry.half_extent_m) // geometry.cell_m, 0, CELLS - 1).astype(np.int64)
-    out: NDArray[np.int64] = row * CELLS + column
+    cell_m = 2 * geometry.half_extent_m / n
+    row, column = np.clip((at + geometry.half_extent_m) // cell_m, 0, n - 1).astype(np.int64)
+    out: NDArray[np.int64] = row * n + column
     return out

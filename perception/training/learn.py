@@ -14,11 +14,12 @@ from sortie.perception.benchmark.dataset import Frames
 from sortie.perception.benchmark.scenes import DRONES
 from sortie.perception.geometry import CELLS, FULL, HEAD_PX, Geometry, to_local
 from sortie.perception.ground_truth import ground_truth
+from sortie.perception.metrics.overlap import iou_pairs
 from sortie.perception.network.decode import REFERENCE_SIZE_M
 from sortie.perception.network.fusion.base import UnsentCells, takes_part
 from sortie.perception.network.model import CarNet
-from sortie.perception.network.warp import warp
-from sortie.perception.training.recipe import Recipe
+from sortie.perception.network.warp import arriving, moved, support
+from sortie.perception.training.recipe import Precision, Recipe
 from sortie.scenarios.streams import stream
 
 SHARDS = 2
@@ -100,7 +101,10 @@ def targets(
 
 
 def loss_of(out: Tensor, labels: list[NDArray[np.float64]], geometry: Geometry = FULL) -> Tensor:
-    """Centre-point focal loss plus weighted L1 regressions, per car. `out` [n, 7, 128, 128], `labels` n tables of cars."""
+    """Centre-point focal loss plus weighted L1 regressions, per car. `out` [n, 7 or 8, 128, 128], `labels` n tables of cars.
+
+    An eighth plane learns the IoU of the box that its cell tells with the car, by cross-entropy.
+    """
     made = [targets(cars, geometry) for cars in labels]
     heat = torch.from_numpy(np.stack([m[0] for m in made])).to(out.device)
     logit = out[:, 0]
@@ -114,9 +118,28 @@ def loss_of(out: Tensor, labels: list[NDArray[np.float64]], geometry: Geometry =
     want = torch.from_numpy(np.concatenate([m[2] for m in made])).to(out.device)
     weight = torch.from_numpy(np.concatenate([m[3] for m in made])).to(out.device)
     said = out[:, 1:].flatten(2)[torch.from_numpy(sample).to(out.device), :, cell]
-    scale = torch.tensor([1.0, 1.0, 0.5, 0.5, 0.4, 0.4], device=out.device)
+    if said.shape[1] > 6:
+        fit = torch.from_numpy(_fit(said[:, :6].detach().float().cpu().numpy(), want.cpu().numpy(), geometry.head_m))
+        uneven = F.binary_cross_entropy_with_logits(said[:, 6].float(), fit.to(out.device), weight, reduction="sum")
+        said = said[:, :6]
+        regression_of_fit = uneven / weight.sum().clamp_min(1.0)
+    else:
+        regression_of_fit = out.new_zeros(())
+    place = 2.0 if out.shape[1] > 7 else 1.0  # a fine network is to place cars well
+    scale = torch.tensor([place, place, 0.5, 0.5, 0.4, 0.4], device=out.device)
     regression = ((said - want).abs() * scale * weight[:, None]).sum() / weight.sum().clamp_min(1.0)
-    return (positive + negative) / cars + regression
+    return (positive + negative) / cars + regression + regression_of_fit
+
+
+def _fit(said: NDArray[np.float32], want: NDArray[np.float32], head_m: float) -> NDArray[np.float32]:
+    """IoU [p] of the boxes that regressions [p, 6] mean with those that they should mean."""
+
+    def boxes(values: NDArray[np.float32]) -> NDArray[np.float64]:
+        v = values.astype(np.float64)
+        size = REFERENCE_SIZE_M * np.exp(np.clip(v[:, 2:4], -1, 1))
+        return np.column_stack([v[:, :2] * head_m, size, 0.5 * np.arctan2(v[:, 4], v[:, 5])])
+
+    return iou_pairs(boxes(said), boxes(want)).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,12 +165,18 @@ class Thinning:
 
 
 def gradients(
-    net: CarNet, batch: Batch, rng: np.random.Generator, device: torch.device, thinning: Thinning | None = None
+    net: CarNet,
+    batch: Batch,
+    rng: np.random.Generator,
+    device: torch.device,
+    thinning: Thinning | None = None,
+    precision: Precision = "float32",
 ) -> tuple[float, list[Tensor]]:
     """Loss and gradients of one shard, in the thread that calls."""
     if device.type == "cpu":
         torch.set_num_threads(1)  # of this thread: shards side by side beat two threads in every operation
-    loss = step_loss(net, batch, rng, device, thinning)
+    with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+        loss = step_loss(net, batch, rng, device, thinning)
     return loss.item(), list(torch.autograd.grad(loss, list(net.parameters())))
 
 
@@ -180,17 +209,22 @@ def step_loss(
     links = len(agent)
     let = torch.ones(links, 1, CELLS, CELLS, dtype=torch.bool) if thinning is None else thinning.sent(links)
     geometry = net.config.geometry
-    warped, sent, inside = warp(
-        features[agent], let.to(device), delta[0].to(device), delta[1].to(device), geometry.cell_m
-    )
-    agents = torch.cat([features[ego[:: k - 1]][:, None], warped.view(b * EGOS, k - 1, *warped.shape[1:])], dim=1)
+    maps, n = net.spread(features).float(), net.config.fused_cells  # float where the step is bfloat16
+    under = support(delta[0].to(device), delta[1].to(device), net.config.fused_cell_m, n)
+    weights, sent = arriving(under, net.sent(let.flatten(1)).to(device))
+    said = moved(maps[agent], under, weights)
+    if net.align is not None:
+        flat = said.permute(0, 2, 3, 1).flatten(1, 2)
+        said = net.align(flat, under.offset.flatten(1, 2), under.turn).view(links, n, n, -1).permute(0, 3, 1, 2)
+    agents = torch.cat([maps[ego[:: k - 1]][:, None], said.view(b * EGOS, k - 1, *said.shape[1:])], dim=1)
     weight = torch.ones(b * EGOS, k - 1, device=device)
-    shape = (b * EGOS, k - 1, CELLS, CELLS)
-    part = takes_part(sent.view(shape), inside.view(shape), weight, "masked" if thinning is None else thinning.unsent)
-    weight = net.fusion.weigh(agents[:, 0], features[agent].unflatten(0, (b * EGOS, k - 1)), weight)
+    shape = (b * EGOS, k - 1, n, n)
+    unsent = "masked" if thinning is None else thinning.unsent
+    part = takes_part(sent.view(shape), under.inside.view(shape), weight, unsent)
+    weight = net.fusion.weigh(agents[:, 0], maps[agent].view(b * EGOS, k - 1, *maps.shape[1:]), weight)
     fused = net.fusion(agents, part, F.pad(weight, (1, 0), value=1.0))
     alone = np.arange(b) * k + rng.integers(k, size=b)
-    out = net.head(torch.cat([fused, features[alone]]))
+    out = net.head(torch.cat([fused, maps[alone]])).float()
     pose = batch.pose.reshape(-1, 3)
     who = np.concatenate([ego[:: k - 1], alone])
     return loss_of(out, [local_cars(batch.cars[i // k], pose[i], geometry) for i in who], geometry)

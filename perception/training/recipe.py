@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from sortie.perception.benchmark.dataset import SIZES, Benchmark
 
 PEAK_LR = 2.5e-3
+Precision = Literal["float32", "bfloat16"]
 FULL_SIZE = SIZES["train"][0]
 
 
@@ -32,6 +33,10 @@ class Recipe:
     """Probability that a link is thinned: only a fraction of its cells arrives, log-uniform from 1 % to all, cells at random."""
     unsent: Literal["masked", "zero"] = "masked"
     """What a dropped cell is in training: it is left out, or takes part as zeros. Under full sharing there is no difference."""
+    varied: float = 0.0
+    """Share of the steps whose frames come from the varied benchmark (`VARIED`)."""
+    precision: Precision = "float32"
+    """Of the forward and backward passes; the weights and the optimiser are float32."""
     warm_start: str = ""
     """Name of the weights that it begins from; empty for none. Tensors that do not fit begin anew."""
 
@@ -44,6 +49,10 @@ class Recipe:
             raise ValueError(f"peak_lr is {self.peak_lr}, must be above 0 and at most 1")
         if not 0 <= self.cell_dropout <= 1:
             raise ValueError(f"cell_dropout is {self.cell_dropout}, must be 0 to 1")
+        if not 0 <= self.varied <= 1:
+            raise ValueError(f"varied is {self.varied}, must be 0 to 1")
+        if self.precision not in get_args(Precision):
+            raise ValueError(f"precision is {self.precision!r}, must be float32 or bfloat16")
         if self.unsent not in ("masked", "zero"):
             raise ValueError(f"unsent is {self.unsent!r}, must be masked or zero")
 
@@ -56,7 +65,13 @@ def command(recipe: dict[str, Any], model: dict[str, Any], bench_seed: int, out:
         for name, value in recipe.items()
         if name in plain and value != plain[name]
     ]
-    usual = {"half_extent_m": 102.4, "fusion": "disconet", "exchange": "rectified", "decoder": "shallow"}
+    usual = {
+        "half_extent_m": 102.4,
+        "fusion": "disconet",
+        "exchange": "rectified",
+        "decoder": "shallow",
+        "grid": "coarse",
+    }
     names = {"half_extent_m": "range"}
     flags += [f"--{names.get(n, n)} {v}" for n, v in model.items() if v != usual.get(n, v)]
     flags += [f"--bench-seed {bench_seed}"] if bench_seed else []

@@ -15,7 +15,7 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_split
+from sortie.perception.benchmark.difficulty import VARIED
 from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference
 from sortie.perception.network.checkpoint import load_weights, read_config
@@ -35,6 +36,8 @@ from sortie.perception.training.recipe import PEAK_LR, Recipe, benchmark_root
 from sortie.perception.training.validation import history, publish, validate, validate_all
 from sortie.scenarios.streams import stream
 
+SAVE_STEPS, SAVE_S = 100, 120.0
+"""A checkpoint is written every so many steps, and after so many seconds."""
 CHECK_STEPS, CHECK_FRAMES, CHECK_EGOS = 100, 12, 2
 """Validation AP is looked at every so many steps, on so many frames with so many egos each."""
 
@@ -108,6 +111,12 @@ def train(
     files = make_split(bench, "train", root, scenes=recipe.scenes, progress=lambda i, n: tell("rendering scenes", i, n))
     held_out = make_split(bench, "validation", root, progress=lambda i, n: tell("rendering validation", i, n))
     data, validation = load_frames(files), load_frames(held_out)
+    varied = data
+    if recipe.varied:
+        other = replace(bench, difficulty=VARIED)
+        varied = load_frames(
+            make_split(other, "train", root, scenes=recipe.scenes, progress=lambda i, n: tell("rendering varied", i, n))
+        )
     check = _first(validation, CHECK_FRAMES)
     log.info("%d training frames in %d scenes", len(data), len(files))
 
@@ -128,7 +137,9 @@ def train(
     recent: list[float] = []  # a resumed run's mean begins anew; its weights do not know
     loss = float("nan")
     with ThreadPoolExecutor(SHARDS) as pool:
+        saved_s = time.monotonic()
         for step in range(done, recipe.steps):
+            from_varied = recipe.varied and stream(recipe.seed, 0, step, "train.varied").random() < recipe.varied
             rate = learning_rate(step, recipe.steps, recipe.peak_lr)
             for group in optimiser.param_groups:
                 group["lr"] = rate
@@ -136,10 +147,11 @@ def train(
                 pool.submit(
                     gradients,
                     r,
-                    draw_batch(data, recipe.seed, step, i),
+                    draw_batch(varied if from_varied else data, recipe.seed, step, i),
                     stream(recipe.seed, 0, (step, i), "train.egos"),
                     where,
                     Thinning.of(recipe, step, i),
+                    recipe.precision,
                 )
                 for i, r in enumerate(replicas)
             ]
@@ -158,7 +170,8 @@ def train(
                 show(done, row)
                 tell("training", done, recipe.steps)
                 log.info("step %d of %d, %s", done, recipe.steps, ", ".join(f"{k} {v:.4g}" for k, v in row.items()))
-            if done % 100 == 0 or done == recipe.steps or late:
+            if done % SAVE_STEPS == 0 or done == recipe.steps or late or time.monotonic() - saved_s > SAVE_S:
+                saved_s = time.monotonic()
                 _save(checkpoint, {**run, "step": done, "spent_s": spent + time.monotonic() - begun}, net, optimiser)
             if late:
                 log.info("stopped after %.1f minutes at step %d of %d", minutes, done, recipe.steps)

@@ -23,6 +23,16 @@ class Decoder(StrEnum):
     deep = "deep"
 
 
+class Grid(StrEnum):
+    coarse = "coarse"
+    fine = "fine"
+
+
+class Precision(StrEnum):
+    float32 = "float32"
+    bfloat16 = "bfloat16"
+
+
 class Unsent(StrEnum):
     masked = "masked"
     zero = "zero"
@@ -54,6 +64,16 @@ def train(
         ExchangeForm, typer.Option(help="Features after or before the last ReLU.")
     ] = ExchangeForm.rectified,
     decoder: Annotated[Decoder, typer.Option(help="The head's trunk.")] = Decoder.shallow,
+    grid: Annotated[
+        Grid, typer.Option(help="Where maps are fused: in the exchanged cells, or in the head's.")
+    ] = Grid.coarse,
+    varied: Annotated[
+        float,
+        typer.Option(help="Share of the steps on dense scenes, any height and differing headings.", min=0, max=1),
+    ] = 0.0,
+    precision: Annotated[
+        Precision, typer.Option(help="Of the passes; bfloat16 takes about half the time where the processor has it.")
+    ] = Precision.float32,
     range_: Annotated[Range, typer.Option("--range", help="How far the grids reach, ± metres.")] = Range.full,
     bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
     bench_dir: Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")] = Path("runs/bench"),
@@ -92,6 +112,8 @@ def train(
             peak_lr=peak_lr,
             cell_dropout=cell_dropout,
             unsent=unsent.value,
+            varied=varied,
+            precision=precision.value,
             warm_start=warm_start.name if warm_start else "",
         )
         if fusion not in FUSIONS:
@@ -100,7 +122,7 @@ def train(
         if warm_start is not None and not warm_start.is_file():
             raise ValueError(f"{warm_start}: no such weights")
         ensure_files(out_file)
-    config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value)
+    config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value, grid.value)
     curves = TrainingLog(out_file.parent / "training.rrd", out_file.stem)
     with stages() as progress, user_errors():
         result = train_detector(

@@ -22,19 +22,20 @@ from sortie.perception.network.fusion.base import PerCell, weighted_sum
 class EdgeWeights(nn.Module):
     """One logit ≥ 0 per row and agent: per-cell layers 160 → 128 → 32 → 8 → 1, batch norm on the first three."""
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = CHANNELS) -> None:
         super().__init__()
-        widths = (2 * CHANNELS, 128, 32, 8)
+        self.channels = channels
+        widths = (2 * channels, 8 * channels // 5, 32, 8)
         self.layers = nn.ModuleList(nn.Linear(a, b, bias=False) for a, b in pairwise(widths))
         self.norms = nn.ModuleList(nn.BatchNorm1d(b) for b in widths[1:])
         self.last = nn.Linear(widths[-1], 1)
 
     def forward(self, features: Tensor) -> Tensor:
-        """[agents, p, 80], the ego first → [agents, p]."""
+        """[agents, p, channels], the ego first → [agents, p]."""
         first, norm = self.layers[0], self.norms[0]
         # the ego's half of the first layer is the same beside every agent
-        ego = F.linear(features[0], first.weight[:, :CHANNELS])  # type: ignore[index]
-        x = F.linear(features, first.weight[:, CHANNELS:], first.bias)  # type: ignore[index,arg-type]
+        ego = F.linear(features[0], first.weight[:, : self.channels])  # type: ignore[index]
+        x = F.linear(features, first.weight[:, self.channels :], first.bias)  # type: ignore[index,arg-type]
         x += ego
         x = F.relu(norm(x.flatten(0, 1)), inplace=True)
         for layer, norm in zip(list(self.layers)[1:], list(self.norms)[1:], strict=True):
@@ -49,9 +50,9 @@ class DiscoNet(PerCell):
     name = "disconet"
     about = "an edge network's softmax over agents, cell by cell (DiscoNet, without its distillation)"
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = CHANNELS) -> None:
         super().__init__()
-        self.edge = EdgeWeights()
+        self.edge = EdgeWeights(channels)
         self.tune()
 
     def tune(self, temperature: float = 1.0, silent_weight: float = 0.0, **params: Any) -> None:

@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_scene_file
+from sortie.perception.benchmark.difficulty import VARIED
 from sortie.perception.network.checkpoint import load_weights, read_facts, save_weights
 from sortie.perception.network.detector import SHIPPED_WEIGHTS
 from sortie.perception.network.fusion.own import OwnFusion
@@ -20,6 +21,7 @@ from sortie.perception.training.learn import Thinning, draw_batch, gradients, lo
 from sortie.perception.training.recipe import Recipe, command
 from sortie.perception.training.train import learning_rate, train
 from sortie.perception.training.validation import card
+from sortie.scenarios.streams import stream
 
 
 @pytest.fixture(scope="module")
@@ -194,3 +196,33 @@ def test_a_fusion_of_ones_own_is_trained_with_its_encoder(tmp_path: Path) -> Non
     again = CarNet(ModelConfig(fusion=name), OwnFusion(name))
     training._begin_from(again, path, logging.getLogger("sortie.train"))
     assert torch.equal(again.fusion.model.gain, trained.fusion.model.gain)
+
+
+def test_a_share_of_the_steps_is_on_the_varied_scenes(
+    tmp_path: Path, scene_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which scenes a step is drawn from follows from the seed alone."""
+    other = make_scene_file(Benchmark(difficulty=VARIED), "train", 77, 1, tmp_path / "scene_78_1.npz")
+    scenes: list[int] = []
+
+    def split(bench: Benchmark, *_: object, **__: object) -> list[Path]:
+        return [other if bench.difficulty == VARIED else scene_file]
+
+    class Stop(Exception):
+        """The steps have been drawn."""
+
+    def draw(frames: Frames, seed: int, step: int, shard: int) -> object:
+        scenes.append(int(frames.scene[0]))
+        if step == 19:
+            raise Stop
+        return None
+
+    monkeypatch.setattr(training, "make_split", split)
+    monkeypatch.setattr(training, "draw_batch", draw)
+    monkeypatch.setattr(training, "gradients", lambda net, *_: (1.0, [torch.zeros_like(p) for p in net.parameters()]))
+    with pytest.raises(Stop):
+        train(tmp_path / "w.safetensors", Recipe(steps=30, varied=0.3), device="cpu", resume=False)
+    steps = scenes[:-1:2]
+    assert len(steps) == 19
+    assert steps.count(78) == sum(stream(0, 0, step, "train.varied").random() < 0.3 for step in range(19)) > 0
+    assert steps.count(77) > steps.count(78)
