@@ -449,7 +449,7 @@ def check(
         progress: called with the simulated seconds of the scenario that flies.
 
     Returns:
-        One `Checked` a scenario: `.verdicts`, `.failed`, and `.replay(verdict)`, the command that shows a failure.
+        One `Checked` a scenario, with `.verdicts`, `.failed`, and `.replay(verdict)`, the command that shows a failure.
 
     Raises:
         ScenarioError, PolicyError, RunError: what is wrong with a scenario, its policy or its golden outcome.
