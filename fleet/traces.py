@@ -127,6 +127,19 @@ def read_traces(path: str | Path, drones: int, origin: Origin | None = None) -> 
     return traces
 
 
+def flown_at(fleet: Fleet) -> Origin | None:
+    """Where on the globe ENU (0, 0, 0) lies: `fleet.origin`, or else what a trace in latitude and longitude begins at.
+
+    Raises:
+        TraceError: the trace cannot be read.
+    """
+    if fleet.origin is not None or fleet.trace is None:
+        return fleet.origin
+    columns = read_columns(Path(fleet.trace), BOUNDS)
+    zero = _zero(_stack(columns, GLOBE)) if set(GLOBE) <= set(columns) else None
+    return None if zero is None else Origin(**dict(zip(Origin.model_fields, zero, strict=True)))
+
+
 def flown_motion(
     fleet: Fleet, duration_s: float, frame_s: float, seed: int, replication: int = 0
 ) -> tuple[Trajectories, dict[int, DroneTrace]]:
@@ -188,12 +201,8 @@ def _placed(columns: Mapping[str, Array], origin: Origin | None) -> dict[str, Ar
     placed = dict(columns)
     if GLOBE[0] in columns:
         fixes = _stack(columns, GLOBE)
-        there = ~np.isnan(fixes).any(axis=-1)
-        if there.any():
-            first = fixes[there][0]
-            zero = (
-                (first[0], first[1], fixes[there, 2].min()) if origin is None else tuple(origin.model_dump().values())
-            )
+        zero = _zero(fixes) if origin is None else tuple(origin.model_dump().values())
+        if zero is not None and not np.isnan(fixes).any(axis=-1).all():
             metres = tangent_plane_m(fixes, zero)
             metres[:, 2] = fixes[:, 2] - zero[2]  # the ground is level in the simulator
             placed |= dict(zip(POSITION, metres.T, strict=True))
@@ -207,6 +216,12 @@ def _placed(columns: Mapping[str, Array], origin: Origin | None) -> dict[str, Ar
             attitude[known] = swap_attitude(Rotation.from_euler("ZYX", turns, degrees=True).as_quat())
         placed |= dict(zip(ATTITUDE, attitude.T, strict=True))
     return placed
+
+
+def _zero(fixes: Array) -> tuple[float, ...] | None:
+    """The first place on the globe, at the lowest altitude; None where there is none."""
+    known = fixes[~np.isnan(fixes).any(axis=-1)]
+    return (float(known[0, 0]), float(known[0, 1]), float(known[:, 2].min())) if len(known) else None
 
 
 def _pose(own: Mapping[str, Array]) -> PoseTrace | None:

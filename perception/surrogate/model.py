@@ -193,7 +193,9 @@ def _of_two(out: Singles, draw: Singles) -> Singles:
     the lower one. `draw` [n] uniform: the worst falls to the lower normal, and within each to its lower end."""
     u, low = draw.astype(np.float64), expit(-out[:, 0].astype(np.float64))
     high = u >= low
-    within = ndtri(np.clip(np.where(high, (u - low) / (1.0 - low), u / low), 1e-6, 1.0 - 1e-6))
+    with np.errstate(divide="ignore", invalid="ignore"):  # of the side that is not chosen
+        share = np.where(high, (u - low) / (1.0 - low), u / low)
+    within = ndtri(np.clip(share, 1e-6, 1.0 - 1e-6))
     mean = np.where(high, out[:, 1], out[:, 2])
     spread = _spread(np.where(high, out[:, 3], out[:, 4]))
     return np.asarray(mean + spread * within, np.float32)

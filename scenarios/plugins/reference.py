@@ -197,15 +197,28 @@ def checked_array(
     """Call a user's model, and check that it returns finite numbers of a shape, but for those left out.
 
     Raises:
-        PluginError: it fails, or returns another shape or a number that is not finite.
+        PluginError: it fails, or returns no numbers, another shape or a number that is not finite.
     """
-    found = np.asarray(checked_call(kind, function, *args), dtype=float)
+    answer = checked_call(kind, function, *args)
+    try:
+        if answer is None or np.iscomplexobj(answer):  # NumPy would make them nan, and drop the imaginary part
+            raise TypeError
+        found = np.asarray(answer, dtype=float)
+    except (TypeError, ValueError) as failure:
+        must = f"must be numbers of shape {shape}"
+        raise PluginError(f"{kind} {name_of(function)}: returns {_shown(answer)}, {must}") from failure
     if found.shape != shape:
         raise PluginError(f"{kind} {name_of(function)}: returns shape {found.shape}, must be {shape}")
     wrong = ~np.isfinite(found) & (True if left_out is None else ~left_out)
     if wrong.any():
         raise PluginError(f"{kind} {name_of(function)}: returns {found[wrong][0]}, must be finite")
     return found
+
+
+def _shown(answer: object) -> str:
+    """What a model returned, short enough for a line."""
+    text = repr(answer).encode(errors="backslashreplace").decode().replace("\n", " ")
+    return text if len(text) <= 60 else f"{type(answer).__name__} {text[:60]}…"
 
 
 class Guard:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from sortie.scenarios.traces import TraceError
 from sortie.sim.cli.console import out
 from sortie.sim.folders import RunError, ensure_folder
 from sortie.sim.results import run_folder
@@ -33,7 +34,9 @@ def export(
     begin: Annotated[str, typer.Option(help="Start time of the sortie, ISO 8601; UTC without a zone.")] = BEGIN,
     origin: Annotated[
         str | None,
-        typer.Option(help="With --tlog: LATITUDE,LONGITUDE[,ALTITUDE] of ENU (0, 0, 0); default: a field in Zurich."),
+        typer.Option(
+            help="With --tlog: LATITUDE,LONGITUDE[,ALTITUDE] of ENU (0, 0, 0); default: fleet.origin, then where a trace in latitude and longitude begins, then a field in Zurich."
+        ),
     ] = None,
     key: Annotated[
         Path | None,
@@ -53,11 +56,14 @@ def export(
     first, end = (1970, 2038) if mcap or pcap else (2015 if key is not None else 1970, 2096)
     began_us = (moment(begin, first, end) - EPOCH) // timedelta(microseconds=1)
     if tlog:
-        from sortie.sim.export.telemetry import ORIGIN, parse_origin, read_key, save_tlog
+        from sortie.sim.export.telemetry import parse_origin, read_key, save_tlog
 
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
-        where = ORIGIN if origin is None else parse_origin(origin)
-        frames = save_tlog(run_folder.load(run), path, began_us, where, secret)
+        where = None if origin is None else parse_origin(origin)
+        try:
+            frames = save_tlog(run_folder.load(run), path, began_us, where, secret)
+        except TraceError as error:
+            raise RunError(f"{error}; the log's origin is in it, or --origin names one") from error
         out.print(f"{frames} MAVLink frames, in [bold]{path}[/bold]", soft_wrap=True)
         return
     if pcap:

@@ -150,5 +150,5 @@ def _line(name: str, given: Mapping[str, object], about: str) -> str:
 
 
 def _summary(model: Any) -> str:
-    """The first line of a model's docstring."""
-    return (inspect.getdoc(inspect.unwrap(model)) or "").partition("\n")[0]
+    """The first line of a model's own docstring; one that its class inherits describes another class."""
+    return inspect.cleandoc(inspect.unwrap(model).__doc__ or "").partition("\n")[0]

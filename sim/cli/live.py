@@ -64,7 +64,10 @@ def live(
     ] = None,
     origin: Annotated[
         str | None,
-        typer.Option(metavar="LAT,LON[,ALT]", help="With --mavlink: where (0, 0, 0) lies; default: local positions."),
+        typer.Option(
+            metavar="LAT,LON[,ALT]",
+            help="With --mavlink: where (0, 0, 0) lies; default: fleet.origin; without either, local positions.",
+        ),
     ] = None,
     mavlink_key: Annotated[
         Path | None,
@@ -92,7 +95,7 @@ def live(
     )
     flown = loaded(scenario, set_, policy)
     with user_errors():
-        from sortie.sim.export.telemetry import parse_origin
+        from sortie.sim.export.telemetry import given_origin, parse_origin
         from sortie.sim.live.seals import find_key, read_own_key
         from sortie.sim.live.session import fly_live
         from sortie.sim.live.watchdog import parse_fallback
@@ -113,7 +116,7 @@ def live(
             fallback=parse_fallback(fallback),
             decide_within_s=decide_within,
             mavlink=mavlink or (),
-            origin=None if origin is None else parse_origin(origin),
+            origin=given_origin(flown.fleet) if origin is None else parse_origin(origin),
             mavlink_key=None if mavlink_key is None else read_own_key(mavlink_key),
             warn=lambda text: err.print(text, soft_wrap=True, markup=False),
             progress=lambda what, done, of: report(what, round(done), round(of)),

@@ -55,8 +55,9 @@ class FleetHandle:
         n = len(self._world.drones)
         given = np.broadcast_to(np.asarray(loss_db, dtype=float), (n, n)).copy()
         np.fill_diagonal(given, 0.0)
-        if not np.isfinite(given).all() or (given < 0.0).any():
-            raise PluginError(f"event {self._event.model}: a loss of {given.min():g} dB, must be finite and ≥ 0")
+        wrong = ~(np.isfinite(given) & (given >= 0.0))
+        if wrong.any():
+            raise PluginError(f"event {self._event.model}: a loss of {given[wrong][0]:g} dB, must be finite and ≥ 0")
         self._world.own_losses_db[self._index] = given
 
     def jam(self, position_m: tuple[float, float, float] | None, power_dbm: float = 20.0) -> None:

@@ -8,6 +8,7 @@ flight is computed again.
 from __future__ import annotations
 
 import math
+from numbers import Real
 
 import numpy as np
 
@@ -118,8 +119,7 @@ class Steering:
         command = planner.command(view)  # type: ignore[attr-defined]
         if command is None:
             return
-        finite = isinstance(command, COMMANDS) and all(v is None or math.isfinite(v) for v in command)
-        if not finite or (isinstance(command, GoTo) and command.speed_mps is not None and not command.speed_mps > 0):
+        if not _is_command(command):
             kinds = ", ".join(kind.__name__ for kind in COMMANDS)
             what = f"returns {command!r}, must be None or one of {kinds} with finite numbers and speeds > 0"
             raise PluginError(f"mobility {self._names[drone]} on drone {drone}: {what}")
@@ -204,3 +204,14 @@ class Steering:
         if self._reported.get(drone) != text:
             self._reported[drone] = text
             self._world.note(drone, EVENT, f"{self._names[drone]}: {text}")
+
+
+def _is_command(given: object) -> bool:
+    """Whether a planner returned a command, with finite numbers wherever it may not be None, and no speed of 0 or less."""
+    if not isinstance(given, COMMANDS):
+        return False
+    optional = (given.z_m, given.speed_mps) if isinstance(given, GoTo) else ()
+    numbers = [*given[:2], *(v for v in optional if v is not None)] if isinstance(given, GoTo) else list(given)
+    if not all(isinstance(v, Real) and math.isfinite(v) for v in numbers):
+        return False
+    return not isinstance(given, GoTo) or given.speed_mps is None or given.speed_mps > 0

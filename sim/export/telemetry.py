@@ -24,13 +24,29 @@ from sortie.fleet.logs.mavlink import (
     messages,
     write_tlog,
 )
+from sortie.fleet.traces import flown_at
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema import Fleet, Scenario
 from sortie.sim.folders import RunError
 from sortie.sim.results.record import SortieRecord
 
 ORIGIN = Origin(47.397742, 8.545594, 488.0)
 """Where ENU (0, 0, 0) lies where nobody says otherwise: the field in Zurich at which PX4's simulators start."""
+
+
+def origin_of(fleet: Fleet) -> Origin:
+    """Where a fleet flies: at `fleet.origin`, else where its trace in latitude and longitude begins, else at `ORIGIN`.
+
+    Raises:
+        TraceError: its trace cannot be read.
+    """
+    at = flown_at(fleet)
+    return ORIGIN if at is None else Origin(**at.model_dump())
+
+
+def given_origin(fleet: Fleet) -> Origin | None:
+    """`fleet.origin`, if there is one."""
+    return None if fleet.origin is None else Origin(**fleet.origin.model_dump())
 
 
 class Telemeter:
@@ -100,18 +116,20 @@ class Stream:
 
 
 def save_tlog(
-    record: SortieRecord, path: Path, begin_us: int, origin: Origin = ORIGIN, key: bytes | None = None
+    record: SortieRecord, path: Path, begin_us: int, origin: Origin | None = None, key: bytes | None = None
 ) -> int:
     """Write a run as one telemetry log of all its drones, system ids 1 … N; returns the number of frames.
 
     Args:
         begin_us: when the sortie began, µs since 1970.
-        origin: where on the globe it flew.
+        origin: where on the globe ENU (0, 0, 0) lies; None: by `origin_of`.
         key: 32 B with which frames are signed.
 
     Raises:
         RunError: the file cannot be written.
+        TraceError: its trace is needed for the origin and cannot be read.
     """
+    origin = origin_of(record.scenario.fleet) if origin is None else origin
     stream = Stream(record.scenario, origin, key, None if key is None else begin_us)
     frames = [
         (begin_us + round(t_s * 1e6), stream.transmitters[drone].pack(message))
@@ -133,7 +151,7 @@ class MavlinkEndpoint:
     Args:
         address: `udpout:HOST:PORT` sends there; `udpin:HOST:PORT` waits for a ground station and sends to it.
         pace: 1 is real time, 2 twice as fast; None sends as fast as the sortie is worked out.
-        origin: where on the globe it flies.
+        origin: where on the globe ENU (0, 0, 0) lies; None: by `origin_of`.
         key: 32 B with which frames are signed.
 
     Raises:
@@ -141,7 +159,7 @@ class MavlinkEndpoint:
     """
 
     def __init__(
-        self, address: str, pace: float | None = 1.0, origin: Origin = ORIGIN, key: bytes | None = None,
+        self, address: str, pace: float | None = 1.0, origin: Origin | None = None, key: bytes | None = None,
         *, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         self._waits, host, port = parse_address(address)
@@ -166,7 +184,8 @@ class MavlinkEndpoint:
     def begin(self, scenario: Scenario, scene: SceneModel) -> None:
         """Start the clock."""
         now_us = time.time_ns() // 1000  # signed frames must be newer than any before them
-        self._stream = Stream(scenario, self._origin, self._key, now_us)
+        origin = origin_of(scenario.fleet) if self._origin is None else self._origin
+        self._stream = Stream(scenario, origin, self._key, now_us)
         self._begin_s = self._clock()
 
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None:

@@ -11,6 +11,7 @@ import pytest
 from sortie.scenarios.plugins.reference import (
     Guard,
     PluginError,
+    checked_array,
     checked_call,
     installed,
     name_of,
@@ -154,3 +155,22 @@ def test_names_of_models() -> None:
     assert [name_of(thing) for thing in (plain, Fails, Fails(), Fails().snr_db)] == [
         "plain", "Fails", "Fails", "Fails.snr_db",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("answer", "shown"),
+    [
+        (None, "None"),
+        ("far", "'far'"),
+        (1j, "1j"),
+        ([[1.0], [2.0, 3.0]], r"\[\[1.0\], \[2.0, 3.0\]\]"),
+        ({}, r"\{\}"),
+        ("x" * 90, "str 'x{59}…"),
+    ],
+)
+def test_an_answer_that_is_no_array_of_numbers_is_named(answer: object, shown: str) -> None:
+    def loss_db() -> object:
+        return answer
+
+    with pytest.raises(PluginError, match=rf"^path_loss loss_db: returns {shown}, must be numbers of shape \(2,\)$"):
+        checked_array("path_loss", loss_db, (2,))

@@ -106,6 +106,8 @@ class Storm:
             fleet.lose(self.loses, "hit by lightning")
         if self.wrong == "loss":
             fleet.set_loss_db(-1.0)
+        if self.wrong == "loss_nan":
+            fleet.set_loss_db(np.where(np.eye(5, k=1), np.nan, 3.0))
         if self.wrong == "drone":
             fleet.lose(99)
 

@@ -161,6 +161,18 @@ def test_what_does_not_fit_is_refused(settings: tuple[str, ...], said: str) -> N
     assert said in str(refused.value)
 
 
+@pytest.mark.parametrize("given", ['GoTo("a", 0)', "GoTo(None, 0)", "GoTo(0, 0, 0, -1)", "Velocity(1, None)"])
+def test_a_command_without_numbers_is_refused(given: str, tmp_path: Path) -> None:
+    own = tmp_path / "own.py"
+    own.write_text(
+        "from sortie.fleet.flight.steering import GoTo, Velocity\n\n"
+        "class Says:\n    def __init__(self, drone, start_m, rng): pass\n"
+        f"    def command(self, view): return {given}\n"
+    )
+    with pytest.raises(SortieError, match=r"^mobility Says on drone \d: returns .*, must be None or one of GoTo"):
+        run_sortie(example("duration_s=1", f"fleet.mobility={own}:Says"))
+
+
 def test_the_built_in_models_are_listed() -> None:
     lines = CliRunner().invoke(app, ["list", "mobility"]).output.splitlines()
     assert [line.partition("(")[0].split()[0] for line in lines] == ["formation", "random_waypoint", "gauss_markov"]

@@ -142,6 +142,7 @@ def test_it_may_lose_a_drone_and_take_energy(models: str) -> None:
     ("wrong", "message"),
     [
         ("loss", r"^event mine.py:Storm: a loss of -1 dB, must be finite and ≥ 0$"),
+        ("loss_nan", r"^event mine.py:Storm: a loss of nan dB, must be finite and ≥ 0$"),
         ("drone", r"^event mine.py:Storm: drone 99, must be 0 … \d$"),
     ],
 )

@@ -117,6 +117,24 @@ def test_mavlogdump_reads_what_the_command_writes(record: SortieRecord, tmp_path
     assert lines[0]["data"]["lat"] == pytest.approx(52.5e7, abs=5_000)
 
 
+def test_a_log_lies_where_the_scenario_says(tmp_path: Path) -> None:
+    """The trace's own latitudes and longitudes come back, with `fleet.origin` and without."""
+    trace = tmp_path / "globe.csv"
+    trace.write_text("t_s,drone,lat_deg,lon_deg,alt_m\n0,0,52.1,13.2,70\n2,0,52.1002,13.2004,90\n0,1,52.1,13.203,60\n")
+    flies = ("duration_s=2", "fleet.drones=2", f"fleet.trace={trace}")
+    origin = "fleet.origin={latitude_deg: 52.099, longitude_deg: 13.199, altitude_m: 50}"
+    for settings in (flies, (*flies, origin)):
+        run = tmp_path / "run"
+        run_folder.save(run_sortie(example(*settings)), run, replace=True)
+        assert CliRunner().invoke(app, ["export", str(run), "--tlog"]).exit_code == 0
+        places = [m for m in read(run / "sortie.tlog") if m.get_type() == "GLOBAL_POSITION_INT"]
+        last = {m.get_srcSystem(): (m.lat / 1e7, m.lon / 1e7, m.alt / 1e3) for m in places}
+        assert last[1] == pytest.approx((52.1 + 0.0002 * 0.95, 13.2 + 0.0004 * 0.95, 89.0), abs=2e-6)
+        assert last[2] == pytest.approx((52.1, 13.203, 60.0), abs=2e-6)
+    trace.unlink()
+    assert CliRunner().invoke(app, ["export", str(run), "--tlog"]).exit_code == 0  # fleet.origin is in the record
+
+
 def test_a_log_is_signed_from_2015_on(record: SortieRecord, tmp_path: Path) -> None:
     run, key = tmp_path / "run", tmp_path / "key"
     run_folder.save(record, run)
