@@ -20,6 +20,7 @@ from sortie.scenarios.reading.load import (
     load,
     load_conditions,
     read,
+    shortened,
     tree,
     validated,
 )
@@ -81,10 +82,10 @@ def load_campaign(path_or_name: str | Path) -> Study:
     base = _base(campaign.base, here, root)
     written = child(root, "set") or root
     sections = base.model_dump(mode="json", exclude_none=True) | {"expect": [], "expect_decisions": []}
-    resolved = as_node(sections, written.source, written.line)  # what set breaks elsewhere in the base is told there
+    resolved = whole = as_node(sections, written.source, written.line)  # what set breaks elsewhere in the base is told there
     for name, node in _section(root, "set").items():
         resolved = _put(resolved, name, _relined(node))
-    base = found_beside(validated(resolved, Scenario), here)
+    base = found_beside(validated(shortened(resolved, whole), Scenario), here)
     columns: dict[str, tuple[Any, ...]] = {}
     varied = _section(root, "vary")
     for name, spread in campaign.vary.items():

@@ -90,10 +90,10 @@ def _scenario(root: Node, source: str, overrides: Overrides) -> Scenario:
     else:
         for override in overrides:
             root = _override(root, override)
-    return validated(_shortened(root, written), Scenario)
+    return validated(shortened(root, written), Scenario)
 
 
-def _shortened(root: Node, written: Node) -> Node:
+def shortened(root: Node, written: Node) -> Node:
     """Where an override sets `duration_s`, the tree without what the file does at instants after the end; a line says so."""
     duration = child(root, "duration_s")
     if duration is None or duration is child(written, "duration_s") or not isinstance(duration.value, int | float):

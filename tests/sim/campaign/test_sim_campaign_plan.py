@@ -395,3 +395,16 @@ def test_levels_of_morris_stop_at_no_interval(tmp_path: Path) -> None:
         load_campaign(path)
     must = "must be left out, or another sample.method: its means have no intervals"
     assert str(error.value) == f"{path}:11: stop_when: morris, {must}"
+
+
+def test_a_shorter_campaign_leaves_out_what_its_base_does_later(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "base.yaml").write_text(
+        "name: base\nduration_s: 9\nevents:\n  - {kind: drone_lost, at_s: 2, drone: 0}\n  - {kind: drone_lost, at_s: 8, drone: 1}\n"
+    )
+    file = tmp_path / "c.yaml"
+    file.write_text("campaign: c\nbase: base.yaml\nset: {duration_s: 5}\npolicies: [worked]\nmetrics: [switches]\n")
+    assert [event.at_s for event in load_campaign(file).base.events] == [2.0]
+    assert "events: 1 of 2 begin at duration_s = 5 or later, and are left out" in caplog.text
+    file.write_text(file.read_text().replace("duration_s: 5", "events.1.at_s: 9"))
+    with pytest.raises(ScenarioError, match=r"events.1.at_s: 9, must be below duration_s = 9"):
+        load_campaign(file)
