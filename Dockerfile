@@ -5,8 +5,8 @@ FROM python:3.12-slim
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends git make \
     && rm -rf /var/lib/apt/lists/*
-# PyTorch's own index: torch without CUDA. Leave this line out for CUDA.
-ENV PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
+# torch without CUDA: --build-arg PIP_EXTRA_INDEX_URL=…, the index for CPUs that PyTorch's install page names
+ARG PIP_EXTRA_INDEX_URL
 ENV PATH="/sortie/.venv/bin:$PATH"
 WORKDIR /sortie
 COPY . .

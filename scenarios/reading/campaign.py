@@ -82,7 +82,9 @@ def load_campaign(path_or_name: str | Path) -> Study:
     base = _base(campaign.base, here, root)
     written = child(root, "set") or root
     sections = base.model_dump(mode="json", exclude_none=True) | {"expect": [], "expect_decisions": []}
-    resolved = whole = as_node(sections, written.source, written.line)  # what set breaks elsewhere in the base is told there
+    resolved = whole = as_node(
+        sections, written.source, written.line
+    )  # what set breaks elsewhere in the base is told there
     for name, node in _section(root, "set").items():
         resolved = _put(resolved, name, _relined(node))
     base = found_beside(validated(shortened(resolved, whole), Scenario), here)

@@ -397,7 +397,9 @@ def test_levels_of_morris_stop_at_no_interval(tmp_path: Path) -> None:
     assert str(error.value) == f"{path}:11: stop_when: morris, {must}"
 
 
-def test_a_shorter_campaign_leaves_out_what_its_base_does_later(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_shorter_campaign_leaves_out_what_its_base_does_later(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / "base.yaml").write_text(
         "name: base\nduration_s: 9\nevents:\n  - {kind: drone_lost, at_s: 2, drone: 0}\n  - {kind: drone_lost, at_s: 8, drone: 1}\n"
     )
