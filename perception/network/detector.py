@@ -281,7 +281,8 @@ class TorchDetector:
     def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
         maps = [s for s in shares if self._is_fused(s) and s.weight > 0.0]
-        out = self._fuse(ego, maps, now, known) if maps else None
+        silent = self._silent(ego, maps, now)
+        out = self._fuse(ego, maps, silent, now, known) if maps or silent else None
         if out is not None:
             own = self._place(out, ego.est_pose)
         elif not ego.looked:
@@ -293,21 +294,42 @@ class TorchDetector:
         late = [self._source(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
         return joined_many([EgoSources.of(ego, shares, own, out is not None, late)], self._config.join)[0]
 
-    def _fuse(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Tensor | None:
+    def _silent(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture]) -> list[Capture]:
+        """The other drones of the moment that count as zeros because no map of theirs came."""
+        if (
+            self._config.absent_peers == "excluded"
+            or self._config.unsent_cells == "masked"
+            or self._shares != "features"
+        ):
+            return []
+        heard = {ego.drone, *(s.capture.drone for s in maps)}
+        return [capture for drone, capture in now.items() if drone not in heard]
+
+    def _fuse(
+        self,
+        ego: Capture,
+        maps: Sequence[Share],
+        silent: Sequence[Capture],
+        now: Mapping[int, Capture],
+        known: Known,
+    ) -> Tensor | None:
         """The head's output after fusion; None where no peer takes part in any cell."""
         # relative to the ego, so that float32 keeps millimetres kilometres from the origin
         x, y, yaw = ego.est_pose
-        poses = [self._map_pose(s, now) for s in maps]
+        poses = [*(self._map_pose(s, now) for s in maps), *(c.est_pose for c in silent)]
         there = torch.tensor([(px - x, py - y, pyaw) for px, py, pyaw in poses])
         config = self._net.config
         under = support(torch.tensor((0.0, 0.0, yaw)), there, config.fused_cell_m, config.fused_cells)
-        sent = self._net.sent(torch.stack([self._sent(s, known).flatten() for s in maps]))
+        nothing = torch.zeros(CELLS**2, dtype=torch.bool)
+        sent = self._net.sent(torch.stack([*(self._sent(s, known).flatten() for s in maps), *[nothing] * len(silent)]))
         weights, arrived = arriving(under, sent)
-        weight = torch.tensor([[s.weight for s in maps]])
+        weight = torch.tensor([[*(s.weight for s in maps), *[1.0] * len(silent)]])
         part = takes_part(arrived[None], under.inside[None], weight, self._config.unsent_cells)
         if not bool(part[:, 1:].any()):
             return None
-        tables = [known[s.capture].maps.result().permute(1, 2, 0).flatten(0, 1) for s in maps]
+        theirs = [known[s.capture].maps.result() for s in maps]
+        theirs += [torch.zeros(config.fused_channels, config.fused_cells, config.fused_cells)] * len(silent)
+        tables = [each.permute(1, 2, 0).flatten(0, 1) for each in theirs]
         taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), strict=True))
 
         def said(at: Tensor) -> Tensor:
@@ -316,7 +338,7 @@ class TorchDetector:
 
         if not ego.looked:
             return self._head(self._fuse_without_own(said, part[0, 1:], arrived, weight[0]))
-        own, theirs = known[ego].maps.result(), [known[s.capture].maps.result() for s in maps]
+        own = known[ego].maps.result()
         weight = self._net.fusion.weigh(own[None], torch.stack(theirs)[None], weight)
         fused = self._net.fusion.fuse(own, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
         return self._head(fused)

@@ -108,6 +108,10 @@ class SurrogateDetector:
             raise InputError(
                 f"perception.fusion_params: {name} was calibrated without them, must be empty for the surrogate"
             )
+        if config.absent_peers != "excluded":
+            raise InputError(
+                f"perception.absent_peers is {config.absent_peers!r}: {name} was calibrated without them, must be excluded"
+            )
         self.parameters, self.calibration = parameters, parameters.id
         self._scene, self._config = scene, config
         self._eyes = eyes or Eyes(scene)

@@ -124,6 +124,10 @@ class Perception(Section):
         "masked",
         description="Cells that were not sent: out of the fusion softmax, or zeros in it (as in the paper's instrument).",
     )
+    absent_peers: Literal["excluded", "zeros"] = Field(
+        "excluded",
+        description="Peers of whom no map came: out of the fusion, or zeros in it wherever their grids reach, with unsent_cells zero (for studies; the torch detector's).",
+    )
     people: tuple[Person, ...] = Field((), max_length=100, description="People who walk about.")
     thermal: Thermal | None = Field(
         None, description="A thermal camera on every drone, which finds people; left out, nobody finds them."

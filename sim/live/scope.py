@@ -43,6 +43,7 @@ UNUSED = (
     "perception.score_threshold",
     "perception.cells_by",
     "perception.unsent_cells",
+    "perception.absent_peers",
     "policy.replays",
     "record.views",
     "record.disagreement",

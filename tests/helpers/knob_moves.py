@@ -468,7 +468,7 @@ UNSIGNED: dict[str, str] = {
     **{
         f"perception.{name}": _KIND
         for name in (
-            "fusion", "fusion_params", "recording", "recorded_fusion", "precision", "motion_compensation", "cells_by", "join", "unsent_cells",
+            "fusion", "fusion_params", "recording", "recorded_fusion", "precision", "motion_compensation", "cells_by", "join", "unsent_cells", "absent_peers",
         )
     },
     **{

@@ -11,6 +11,7 @@ from perception_examples import capture, cross
 from places import HELPERS
 
 from sortie.perception.detectors import make_detector
+from sortie.perception.errors import InputError
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import source_of
 from sortie.perception.metrics.ap import match
@@ -125,6 +126,35 @@ def test_a_budget_an_roi_and_the_two_masks_matter(
     norm = TorchDetector(scene, Perception(cells_by="norm"), seed=1).detect([(fleet[0], shares)])[0]
     answers = [full, tenth, disc, zero, norm]
     assert not any(same(a, b) for k, a in enumerate(answers) for b in answers[:k])
+
+
+def test_peers_of_whom_nothing_came_dilute_where_they_count_as_zeros(scene: SceneModel, fleet: list[Capture]) -> None:
+    """As if each of them had sent a map of which no cell arrived."""
+    ego, first, *others = fleet
+    jobs = [(ego, [share(first)]), *((c, []) for c in (first, *others))]
+    zeros = {"unsent_cells": "zero", "absent_peers": "zeros"}
+    found, *rest = TorchDetector(scene, Perception.model_validate(zeros), 1).detect(jobs)
+    nothing = [Share(c, "features", 1.0, None, 1.0, missing=tuple(range(4096))) for c in others]
+    as_sent = TorchDetector(scene, Perception(unsent_cells="zero"), 1)
+    assert same(found, as_sent.detect([(ego, [share(first), *nothing])])[0])
+    assert not same(found, as_sent.detect([(ego, [share(first)])])[0])
+    assert not same(rest[0], as_sent.detect([(first, [])])[0])  # to whom nobody sends anything
+    masked = TorchDetector(scene, Perception(absent_peers="zeros"), 1)
+    assert same(masked.detect(jobs)[0], TorchDetector(scene, Perception(), 1).detect(jobs)[0])
+
+
+@pytest.mark.parametrize(
+    ("detector", "message"),
+    [
+        ("surrogate", "perception.absent_peers is 'zeros': .* was calibrated without them, must be excluded"),
+        ("recorded", "perception.absent_peers is 'zeros', must be excluded for a recording"),
+    ],
+)
+def test_other_detectors_refuse_peers_as_zeros(scene: SceneModel, detector: str, message: str) -> None:
+    recording = "none.npz" if detector == "recorded" else None
+    config = Perception.model_validate({"detector": detector, "absent_peers": "zeros", "recording": recording})
+    with pytest.raises(InputError, match=message):
+        make_detector(scene, config, 1)
 
 
 def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(

@@ -395,6 +395,7 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.cells_by": ("norm", ()),
     "perception.join": ("average", ("policy.name=boxes", "policy.params={}")),
     "perception.unsent_cells": ("zero", ()),
+    "perception.absent_peers": ("zeros", ("perception.unsent_cells=zero", "policy.name=best-2", "policy.params={}")),
     "perception.scene.seed": ("8", ()),
     "perception.scene.style": ("suburb", ()),
     "perception.scene.block_m": ("100", ()),

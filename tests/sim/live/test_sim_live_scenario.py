@@ -305,6 +305,7 @@ CHANGED = {
     "perception.score_threshold": "0.5",
     "perception.cells_by": "norm",
     "perception.unsent_cells": "zero",
+    "perception.absent_peers": "zeros",
 }
 
 
