@@ -85,14 +85,18 @@ class Origin(Section):
 
 
 class Steering(Section):
-    """What planners of one's own are held to (docs/guide/mobility.md); nothing else reads it."""
+    """What planners of one's own are held to (docs/guide/mobility.md), and when two groups are too near."""
 
     reach_m: float = Field(200.0, gt=0, le=5000, description="How far from where it began a drone may fly.")
     speed_mps: float = Field(8.0, gt=0, le=30, description="Fastest over ground.")
     climb_mps: float = Field(3.0, gt=0, le=10, description="Fastest up and down.")
     acceleration_mps2: float = Field(2.0, gt=0, le=8, description="Most that it accelerates, in any direction.")
     separation_m: float = Field(
-        5.0, gt=0, le=500, description="No nearer to any other member of the fleet, unless it is so already."
+        5.0,
+        gt=0,
+        le=500,
+        description="No nearer to any other member of the fleet, unless it is so already. Where groups, models or ground "
+        "stations are nearer to each other, an event says so.",
     )
     altitude_m: tuple[Height, Height] = Field((10.0, 120.0), description="Lowest and highest flight.")
     fence_m: tuple[float, float, float, float] | None = Field(

@@ -47,6 +47,7 @@ from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer
+from sortie.sim.engine.separation import Separation
 from sortie.sim.engine.steering import Steering, area_m
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
@@ -281,7 +282,9 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
     moves = [] if parts.choreography is None else [parts.choreography.renew]
     if parts.steering.anyone:
         moves.append(parts.steering.renew)
-    world.start(each_second, [parts.membership.renew, *moves, parts.own_events.step])
+    separation = Separation(parts.scenario, world)
+    watch = [separation.check] if separation.anyone else []
+    world.start(each_second, [parts.membership.renew, *moves, parts.own_events.step, *watch])
     for agent in parts.agents:
         agent.start()
     if scorer is not None:

@@ -155,7 +155,11 @@ class ReplaySenses:
         mission = scenario.mission
         self._scene = SceneModel(scenario.perception.scene, mission.target, trace.bounds, mission.more_targets)
         self._cameras = cameras_of(scenario.fleet)[drone]
-        self._flight = FlightSenses(trace.motion, scenario.frame_s, self._scene.height_field, [self._cameras])
+        station = scenario.fleet.station(drone)
+        blind = (0,) if station is not None and not station.camera else ()
+        self._flight = FlightSenses(
+            trace.motion, scenario.frame_s, self._scene.height_field, [self._cameras], blind=blind
+        )
         self._plan = MissionPlan(mission, scenario.fleet.drones)
         self._tracking = FleetTracking(scenario, TargetSeen(self._scene))
         self._drone, self._trace = drone, trace

@@ -27,6 +27,8 @@ from sortie.scenarios.schema import (
 UNUSED = (
     "context.form",  # descriptors have the paper's form
     "radio.framing",  # payloads go whole
+    "fleet.sensor",  # live drones believe what the replayed models of motion give them
+    "fleet.sensor_params",
     "perception.detector",  # no network runs, and nothing is scored
     "perception.detector_params",
     "perception.fusion",
@@ -47,6 +49,7 @@ UNUSED = (
     "policy.replays",
     "record.views",
     "record.disagreement",
+    "metrics",
     "expect",
     "expect_decisions",
 )

@@ -71,7 +71,7 @@ def test_a_missing_file_names_what_was_probably_meant(tmp_path: Path) -> None:
         ("link_batery", "did you mean link_battery?"),  # a campaign
         (
             "zzz.yaml",
-            "the library has paper_context, paper_replay, person_crossing, search_grid, track_target, two_makes",
+            "the library has paper_context, paper_replay, person_crossing, search_grid, track_target, two_groups, two_makes",
         ),
     ):
         with pytest.raises(ScenarioError) as caught:
@@ -369,6 +369,7 @@ def test_the_library_is_what_the_design_names() -> None:
         "person_crossing",
         "search_grid",
         "track_target",
+        "two_groups",
         "two_makes",
     ]
 

@@ -419,7 +419,7 @@ def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: P
     ("what", "words"),
     [
         ("policies", ["worked", "random-2", "silence", "when2com-style", "Missing: learned keys and queries"]),
-        ("scenarios", ["track_target", "paper_replay", "person_crossing", "search_grid", "two_makes"]),
+        ("scenarios", ["track_target", "paper_replay", "person_crossing", "search_grid", "two_groups", "two_makes"]),
         ("detectors", ["torch", "none"]),
         ("detector", ["torch", "none"]),
         ("fusion", ["disconet", "element-wise maximum"]),

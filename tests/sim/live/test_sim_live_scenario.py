@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -128,6 +129,19 @@ def test_a_drone_that_goes_home_publishes_landing_and_descends() -> None:
         assert sensed.capture.position_m[2] == pytest.approx(height_m[frame])
         assert (senses.task().phase == TaskPhase.LANDING) == (frame > 19)
     assert height_m[59] < height_m[0] - 9
+
+
+def test_a_planner_and_a_ground_station_are_replayed() -> None:
+    own = Path(__file__).parents[1] / "engine" / "own_models.py"
+    planner = (f"fleet.mobility={own}:Goes", "fleet.mobility_params={x_m: -50, y_m: -10, only: 0}")
+    scenario = example("fleet.drones=3", *planner, "fleet.ground=[{drone: 2, position_m: [5, 5, 9]}]")
+    flown = run_sortie(scenario).tables["states"].to_pandas()
+    replayed = [ReplaySenses(scenario, i, trace, 0.0) for i, trace in enumerate(traces(scenario))]
+    for frame in (0, 30, 50):
+        its = flown[flown["t_s"].round(3) == round(frame * 0.1, 3)].sort_values("drone")
+        sensed = [senses.sense(frame) for senses in replayed]
+        assert [each.capture.position_m[0] for each in sensed] == pytest.approx(its["x_m"].tolist())
+        assert [each.footprint_radius_m > 0 for each in sensed] == [True, True, False]
 
 
 def test_a_drone_that_never_flies_has_senses() -> None:
