@@ -7,7 +7,7 @@ SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
 
 
-.PHONY: help sortie screenshot test test-all lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks fuzz docs
+.PHONY: help sortie screenshot test test-all lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks outputs fuzz docs
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -47,6 +47,9 @@ fuzz: $(STAMP) ## try every reader with damaged inputs, ten minutes of processor
 
 notebooks: $(STAMP) ## execute the notebooks
 	$(BIN)/python -m pytest --nbmake --nbmake-timeout=1200 notebooks
+
+outputs: $(STAMP) ## execute the notebooks and keep their outputs, which the site shows (NOTEBOOK=name for one)
+	$(BIN)/python docs/site/run_notebooks.py $(NOTEBOOK)
 
 docs: $(STAMP) ## build the documentation site into build/site; a broken link or page fails
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
