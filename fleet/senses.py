@@ -35,6 +35,17 @@ class Sensed(NamedTuple):
     """Its orientation as it publishes it: the true one, turned by what a fault of its heading adds."""
 
 
+def believed(motion: Trajectories, errors: Mapping[int, Array], frames: slice) -> tuple[Array, Array]:
+    """Where drones believe they are, [T, N, 3] ENU, and their heading, [T, N] rad: the motion's, and what faults add."""
+    position_m, yaw_rad = motion.est_position_m[frames], motion.est_yaw_rad[frames]
+    if errors:
+        position_m, yaw_rad = np.array(position_m), np.array(yaw_rad)
+        for drone, error in errors.items():
+            position_m[:, drone] += error[frames, :3]
+            yaw_rad[:, drone] = np.mod(yaw_rad[:, drone] + error[frames, 3] + np.pi, 2 * np.pi) - np.pi
+    return position_m, yaw_rad
+
+
 class FlightSenses:
     """What all drones sense; `at(frame)[drone]`. Sensors trigger with the frame."""
 
@@ -68,12 +79,7 @@ class FlightSenses:
         self._first = frame // _BLOCK * _BLOCK
         frames = slice(self._first, self._first + _BLOCK)
         m = self._motion
-        believed_m, believed_yaw = m.est_position_m[frames], m.est_yaw_rad[frames]
-        if self._errors:
-            believed_m, believed_yaw = np.array(believed_m), np.array(believed_yaw)
-            for drone, error in self._errors.items():
-                believed_m[:, drone] += error[frames, :3]
-                believed_yaw[:, drone] = np.mod(believed_yaw[:, drone] + error[frames, 3] + np.pi, 2 * np.pi) - np.pi
+        believed_m, believed_yaw = believed(m, self._errors, frames)
         poses = Poses(m.position_m[frames], m.orientation_xyzw[frames], m.yaw_rad[frames], believed_m, believed_yaw)
         seen = zip(*views(poses, self._field, self._cameras), strict=True)
         self._block = list(zip(*(self._of(drone, frames, poses, view) for drone, view in enumerate(seen)), strict=True))

@@ -105,8 +105,11 @@ def load_campaign(path_or_name: str | Path) -> Study:
     return Study(campaign, base, columns, here, root, drones, phases)
 
 
-def read_any(path_or_name: str | Path, overrides: Overrides = ()) -> None:
+def read_any(path_or_name: str | Path, overrides: Overrides = ()) -> Scenario | None:
     """Read a scenario, a campaign or a set of conditions, whichever the file is, to see whether it can be read.
+
+    Returns:
+        The scenario, or a campaign's base; None for a set of conditions.
 
     Raises:
         ScenarioError: with everything that is wrong in `issues`.
@@ -114,11 +117,11 @@ def read_any(path_or_name: str | Path, overrides: Overrides = ()) -> None:
     text, source = read(path_or_name)
     root = tree(text, source)
     if child(root, "campaign") is not None:
-        load_campaign(path_or_name)
-    elif child(root, "conditions") is not None and child(root, "name") is None:
+        return load_campaign(path_or_name).base
+    if child(root, "conditions") is not None and child(root, "name") is None:
         load_conditions(path_or_name)
-    else:
-        load(path_or_name, overrides)
+        return None
+    return load(path_or_name, overrides)
 
 
 def vary_scenario(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

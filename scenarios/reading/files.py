@@ -102,6 +102,13 @@ def named_models(sections: dict[str, Any]) -> list[tuple[str, str]]:
     return [(kind, holder[key]) for kind, holder, key in _models(sections)]
 
 
+def models_with_params(sections: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Every model that a scenario's plain sections name: its kind, its name and its parameters."""
+    for kind, holder, key in _models(sections):
+        of = "params" if key in ("name", "model") else f"{key.removesuffix('_model')}_params"
+        yield kind, holder[key], holder.get(of) or {}
+
+
 def _places(sections: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
     """Where files are named: the section and its key."""
     yield from _given(sections, FIELDS)

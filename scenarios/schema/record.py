@@ -12,6 +12,9 @@ class RecordSection(Section):
         False,
         description="Keep the exact view and answer of every decision, for `sortie replay`; `sim/README.md` says what it costs.",
     )
+    beliefs: bool = Field(
+        False, description="Keep the pose that each drone believes to have in each frame, as the table `beliefs`."
+    )
     disagreement: bool = Field(
         False,
         description="Measure how often two drones' views lead to different choices about a link; takes time after the flight.",

@@ -75,12 +75,16 @@ def _write_junit(file: Path | None, suites: Sequence[Suite]) -> None:
 
 def _check_syntax(files: list[str], overrides: list[str] | None) -> None:
     """Print everything that is wrong with files, a line each. Exit code 1 if anything is."""
+    from sortie.sim.check.named import not_there
+
     issues: list[str] = []
     for file in files:
         try:
-            read_any(file, overrides or ())
+            scenario = read_any(file, overrides or ())
         except ScenarioError as error:
             issues += error.issues
+        else:
+            issues += [f"{file}: {issue}" for issue in (() if scenario is None else not_there(scenario))]
     for issue in issues:
         out.print(issue, soft_wrap=True, markup=False, highlight=False)
     if issues:

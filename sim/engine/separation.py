@@ -55,4 +55,5 @@ def strangers(fleet: Fleet) -> NDArray[np.bool_]:
             unit[-1] = fleet.drones + drone  # a unit of its own
     flies = np.array([drone not in stands for drone in range(fleet.drones)])
     units = np.array(unit)
-    return (units[:, None] != units[None]) & (flies[:, None] | flies[None])
+    apart: NDArray[np.bool_] = (units[:, None] != units[None]) & (flies[:, None] | flies[None])
+    return apart

@@ -53,7 +53,7 @@ from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, ca
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, own_antennas, strongest_dbm
 from sortie.sim.identity import code_version, name_of, own_files, runs_user_code
-from sortie.sim.results import disagreement, rosters
+from sortie.sim.results import beliefs, disagreement, rosters
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 from sortie.sim.results.views import TABLES as VIEW_TABLES
 from sortie.sim.results.views import Journal, decisions
@@ -307,6 +307,8 @@ def _collect(parts: Parts, policies: PolicyPlan, policy: str, seed: int, replica
     more = {} if parts.journal is None else _decided(parts.journal, policies, parts.scenario)
     if parts.scenario.context.roster:
         more[rosters.TABLE] = notes.rosters.table()
+    if parts.scenario.record.beliefs:
+        more[beliefs.TABLE] = beliefs.table(*parts.world.believed())
     for name, table in more.items():
         recorder.spool.add_table(name, table)
     counters = {f.name: getattr(air.counters, f.name) for f in dataclasses.fields(air.counters) if f.name != "lost_to"}

@@ -22,7 +22,7 @@ from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.motion import Trajectories
 from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.plane import DroneStatus
-from sortie.fleet.senses import FlightSenses, Sensed
+from sortie.fleet.senses import FlightSenses, Sensed, believed
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.tracking.wire import content
@@ -353,6 +353,11 @@ class World:
     def sensed(self, drone: int, frame: int) -> Sensed:
         """The drone's pose, velocity and coverage in a frame."""
         return self._flight.at(frame)[drone]
+
+    def believed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times [T] of all frames, and in each the positions [T, N, 3] and headings [T, N] that drones believe to have."""
+        frames = slice(0, self._scenario.frames)
+        return np.arange(self._scenario.frames) * self._scenario.frame_s, *believed(self.motion, self._errors, frames)
 
     def platform(self, drone: int) -> Platform:
         """Charge, and headrooms over the second that ended."""

@@ -49,6 +49,7 @@ UNUSED = (
     "policy.replays",
     "record.views",
     "record.disagreement",
+    "record.beliefs",
     "metrics",
     "expect",
     "expect_decisions",

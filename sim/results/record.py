@@ -150,7 +150,7 @@ class SortieRecord:
     """The detector that flew, as `sortie.sim.identity.name_of` names it; `none` without one."""
     tables: Mapping[str, pa.Table]
     """Those of `TABLES`. Where the scenario keeps views, also those of `sortie.sim.results.views`; where drones publish
-    rosters, also that of `sortie.sim.results.rosters`. Those are no part of the fingerprint: what is kept changes nothing
+    rosters, also that of `sortie.sim.results.rosters`; with `record.beliefs`, that of `sortie.sim.results.beliefs`. Those are no part of the fingerprint: what is kept changes nothing
     that flies."""
     totals: Mapping[str, float]
     """Counts that are no table: context bytes, medium utilisation, ..."""

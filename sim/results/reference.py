@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from sortie.scenarios.report_text import table
 from sortie.sim.folders import write_text
-from sortie.sim.results import disagreement, rosters, views
+from sortie.sim.results import beliefs, disagreement, rosters, views
 from sortie.sim.results.outcome_fields import Outcome
 from sortie.sim.results.record import ABOUT, TABLES
 
@@ -64,7 +64,7 @@ def page() -> str:
         "truck, 2 a person. `car` is then a person's number where the box is of one.",
         "",
         "With `record.views: true` the first three of these too, with `record.disagreement: true` the fourth, with "
-        "`context.roster: true` the last one. They are no part of the fingerprint.",
+        "`context.roster: true` the fifth, with `record.beliefs: true` the last one. They are no part of the fingerprint.",
         "",
         *table(
             ("table", "a row is", "columns"),
@@ -74,6 +74,7 @@ def page() -> str:
                     *((name, views.ABOUT[name], columns) for name, columns in views.TABLES.items()),
                     (disagreement.TABLE, disagreement.ABOUT, disagreement.COLUMNS),
                     (rosters.TABLE, rosters.ABOUT, rosters.COLUMNS),
+                    (beliefs.TABLE, beliefs.ABOUT, beliefs.COLUMNS),
                 )
             ),
         ),

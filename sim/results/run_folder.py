@@ -16,7 +16,7 @@ from sortie.scenarios.reading.load import ScenarioError, dump, loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import models_of_the_past
 from sortie.sim.folders import RunError, ensure_folder, replacing
-from sortie.sim.results import disagreement, rosters, views
+from sortie.sim.results import beliefs, disagreement, rosters, views
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import TABLES, SortieRecord
 from sortie.sim.results.spool import batches, schema_of
@@ -29,7 +29,7 @@ WRITTEN = frozenset(
         SCENARIO,
         RECORD,
         RECORDING,
-        *(f"{name}.parquet" for name in (*TABLES, *views.TABLES, disagreement.TABLE, rosters.TABLE)),
+        *(f"{name}.parquet" for name in (*TABLES, *views.TABLES, disagreement.TABLE, rosters.TABLE, beliefs.TABLE)),
     }
     | {PAGE, "sortie.tlog", "bag/metadata.yaml", "bag/bag.mcap"}  # `sortie report` and `export`, made of the run
 )
@@ -226,6 +226,8 @@ def load(path: Path) -> SortieRecord:
             expected[disagreement.TABLE] = disagreement.COLUMNS
         if scenario.context.roster:
             expected[rosters.TABLE] = rosters.COLUMNS
+        if scenario.record.beliefs:
+            expected[beliefs.TABLE] = beliefs.COLUMNS
         tables = {name: pq.read_table(path / f"{name}.parquet") for name in expected}
         for name, columns in expected.items():
             if lacking := [c for c in columns if c not in tables[name].column_names]:

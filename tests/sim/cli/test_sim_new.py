@@ -78,6 +78,25 @@ def test_everything_that_is_wrong_is_said_at_once(here: Path) -> None:
     assert lines[5] == "5 things are wrong"
 
 
+def test_what_a_file_names_and_is_not_there_is_said(here: Path) -> None:
+    (here / "own.py").write_text("def loss(d, a, b, ghz, *, db=1.0):\n    return d\n")
+    (here / "s.yaml").write_text(
+        "name: s\nradio: {path_loss: own.py:loss, path_loss_params: {decibel: 3}, link: own.py:Link, trace: links.csv}\n"
+        "perception: {detector: gone.py:D}\nfleet: {airframe: {power_model: momentum}}\n"
+        "policy: {name: own.py:loss, params: {db: 2}}\nmetrics: {m: {model: own.py:loss, params: {x: 1}}}\n"
+    )
+    code, text = say("check", "--syntax", "s.yaml")
+    assert code == 1
+    assert text.splitlines() == [
+        "s.yaml: no file links.csv",
+        "s.yaml: path_loss 'own.py:loss' has no parameter 'decibel', it has: db",
+        "s.yaml: link file 'own.py' has no function or class 'Link'",
+        "s.yaml: detector file 'gone.py' not found",
+        "s.yaml: metric 'own.py:loss' has no parameter 'x', it has: db",
+        "5 things are wrong",
+    ]
+
+
 def test_every_file_of_the_library_is_read() -> None:
     code, text = say("check", "--syntax", "all")
     assert code == 0

@@ -17,6 +17,7 @@ from sortie.scenarios.errors import SortieError
 from sortie.sim.engine import sortie
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
 
 WHOLE = "duration_s=3"
@@ -191,3 +192,19 @@ def test_a_sensor_of_ones_own_adds_its_error_to_every_drone(sensors: str) -> Non
 def test_a_sensor_that_returns_something_else_is_refused(function: str, message: str, sensors: str) -> None:
     with pytest.raises(SortieError, match=message):
         flown(more=(f"fleet.sensor={sensors}:{function}",))
+
+
+def test_what_drones_believe_is_kept_if_wanted(tmp_path: Path) -> None:
+    settings = (WHOLE, f"events=[{POSITION}, {HEADING}]")
+    record, plain = run_sortie(example(*settings, "record.beliefs=true")), run_sortie(example(*settings))
+    assert "beliefs" not in plain.tables
+    assert plain.fingerprint == record.fingerprint
+    run_folder.save(record, tmp_path / "run")
+    kept, states = (run_folder.load(tmp_path / "run").tables[name].to_pandas() for name in ("beliefs", "states"))
+    assert_allclose(kept[["t_s", "drone"]], states[["t_s", "drone"]])
+    its = captures(flown(POSITION, HEADING), 1)
+    own = kept[kept["drone"] == 1]
+    assert_allclose(own[["x_m", "y_m", "z_m"]], [c.est_position_m for c in its])
+    assert_allclose(own["yaw_rad"], [c.est_yaw_rad for c in its])
+    wrong_m = np.hypot(*(kept[["x_m", "y_m"]].to_numpy() - states[["x_m", "y_m"]].to_numpy()).T).reshape(30, -1)
+    assert wrong_m[10:20, 1].min() > 9 > 2 > np.delete(wrong_m, np.s_[10:20], axis=0).max()

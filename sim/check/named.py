@@ -1,0 +1,36 @@
+"""What a scenario names and what is not there: files, models in files, and their parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from sortie.policies.registry import resolve as resolve_policy
+from sortie.scenarios.errors import SortieError
+from sortie.scenarios.plugins.reference import installed, is_file, resolve
+from sortie.scenarios.reading.files import models_with_params, named_files
+from sortie.scenarios.schema import Scenario
+from sortie.scenarios.traces import located
+
+
+def not_there(scenario: Scenario) -> list[str]:
+    """A line for each file that a scenario names and that is missing, and for each model that cannot be made.
+
+    Files of models are loaded, as for a flight; no model is called.
+    """
+    sections = scenario.model_dump(mode="json", exclude_none=True)
+    models = list(models_with_params(sections))
+    own = {name.rpartition(":")[0] for _, name, _ in models if is_file(name)}
+    missing = [name for name in named_files(sections) if name not in own and not located(Path(name)).exists()]
+    return [f"no file {name}" for name in dict.fromkeys(missing)] + list(dict.fromkeys(_refused(models)))
+
+
+def _refused(models: list[tuple[str, str, dict[str, object]]]) -> Iterator[str]:
+    for kind, name, params in models:
+        try:
+            if kind == "policy":
+                resolve_policy(name, params)
+            elif is_file(name) or name in installed(kind):
+                resolve(kind, name, params)
+        except SortieError as error:
+            yield str(error)
