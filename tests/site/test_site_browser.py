@@ -1,4 +1,4 @@
-"""The built site in a real browser: every picture opens, and no page is wider than a screen or a telephone.
+"""The built site in a real browser: every picture opens, no page is wider than a screen or a telephone, search finds.
 
 Skipped without Chromium, and where `make docs` has not built the site.
 """
@@ -49,7 +49,14 @@ async function look() {
     }
     frame.remove();
   }
-  await fetch("/found", {method: "POST", body: JSON.stringify({found, pictures})});
+  const frame = document.body.appendChild(document.createElement("iframe"));
+  await new Promise(done => { frame.onload = done; frame.src = "/search.html?q=dwell_s"; });
+  let hits = 0;
+  for (let tries = 0; tries < 100 && !hits; tries += 1) {
+    await new Promise(done => setTimeout(done, 100));
+    hits = frame.contentDocument.querySelectorAll("ul.search li").length;
+  }
+  await fetch("/found", {method: "POST", body: JSON.stringify({found, pictures, hits})});
 }
 look();
 </script>"""
@@ -104,13 +111,15 @@ def broken(tmp_path: Path) -> Path:
     return folder
 
 
-def test_every_picture_opens_and_every_page_fits(tmp_path: Path) -> None:
+def test_every_picture_opens_every_page_fits_and_the_search_finds(tmp_path: Path) -> None:
     answer = look(SITE, tmp_path / "profile")
     assert answer["found"] == []
     assert answer["pictures"] > 20
+    assert answer["hits"] >= 3
 
 
 def test_a_missing_picture_and_a_wide_page_are_found(broken: Path, tmp_path: Path) -> None:
     answer = look(broken, tmp_path / "profile")
     assert "index.html: the picture gone.png does not open" in answer["found"]
     assert any("px wider than 420" in line for line in answer["found"])
+    assert answer["hits"] == 0
