@@ -1,4 +1,4 @@
-"""The built site in a real browser: every picture opens, no page is wider than a screen or a telephone, search finds.
+"""The built site in a real browser: every picture opens, no page is too wide or loads from elsewhere, search finds.
 
 Skipped without Chromium, and where `make docs` has not built the site.
 """
@@ -43,6 +43,9 @@ async function look() {
         const name = (picture.getAttribute("src") || "").slice(0, 80);
         await picture.decode().catch(() => found.push(`${page}: the picture ${name} does not open`));
         pictures += 1;
+      }
+      for (const {name} of frame.contentWindow.performance.getEntriesByType("resource")) {
+        if (!name.startsWith(location.origin) && !name.startsWith("data:")) found.push(`${page}: loads ${name}`);
       }
       const over = inside.documentElement.scrollWidth - width;
       if (over > 0) found.push(`${page}: ${over} px wider than ${width}`);
@@ -103,11 +106,14 @@ def look(site: Path, profile: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def broken(tmp_path: Path) -> Path:
-    """A site of one page, with a picture that is not there and a line that is too long."""
+    """A site of one page: a picture that is not there, a script from elsewhere, a line that is too long."""
     folder = tmp_path / "broken"
     folder.mkdir()
+    far = '<script src="http://localhost:9/far.js"></script>'
     wide = '<p style="width: 900px">wide</p>'
-    (folder / "index.html").write_text(f'<!doctype html><title>broken</title><img src="gone.png" alt="gone">{wide}')
+    (folder / "index.html").write_text(
+        f'<!doctype html><title>broken</title><img src="gone.png" alt="gone">{far}{wide}'
+    )
     return folder
 
 
@@ -118,8 +124,9 @@ def test_every_picture_opens_every_page_fits_and_the_search_finds(tmp_path: Path
     assert answer["hits"] >= 3
 
 
-def test_a_missing_picture_and_a_wide_page_are_found(broken: Path, tmp_path: Path) -> None:
+def test_a_missing_picture_a_wide_page_and_a_script_from_elsewhere_are_found(broken: Path, tmp_path: Path) -> None:
     answer = look(broken, tmp_path / "profile")
     assert "index.html: the picture gone.png does not open" in answer["found"]
+    assert "index.html: loads http://localhost:9/far.js" in answer["found"]
     assert any("px wider than 420" in line for line in answer["found"])
     assert answer["hits"] == 0
