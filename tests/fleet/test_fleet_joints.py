@@ -22,17 +22,16 @@ Draws that must be independent: gusts, offsets, errors of position and heading, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
-import simpy
+from agent_rig import Rig, capture, descriptor, memory, payload
 from fleet_examples import DESCRIPTOR
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.agent import Agent, Platform, Task
 from sortie.fleet.clock import WINDOW, Clock, oscillators
 from sortie.fleet.computer import Work, headrooms
 from sortie.fleet.coverage import Poses, View, cameras_of, footprint_radius_m, views
@@ -43,11 +42,10 @@ from sortie.fleet.flight.displaced import displaced
 from sortie.fleet.flight.motion import fly
 from sortie.fleet.flight.rotor import climb_power_w, fleet_power_w, momentum_power_w, rotor_power_w
 from sortie.fleet.flight.viewpoints import Move, bounds_of, course_of, grant
-from sortie.fleet.gate import Gate, Payload
 from sortie.fleet.lies import falsified
-from sortie.fleet.memory import PeerMemory, Received
+from sortie.fleet.memory import Received
 from sortie.fleet.messages.wire import decode_descriptor
-from sortie.fleet.plane import DroneStatus, Equipment, PlaneRules, equipment_of
+from sortie.fleet.plane import Equipment, equipment_of
 from sortie.fleet.probes import Probes
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.sensor_faults import sensor_errors
@@ -55,8 +53,7 @@ from sortie.fleet.staleness import DEGRADED_RATE_HZ, LinkHealth, cap_by_age
 from sortie.fleet.trust import Arrival, goodput_doubt, judge
 from sortie.perception.geometry import USUAL
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.types import Boxes, Capture
-from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Representation, TaskPhase
+from sortie.policies.contract import Directive, Disc, FleetView, Representation
 from sortie.scenarios.link_state import heard_share
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import (
@@ -377,26 +374,6 @@ def test_a_clock_told_anew_goes_on_as_it_went(rate: float, growth: float) -> Non
             )
 
 
-RULES = PlaneRules(0.1, 1000, 3.0, 10.0, 0.3, 0.2, 0.04, trust=True)
-
-
-def memory(drone: int = 0, **changes: Any) -> PeerMemory:
-    rules = PlaneRules(**{f: getattr(RULES, f) for f in RULES.__dataclass_fields__} | changes)
-    return PeerMemory(drone, rules, DroneStatus())
-
-
-def descriptor(agent_id: int, t_s: float = 0.0, **changes: Any) -> Descriptor:
-    return DESCRIPTOR._replace(agent_id=agent_id, stamp_ns=round(t_s * 1e9), **changes)
-
-
-def capture(drone: int, t_s: float) -> Capture:
-    return Capture(drone, t_s, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 60.0), 0.0)
-
-
-def payload(size: int = 20_000, rung: Representation = Representation.FEATURES) -> Payload:
-    return Payload(rung, 0.1, None, 1.0, 100, 0, 0, size)
-
-
 @pytest.mark.parametrize("mine_s", [0.0, 3.0, -2.0])
 @pytest.mark.parametrize("theirs_s", [0.0, 5.0, -4.0])
 def test_ages_are_true_whoever_s_clock_is_off(mine_s: float, theirs_s: float) -> None:
@@ -586,67 +563,6 @@ def test_a_lie_changes_what_it_is_about_and_nothing_else(lie: tuple[Any, Any]) -
 
 
 # --- one agent ------------------------------------------------------------------------------------------------
-
-
-class Rig:
-    """One agent with made-up senses and air; `sent` and `published` are what it put on the air."""
-
-    def __init__(self, policy: Callable[[FleetView], Sequence[Directive]], *, handshake: int = 0, **rules: Any) -> None:
-        self.env = simpy.Environment()
-        self.memory = memory(0, **rules)
-        self.sent: list[tuple[float, int, Payload, Capture]] = []
-        self.shaken: list[tuple[float, int]] = []
-        self.published: list[tuple[float, bytes]] = []
-        self.gate = Gate()
-        self.agent = Agent(
-            self.env, self.memory, rules=self.memory._rules, policy=policy, senses=self, modem=self, gate=self.gate,
-            log=self, sealer=None, phase_s=0.01, handshake_bytes=lambda: handshake,
-        )  # fmt: skip
-        self.agent.start()
-
-    # senses
-    def sense(self, frame: int) -> Sensed:
-        now = capture(0, frame * 0.1)
-        return Sensed(now, (0.0, 0.0, 0.0), 42.0, View(0, 0, bytes(64)), now.orientation_xyzw)
-
-    def platform(self) -> Platform:
-        return Platform(0.9, 1.0, 1.0)
-
-    def task(self) -> Task:
-        return Task(TaskPhase.SEARCH, None)
-
-    def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
-        return 3
-
-    def perceived(self, capture: Capture) -> None: ...
-
-    def tracks_in(self, capture: Capture, roi: Disc | None) -> None:
-        return None
-
-    def people_in(self, capture: Capture, roi: Disc | None) -> Boxes:
-        return Boxes.empty()
-
-    # modem
-    def broadcast(self, datagram: bytes) -> None:
-        self.published.append((self.env.now, datagram))
-
-    def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
-        self.sent.append((self.env.now, peer, payload, capture))
-
-    def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
-        self.shaken.append((self.env.now, peer))
-
-    def goodput_mbps(self) -> tuple[float, ...]:
-        return (50.0,) * 4
-
-    def __getattr__(self, name: str) -> Any:  # the log
-        if name in ("descriptor", "directive", "trust", "decision", "event", "alert"):
-            return lambda *what: None
-        raise AttributeError(name)
-
-    def hear(self, *peers: int) -> None:
-        for peer in peers:
-            self.memory.hold(descriptor(peer, self.env.now, coverage_grid=bytes(64)), self.env.now)
 
 
 FULL = Directive(0, 1, Representation.FEATURES, 0.5, None, 10.0)
