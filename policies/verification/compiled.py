@@ -1,13 +1,13 @@
 """Invariants as closures, for the shield: built once for each line, and cheap to ask thousands of times a second.
 
-A line is split into its parts joined by `and`. Each part knows which fields of a directive it names, and at which values
-of them its truth changes. `evaluate` in `invariants` gives the same answers from the tree.
+A line is split into its parts joined by `and`. Each part has its ways to hold: a list of alternatives, each a list of
+comparisons that must hold together. `evaluate` in `invariants` gives the same answers from the tree.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -27,10 +27,15 @@ from sortie.policies.verification.words import DECISIONS, WORDS
 
 Ask = Callable[["Context", Directive], Any]
 """The value of an expression in a context, for one link."""
-_COMPARE: dict[str, Callable[[Any, Any], Any]] = {
+Compare = Callable[[Any, Any], Any]
+_COMPARE: dict[str, Compare] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq, "!=": operator.ne,
 }  # fmt: skip
 _ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {"+": operator.add, "-": operator.sub, "*": operator.mul}
+_OPPOSITE = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "==": "!=", "!=": "=="}
+_MIRRORED = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "==": "==", "!=": "!="}
+_MOST_WAYS = 64
+"""A part with more alternatives is not taken apart: the shield then changes single fields of it."""
 
 
 class Context:
@@ -45,16 +50,34 @@ class Context:
         self.known: dict[Any, Any] = {}
 
 
+class Claim(NamedTuple):
+    """A comparison, or a word that is true or false."""
+
+    holds: Ask
+    fields: tuple[str, ...]
+    """The fields of the link's own directive that it depends on."""
+    compare: Compare | None = None
+    """Of a claim about one field: how the field compares with `value`."""
+    value: Ask | None = None
+    """Of a claim about one field: the other side, which depends on no field of the link's directive."""
+    gap: Ask | None = None
+    """Of a comparison of several fields: left side less right side."""
+
+
 class Part(NamedTuple):
     """A part of a requirement that must hold by itself."""
 
     holds: Ask
-    fields: frozenset[str]
-    """The fields of the link's directive that it names."""
-    edges: tuple[tuple[str, Ask], ...]
-    """A field, and the value of the other side of a comparison with it."""
+    ways: tuple[tuple[Claim, ...], ...]
+    """The requirement holds where all claims of one of these hold."""
+    exempt: tuple[tuple[Claim, ...], ...]
+    """Where all claims of one of these hold, the line's condition on the directive is false."""
+    bound: Claim | None
+    """The claim about one field that the whole part is, if its other side is the same for all links."""
     of_peer: bool
-    """Whether it depends on the peer otherwise than through the directive."""
+    """Whether it depends on the peer otherwise than through the link's directive."""
+    of_links: bool
+    """Whether it depends on other links' directives."""
 
 
 class Rule(NamedTuple):
@@ -62,12 +85,10 @@ class Rule(NamedTuple):
 
     invariant: Invariant
     when: Ask | None
-    when_of_link: bool
+    """The condition, if it depends on no directive; a condition that does is within the parts."""
+    when_of_peer: bool
     parts: tuple[Part, ...]
-    any_link: tuple[Part, ...]
-    """The parts of the body, if the requirement has one `any_link(…)` and else depends on the view alone."""
-    when_mixed: bool
-    """Whether the condition depends on the link's directive and on its peer as well."""
+    of_link: bool
 
     def holds(self, context: Context, link: Directive) -> bool:
         """Whether the line holds for a link, or for all of them if it is about all."""
@@ -79,20 +100,16 @@ class Rule(NamedTuple):
 @lru_cache(maxsize=256)
 def compiled(invariant: Invariant) -> Rule:
     """A line as closures."""
-    when, then = invariant.when, invariant.then
-    parts = _conjuncts(then)
-    over = [node for node in parts if isinstance(node, LinksTerm) and node.function == "any_link"]
-    alone = len(over) == 1 and not any(isinstance(n, LinksTerm) for p in parts if p not in over for n in walk(p))
-    named = {n.word for n in walk(when) if isinstance(n, Name)} if when is not None else set()
-    peers = any(word not in DECISIONS and word in WORDS and WORDS[word].of_link for word in named)
+    parts = _conjuncts(invariant.then)
+    conditions = () if invariant.when is None else _conjuncts(invariant.when)
+    apart = tuple(node for node in conditions if not _depends(node))
+    within = tuple(node for node in conditions if _depends(node))
     return Rule(
         invariant,
-        None if when is None else _ask(when),
-        when is not None and _is_of_link(when),
-        tuple(_part(node) for node in parts),
-        tuple(_part(node) for node in _conjuncts(over[0].body)) if alone else (),
-        when is not None
-        and ((peers and bool(named & DECISIONS.keys())) or any(isinstance(n, Fresh | LinksTerm) for n in walk(when))),
+        _ask(Logic("and", apart)) if apart else None,
+        any(_is_of_peer(node) for node in apart),
+        tuple(_part(node, within) for node in parts),
+        invariant.of_link,
     )
 
 
@@ -102,26 +119,78 @@ def _conjuncts(node: Node) -> tuple[Node, ...]:
     return (node,)
 
 
-def _part(node: Node) -> Part:
-    edges = []
-    for inner in walk(node):
-        if isinstance(inner, Binary) and inner.sign in _COMPARE:
-            for side, other in ((inner.left, inner.right), (inner.right, inner.left)):
-                if isinstance(side, Name) and side.word in DECISIONS and not isinstance(other, LinksTerm):
-                    edges.append((side.word, _ask(other)))
-    named = [n.word for n in walk(node) if isinstance(n, Name)]
-    fields = frozenset(word for word in named if word in DECISIONS)
-    others = any(WORDS[w].of_link for w in named if w not in DECISIONS) or any(
-        isinstance(n, Fresh | LinksTerm) for n in walk(node)
-    )
-    return Part(_ask(node), fields, tuple(edges), others)
+def _part(required: Node, conditions: Sequence[Node]) -> Part:
+    node = required
+    if conditions:
+        node = Logic("or", (*[Logic("not", (condition,)) for condition in conditions], required))
+    ways = _quick_first(_ways(required, True))
+    exempt = _quick_first(way for condition in conditions for way in _ways(condition, False))
+    bound = ways[0][0] if len(ways) == 1 and len(ways[0]) == 1 and not exempt else None
+    of_peer, of_links = _is_of_peer(node), any(isinstance(n, LinksTerm) for n in walk(node))
+    simple = bound is not None and bound.value is not None and not of_peer and not of_links
+    return Part(_ask(node), ways, exempt, bound if simple else None, of_peer, of_links)
 
 
-def _is_of_link(node: Node) -> bool:
-    return any(
-        isinstance(n, Fresh | LinksTerm) or (isinstance(n, Name) and n.word in WORDS and WORDS[n.word].of_link)
-        for n in walk(node)
-    )
+def _quick_first(ways: Iterable[tuple[Claim, ...]]) -> tuple[tuple[Claim, ...], ...]:
+    """The claims that a view or another drone decides come first."""
+    return tuple(tuple(sorted(way, key=lambda claim: len(claim.fields))) for way in ways)
+
+
+def _ways(node: Node, wanted: bool) -> tuple[tuple[Claim, ...], ...]:
+    """The alternatives under which a node is true, or false if that is wanted."""
+    if isinstance(node, Logic):
+        if node.word == "not":
+            return _ways(node.parts[0], not wanted)
+        below = [_ways(part, wanted) for part in node.parts]
+        if (node.word == "or") == wanted:
+            return tuple(way for ways in below for way in ways)
+        found: tuple[tuple[Claim, ...], ...] = ((),)
+        for ways in below:
+            found = tuple((*a, *b) for a in found for b in ways)
+            if len(found) > _MOST_WAYS:
+                return ((_claim_of(node, wanted),),)
+        return found
+    if isinstance(node, LinksTerm) and node.function == "any_link":
+        others = _other_links(_ask(node.body))
+        if wanted:
+            return ((Claim(others, ()),), *_ways(node.body, True))
+        return tuple((Claim(_not(others), ()), *way) for way in _ways(node.body, False))
+    if isinstance(node, Binary) and node.sign == ("!=" if wanted else "=="):
+        sides = (Binary(sign, node.left, node.right) for sign in ("<", ">"))  # the nearest on each side
+        return tuple((_claim_of(side, True),) for side in sides)
+    return ((_claim_of(node, wanted),),)
+
+
+def _claim_of(node: Node, wanted: bool) -> Claim:
+    fields = tuple(dict.fromkeys(n.word for n in walk(node) if isinstance(n, Name) and n.word in DECISIONS))
+    if isinstance(node, Name):
+        holds = _ask(node) if wanted else _not(_ask(node))
+        return Claim(holds, fields, operator.eq, lambda _, __: float(wanted)) if fields else Claim(holds, ())
+    if isinstance(node, Binary) and node.sign in _COMPARE and not any(isinstance(n, LinksTerm) for n in walk(node)):
+        sign = node.sign if wanted else _OPPOSITE[node.sign]
+        holds = _binary(sign, node.left, node.right)
+        for side, other, how in ((node.left, node.right, sign), (node.right, node.left, _MIRRORED[sign])):
+            if isinstance(side, Name) and fields == (side.word,) and not _depends(other):
+                return Claim(holds, fields, _COMPARE[how], _ask(other))
+        return Claim(holds, fields, gap=_binary("-", node.left, node.right))
+    return Claim(_ask(node) if wanted else _not(_ask(node)), fields)
+
+
+def _not(ask: Ask) -> Ask:
+    return lambda context, link: not ask(context, link)
+
+
+def _of_peer(word: str) -> bool:
+    return word not in DECISIONS and word in WORDS and WORDS[word].of_link
+
+
+def _is_of_peer(node: Node) -> bool:
+    return any(isinstance(n, Fresh) or (isinstance(n, Name) and _of_peer(n.word)) for n in walk(node))
+
+
+def _depends(node: Node) -> bool:
+    """Whether it depends on directives that may change."""
+    return any(isinstance(n, LinksTerm) or (isinstance(n, Name) and n.word in DECISIONS) for n in walk(node))
 
 
 def _ask(node: Node) -> Ask:
@@ -170,6 +239,13 @@ def _logic(word: str, parts: tuple[Ask, ...]) -> Ask:
     if word == "not":
         (one,) = parts
         return lambda context, link: not one(context, link)
+    if len(parts) == 1:
+        return parts[0]
+    if len(parts) == 2:
+        a, b = parts
+        if word == "and":
+            return lambda context, link: a(context, link) and b(context, link)
+        return lambda context, link: a(context, link) or b(context, link)
     if word == "and":
         return lambda context, link: all(part(context, link) for part in parts)
     return lambda context, link: any(part(context, link) for part in parts)
@@ -196,10 +272,22 @@ def _binary(sign: str, left: Node, right: Node) -> Ask:
 
 
 def _over_links(function: str, body: Ask) -> Ask:
+    # The link's own directive may be another one than is listed: one that is tried in its place.
     if function == "any_link":
-        return lambda context, _: any(body(context, d) for d in context.directives)
+        others = _other_links(body)
+        return lambda context, link: body(context, link) or others(context, link)
     if function == "every_link":
         return lambda context, _: all(body(context, d) for d in context.directives)
     if function == "count_links":
         return lambda context, _: sum([1 if body(context, d) else 0 for d in context.directives])
     return lambda context, _: sum([body(context, d) for d in context.directives])
+
+
+def _other_links(body: Ask) -> Ask:
+    """Whether one of the other links satisfies a condition."""
+
+    def ask(context: Context, link: Directive) -> bool:
+        mine = link.destination
+        return any(d.destination != mine and body(context, d) for d in context.directives)
+
+    return ask

@@ -19,19 +19,17 @@ than the age of the peer's descriptor allows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.verification.invariants import Invariant, describe_directives, violations
 from sortie.policies.verification.past import Past
+from sortie.policies.verification.shield import Cap as Cap
 from sortie.policies.verification.shield import enforce
 
 POLICY, STALENESS, DAMPING, NO_PEER = "policy", "staleness", "damping", "no peer"
 CAUSES = (POLICY, STALENESS, DAMPING, NO_PEER)
-
-Cap = Callable[[Directive], Directive]
-"""A directive as far as the age of its peer's descriptor allows it."""
 
 
 class Steps(NamedTuple):
@@ -68,7 +66,7 @@ def put_right(
 ) -> list[Directive]:
     """The nearest directives that keep the rules within what ages allow; those that nothing can mend stay as they are."""
     acting = [effective(d) for d in damped]
-    shielded = enforce(rules, view, acting, fresh, lambda d: cap(d) == d)
+    shielded = enforce(rules, view, acting, fresh, cap)
     return [before if after == seen else after for before, seen, after in zip(damped, acting, shielded, strict=True)]
 
 

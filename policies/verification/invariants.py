@@ -139,6 +139,9 @@ class Invariant:
     within: Span | None = None
     """How long `then` may be false without a break while `when` is true; None: not at all."""
 
+    def __hash__(self) -> int:
+        return hash(self.text)  # a shield looks its lines up at every decision
+
     @property
     def nodes(self) -> Iterator[Node]:
         """All parts of the line."""

@@ -4,8 +4,8 @@
 
 A directive that breaks an invariant is replaced by the nearest one that keeps them all. Its reason then begins with
 "shield:", so the record shows each intervention and `interventions` counts them. Nearest means: fewest fields changed,
-then the smallest change. A step of representation counts as a quarter, a number as a share of its bounds. A line
-`within T s: …` is kept at once.
+then the smallest change. A step of representation counts as a quarter, a number as a share of its bounds. A condition
+on the directive itself is made false only where nothing else helps. A line `within T s: …` is kept at once.
 
 In flight the shield acts twice: here, on the policy's output, and at the gate, on what the staleness rules and damping
 left of it (`policies.verification.enforced`). There a limit keeps it from giving a link more than its age allows.
@@ -17,13 +17,15 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, FleetView, Policy, Representation, check_directives
-from sortie.policies.verification.compiled import Context, Part, Rule, compiled
+from sortie.policies.verification.compiled import Context, Rule, compiled
 from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, Recent, just_heard
-from sortie.policies.verification.nearest import LEAST_RATE_HZ, distance, least_distance, nearest
+from sortie.policies.verification.nearest import Box, Far, distance, nearest
 from sortie.policies.verification.words import CHANGES
 from sortie.scenarios.representation import NAME_OF
 
 MARK = "shield: "
+Cap = Callable[[Directive], Directive]
+"""A directive as far as something allows it, such as the age of its peer's descriptor."""
 _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
 
 
@@ -87,16 +89,12 @@ def interventions(directives: Iterable[Directive]) -> int:
     return sum(d.reason.startswith(MARK) for d in directives)
 
 
-def _anything(_: Directive) -> bool:
-    return True
-
-
 def enforce(
     rules: Sequence[Invariant],
     view: FleetView,
     decided: Sequence[Directive],
     fresh: Sequence[Directive] = (),
-    allowed: Callable[[Directive], bool] = _anything,
+    cap: Cap | None = None,
 ) -> list[Directive]:
     """The directives; those that break a rule are replaced by the nearest ones that keep all rules.
 
@@ -105,104 +103,111 @@ def enforce(
         view: the policy's input.
         decided: its output.
         fresh: its output at age 0, if a rule needs it.
-        allowed: which directives may replace others.
+        cap: gives a directive as far as it is allowed; None allows all.
     """
     me, directives = view.me, list(decided)
-    if me is None or not rules:
+    if me is None or not rules or not directives:
         return directives
     context = Context(view, me, directives, {d.destination: d for d in fresh})
     lines = [compiled(rule) for rule in rules]
-    of_link = _in_force([line for line in lines if line.invariant.of_link], context)
-    # Links with equal directives under the same lines get the same correction, unless a line names the peer.
-    shared = _is_shared(of_link)
-    solved: dict[Any, tuple[Directive | None, list[Invariant]]] = {}
+    boxes = _Boxes([line for line in lines if line.of_link], context, directives[0], cap)
+    solved: dict[Any, Directive | None] = {}
     for k, directive in enumerate(directives):
-        if all(r.holds(context, directive) for r in of_link):
+        box = boxes.of(directive)
+        broken = box.broken(context, directive)
+        if not broken:
             continue
-        applies = [r for r in of_link if r.when is None or r.when(context, directive)]
-        key = _key(directive, applies, allowed) if shared else None
+        within = boxes.capped(directive, box)
+        key = _key(directive, within)
         if key is None or key not in solved:
-            parts = [part for r in applies for part in r.parts]
-            lost = [r.invariant for r in applies if not r.holds(context, directive)]
-            found = nearest(directive, parts, of_link, context, allowed), lost
+            after = nearest(directive, within, (), context, boxes.allowed)
             if key is not None:
-                solved[key] = found
+                solved[key] = after
         else:
-            found = solved[key]
-        after, lost = found
-        if after is None:
-            directives[k] = _not_replaced(directive, lost)
-        else:
-            directives[k] = _replaced(directive, after._replace(destination=directive.destination), lost)
+            after = solved[key]
+        lost = [box.rules[i].invariant for i in sorted(set(broken))]
+        directives[k] = _not_replaced(directive, lost) if after is None else _replaced(directive, after, lost)
     for line in lines:
-        if not line.invariant.of_link and directives and not line.holds(context, directives[0]):
-            _replace_one_link(context, directives, line, of_link, allowed)
+        if not line.of_link and not line.holds(context, directives[0]):
+            _replace_one_link(context, directives, line, boxes)
     return directives
 
 
-def _is_shared(lines: Sequence[Rule], more: Sequence[Part] = ()) -> bool:
-    """Whether links with equal directives, to which the same lines apply, get the same correction."""
-    parts = [*more, *(part for rule in lines for part in rule.parts if rule.invariant.of_link)]
-    return not any(rule.when_mixed for rule in lines) and not any(part.of_peer for part in parts)
-
-
-def _key(directive: Directive, applies: Sequence[Rule], allowed: Callable[[Directive], bool]) -> Any:
-    """What two directives have in common if a shield corrects them alike; None if a number is not a plain one.
-
-    What a link is allowed depends on the age of its peer: it is asked for the highest directive and for the lowest rung.
-    """
-    _, _, rung, rho, roi, rate_hz, deadline_s, weight, duty, _ = directive
-    numbers = (rung, rho, rate_hz, deadline_s, weight, duty)
-    if not all(type(x) in _PLAIN for x in numbers):
+def _key(directive: Directive, box: Box) -> Any:
+    """What two directives have in common that are corrected alike; None if nothing can be said."""
+    if not box.shared:
         return None
-    if allowed is _anything:
-        return (*numbers, id(roi), *map(id, applies))
-    caps = [allowed(directive._replace(representation=r, rate_hz=hz, rho=0.0)) for r, hz in _PROBES]
-    return (*numbers, id(roi), *map(id, applies), *caps)
+    _, _, rung, rho, roi, rate_hz, deadline_s, weight, duty, _ = directive
+    for x in (rung, rho, rate_hz, deadline_s, weight, duty):
+        if type(x) not in _PLAIN:
+            return None
+    return id(box), rung, rho, id(roi), rate_hz, deadline_s, weight, duty
 
 
-_PROBES = (
-    (Representation.RAW, DIRECTIVE_BOUNDS["rate_hz"].high),
-    (Representation.DETECTIONS, LEAST_RATE_HZ),
-    (Representation.NONE, 0.0),
-)
 _PLAIN = (float, int, Representation)
 
 
-def _in_force(lines: Sequence[Rule], context: Context) -> list[Rule]:
-    """The lines about links, without those that do not apply to any link now."""
-    some = Directive(context.view.ego, context.view.ego)
-    return [r for r in lines if r.when is None or r.when_of_link or r.when(context, some)]
+class _Boxes:
+    """What the lines about links allow each link. Links to which the same lines apply share a box."""
+
+    def __init__(self, lines: Sequence[Rule], context: Context, some: Directive, cap: Cap | None) -> None:
+        self._lines = [r for r in lines if r.when is None or r.when_of_peer or r.when(context, some)]
+        self._asked = [r.when for r in self._lines if r.when is not None and r.when_of_peer]
+        self._context, self._some, self._cap = context, some, cap
+        self._boxes: dict[Any, Box] = {}
+
+    def of(self, link: Directive) -> Box:
+        """The box of a link."""
+        context = self._context
+        return self._box(tuple([bool(when(context, link)) for when in self._asked]), None)
+
+    def capped(self, link: Directive, box: Box) -> Box:
+        """The link's box within what it is allowed at most."""
+        if self._cap is None:
+            return box
+        most = self._cap(_FULLEST._replace(source=link.source, destination=link.destination))
+        return self._box(box.applies, (most.representation, most.rate_hz))
+
+    def _box(self, applies: tuple[bool, ...], most: tuple[Representation, float] | None) -> Box:
+        key = applies, most
+        if key not in self._boxes:
+            answers = iter(applies)
+            rules = [r for r in self._lines if not (r.when is not None and r.when_of_peer) or next(answers)]
+            bounds = None if most is None else {"representation": float(most[0]), "rate_hz": most[1]}
+            self._boxes[key] = Box(rules, applies, self._context, self._some, bounds)
+        return self._boxes[key]
+
+    def allowed(self, directive: Directive) -> bool:
+        """Whether a directive may replace another one."""
+        return self._cap is None or self._cap(directive) == directive
 
 
-def _replace_one_link(
-    context: Context,
-    directives: list[Directive],
-    rule: Rule,
-    of_link: Sequence[Rule],
-    allowed: Callable[[Directive], bool],
-) -> None:
+_FULLEST = Directive(-1, -1, Representation.RAW, rho=1.0, rate_hz=DIRECTIVE_BOUNDS["rate_hz"].high)
+
+
+def _replace_one_link(context: Context, directives: list[Directive], rule: Rule, boxes: _Boxes) -> None:
     """Change one link, by the smallest change of any, so that a rule about all links holds.
 
     Args:
         context: has these same directives.
+        rule: the rule, which is broken.
+        boxes: what the rules about links allow.
     """
-    best: tuple[tuple[int, float], int, Directive] | None = None
-    shared = bool(rule.any_link) and _is_shared([*of_link, rule], rule.any_link)
-    seen = set()
-    for k, before in enumerate(list(directives)):
-        applies = [r for r in of_link if r.when is None or r.when(context, before)]
-        key = _key(before, applies, allowed) if shared else None
-        if key is not None:
-            if key in seen or (best is not None and least_distance(before, rule.any_link, context) >= best[0]):
-                continue
-            seen.add(key)
-        after = _one_link(context, directives, k, rule, applies, of_link, allowed)
+    best: tuple[Far, int, Directive] | None = None
+    alike, seen = not any(part.of_peer for part in rule.parts), set()
+    for k, before in enumerate(directives):
+        box = boxes.capped(before, boxes.of(before))
+        key = _key(before, box) if alike else None
+        if key is not None and key in seen:
+            continue  # another link would change by as much
+        seen.add(key)
+        nearer = None if best is None else best[0]
+        after = nearest(before, box, rule.parts, context, boxes.allowed, nearer)
         if after is None:
             continue
         changed, far = distance(before, after)
         if (
-            best is None or (changed, round(far, 2)) < best[0]
+            nearer is None or (changed, round(far, 2)) < nearer
         ):  # a hundredth of the bounds is no reason for another link
             best = (changed, round(far, 2)), k, after
     if best is None:
@@ -212,34 +217,10 @@ def _replace_one_link(
         directives[k] = _replaced(directives[k], after, [rule.invariant])
 
 
-def _one_link(
-    context: Context,
-    directives: list[Directive],
-    k: int,
-    rule: Rule,
-    applies: Sequence[Rule],
-    of_link: Sequence[Rule],
-    allowed: Callable[[Directive], bool],
-) -> Directive | None:
-    """The nearest directive for one link with which a rule about all links holds, and the rules about links too."""
-    before = directives[k]
-    parts = [part for r in applies for part in r.parts]
-    if rule.any_link:
-        return nearest(before, [*parts, *rule.any_link], of_link, context, allowed)
-
-    def holds(after: Directive) -> bool:
-        directives[k] = after
-        kept = rule.holds(context, after)
-        directives[k] = before
-        return kept and allowed(after)
-
-    return nearest(before, [*parts, *rule.parts], of_link, context, holds, only_all=rule)
-
-
 def _replaced(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
     because = "; ".join([rule.text for rule in broken])
-    was = f"{NAME_OF[Representation(before.representation)]} at {before.rate_hz:g} Hz"
-    return after._replace(reason=f"{MARK}{because} (decided {was}: {before.reason})")
+    was = f"{NAME_OF[before.representation]} at {before.rate_hz:g} Hz"
+    return after._replace(destination=before.destination, reason=f"{MARK}{because} (decided {was}: {before.reason})")
 
 
 def _not_replaced(before: Directive, broken: Sequence[Invariant]) -> Directive:

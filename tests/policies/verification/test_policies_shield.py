@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from random import Random
 
 import pytest
 from policies_examples import fleet_of, planted
@@ -12,8 +14,9 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Policy, Representation, TaskPhase
 from sortie.policies.verification.conformance import conform, failing
 from sortie.policies.verification.invariants import InvariantError, just_heard, parse, violations
+from sortie.policies.verification.nearest import distance
 from sortie.policies.verification.proof import prove
-from sortie.policies.verification.shield import MARK, interventions, shield
+from sortie.policies.verification.shield import MARK, enforce, interventions, shield
 from sortie.policies.verification.views import draw_views
 
 HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"
@@ -142,3 +145,66 @@ def test_no_shield_reaches_further_than_the_ladder() -> None:
     for view in draw_views(6, 60):
         for d in shield(always, parse("representation >= raw and rate_hz >= 30 and rho >= 1"))(view):
             assert (d.representation, d.rate_hz, d.rho) == (Representation.RAW, 30.0, 1.0)
+
+
+FIELDS = {
+    "representation": [0.0, 1.0, 2.0, 3.0, 4.0],
+    "rho": [0.0, 0.1, 0.4, 1.0],
+    "rate_hz": [0.0, 2.0, 8.0, 30.0],
+    "fusion_weight": [0.0, 0.2, 0.5, 1.0],
+}
+
+
+def a_bound(draw: Random) -> str:
+    word = draw.choice(list(FIELDS))
+    return f"{word} {draw.choice(['<=', '>=', '<=', '>=', '=='])} {draw.choice(FIELDS[word]):g}"
+
+
+def some_lines(draw: Random) -> str:
+    """Lines that bound fields one by one, by alternatives, and by sums of two."""
+    kinds = (
+        lambda: a_bound(draw),
+        lambda: f"{a_bound(draw)} or {a_bound(draw)}",
+        lambda: f"{a_bound(draw)} or ({a_bound(draw)} and {a_bound(draw)})",
+        lambda: f"not ({a_bound(draw)} and {a_bound(draw)})",
+    )
+    return "\n".join(draw.choice(kinds)() for _ in range(draw.randint(1, 4)))
+
+
+def on_the_grid(before: Directive) -> list[Directive]:
+    """Every directive with values that the lines name."""
+    return [
+        before._replace(representation=Representation(int(r)), rho=c, rate_hz=hz, fusion_weight=w)
+        for r, c, hz, w in itertools.product(*FIELDS.values())
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_directive_that_keeps_the_lines_is_nearer(seed: int) -> None:
+    """Compared with every combination of the values that the lines name."""
+    draw = Random(seed)
+    text, view = some_lines(draw), fleet_of(2)
+    before = draw.choice(on_the_grid(Directive(view.ego, view.peers[0])))
+    (after,) = enforce(parse(text), view, [before])
+    keep = [d for d in on_the_grid(before) if not any(violations(r, view, [d]) for r in parse(text))]
+    assert after.reason.startswith(f"{MARK}cannot keep") == (not keep), text
+    if keep:
+        assert not any(violations(r, view, [after]) for r in parse(text)), text
+        # A lower rung takes the cells with it, and a raised link gets a rate: these changes are not the lines'.
+        follows = after._replace(rho=before.rho if after.rho == 0 else after.rho)
+        follows = follows._replace(rate_hz=before.rate_hz if before.rate_hz == 0 else follows.rate_hz)
+        assert min(distance(before, follows), distance(before, after)) <= min(distance(before, d) for d in keep), text
+
+
+def test_lowering_a_link_does_not_make_it_send() -> None:
+    (quiet,) = enforce(parse("representation <= tracks"), fleet_of(2), [Directive(0, 1, Representation.RAW)])
+    assert (quiet.representation, quiet.rate_hz) == (Representation.TRACKS, 0.0)
+
+
+def test_a_condition_on_the_directive_is_made_false_only_where_nothing_else_helps() -> None:
+    view = fleet_of(2)
+    sends = Directive(0, 1, Representation.TRACKS, rate_hz=9.0)
+    (slower,) = enforce(parse("when representation > none: rate_hz <= 2"), view, [sends])
+    assert (slower.representation, slower.rate_hz) == (Representation.TRACKS, 2.0)
+    (silent,) = enforce(parse("when representation > none: rate_hz <= 2\nrate_hz >= 5"), view, [sends])
+    assert (silent.representation, silent.rate_hz) == (Representation.NONE, 9.0)
