@@ -124,20 +124,6 @@ def read_any(path_or_name: str | Path, overrides: Overrides = ()) -> Scenario | 
     return load(path_or_name, overrides)
 
 
-def vary_scenario(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """A scenario's plain sections with dotted fields changed; not validated.
-
-    Raises:
-        ScenarioError: a path that leads through a plain value or to an entry that is not there.
-    """
-    node = as_node(base)
-    for name, value in values.items():
-        node = assign(node, name.split("."), as_node(value))
-    made = plain(node)
-    assert isinstance(made, dict)  # noqa: S101
-    return made
-
-
 def _relined(node: Node) -> Node:
     return as_node(plain(node), node.source, node.line)
 

@@ -6,6 +6,7 @@ import copy
 import functools
 import json
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from pydantic import BaseModel
 
 from sortie.scenarios.plugins.reference import is_file
 from sortie.scenarios.reading.explain import sections_of
+from sortie.scenarios.reading.strict_yaml import read_scalar
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import ModelName
 from sortie.scenarios.traces import located
@@ -34,6 +36,41 @@ MODELS = {
 }
 """The kind of model that a field names. Makes name policies, power models and cells too, groups of drones mobility models,
 changes of policy policies, events of kind `own` events, and `metrics` metrics."""
+
+
+_CALLED = re.compile(r"([^()]*[^()\s])\s*\(((?:\s*[^\W\d]\w*\s*=[^=(),]+,?)*)\s*\)")
+"""A model's name, and `key=value, …` in brackets."""
+_CALLABLE = frozenset(field.rpartition(".")[2] for field in MODELS) - {"name", "recorded_fusion"} | {"model"}
+
+
+def params_of(field: str) -> str:
+    """The field that has the parameters of the model that a field names.
+
+    Example:
+        >>> [params_of(field) for field in ("link", "power_model", "model")]
+        ['link_params', 'power_params', 'params']
+    """
+    return "params" if field in ("name", "model") else f"{field.removesuffix('_model')}_params"
+
+
+def without_brackets(sections: Any) -> Any:
+    """Plain sections, valid or not, in which models are named without brackets; their parameters stand where they belong.
+
+    Example:
+        >>> without_brackets({"radio": {"link": "own.py:Name(loss_db=3)", "link_params": {"clear_s": 1}}})
+        {'radio': {'link': 'own.py:Name', 'link_params': {'loss_db': 3}}}
+    """
+    if isinstance(sections, list):
+        return [without_brackets(each) for each in sections]
+    if not isinstance(sections, dict):
+        return sections
+    plain = {k: v if str(k).endswith("params") else without_brackets(v) for k, v in sections.items()}
+    for name in _CALLABLE & plain.keys():
+        called = _CALLED.fullmatch(plain[name]) if isinstance(plain[name], str) else None
+        if called is not None:
+            pairs = (part.partition("=") for part in called[2].split(",") if part.strip())
+            plain |= {name: called[1], params_of(name): {k.strip(): read_scalar(v.strip())[0] for k, _, v in pairs}}
+    return plain
 
 
 def builtin(field: str) -> tuple[str, ...]:
@@ -105,8 +142,7 @@ def named_models(sections: dict[str, Any]) -> list[tuple[str, str]]:
 def models_with_params(sections: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Every model that a scenario's plain sections name: its kind, its name and its parameters."""
     for kind, holder, key in _models(sections):
-        of = "params" if key in ("name", "model") else f"{key.removesuffix('_model')}_params"
-        yield kind, holder[key], holder.get(of) or {}
+        yield kind, holder[key], holder.get(params_of(key)) or {}
 
 
 def _places(sections: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
@@ -147,6 +183,7 @@ def _given(sections: dict[str, Any], fields: Iterable[str]) -> Iterator[tuple[di
 
 
 def _split(text: str) -> tuple[str, str]:
-    """`file.py:function` as the file, and the rest with its colon; anything else is a file alone."""
-    file, colon, function = text.rpartition(":")
-    return (file, colon + function) if colon and function.isidentifier() else (text, "")
+    """`file.py:function` or `file.py:function(key=value)` as the file, and the rest with its colon; else a file alone."""
+    name, bracket, given = text.partition("(")
+    file, colon, function = name.rpartition(":")
+    return (file, colon + function + bracket + given) if colon and function.isidentifier() else (text, "")

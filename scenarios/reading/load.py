@@ -15,7 +15,7 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 
 from sortie.scenarios.reading.explain import explain
-from sortie.scenarios.reading.files import found_beside
+from sortie.scenarios.reading.files import found_beside, without_brackets
 from sortie.scenarios.reading.nodes import (
     Issue,
     Node,
@@ -172,7 +172,7 @@ def validated(root: Node, model: type[Model]) -> Model:
     found = {issue.path: issue for issue in problems(root)}
     try:
         # through JSON, where strict still lets a list be a tuple and a whole number a float
-        made = model.model_validate_json(json.dumps(plain(root)), strict=True)
+        made = model.model_validate_json(json.dumps(without_brackets(plain(root))), strict=True)
     except ValidationError as error:
         for issue in explain(error, root, model):
             above = (found.get(issue.path[:n]) for n in range(len(issue.path) + 1))

@@ -21,7 +21,15 @@ from sortie.policies.contract import PolicyError
 from sortie.policies.registry import resolve
 from sortie.scenarios.plugins.user_code import imported_files
 from sortie.scenarios.reading.campaign import Study, extremes
-from sortie.scenarios.reading.files import assigned, found_beside, named_files, placed, value_at, with_files
+from sortie.scenarios.reading.files import (
+    assigned,
+    found_beside,
+    named_files,
+    placed,
+    value_at,
+    with_files,
+    without_brackets,
+)
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.reading.nodes import ScenarioError, as_node, assign, plain
 from sortie.scenarios.schema import Perception
@@ -151,7 +159,7 @@ class CampaignPlan:
         node, varied = self._base, self.varied(at.cell)
         for name, value in varied.items():
             node = assign(node, name.split("."), as_node(value))
-        scenario = plain(node)
+        scenario = without_brackets(plain(node))
         assert isinstance(scenario, dict)  # noqa: S101
         seed, policy = self.seed(at.cell), self.spec["policies"][at.policy][1]
         params = {name.removeprefix(PARAMS): value for name, value in varied.items() if name.startswith(PARAMS)}

@@ -7,8 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from sortie.scenarios.reading.files import assigned, found_beside, named_files, placed, value_at, with_files
-from sortie.scenarios.reading.load import load, loads
+from sortie.scenarios.reading.files import (
+    assigned,
+    found_beside,
+    named_files,
+    placed,
+    value_at,
+    with_files,
+    without_brackets,
+)
+from sortie.scenarios.reading.load import ScenarioError, build, load, loads
 from sortie.scenarios.traces import SHIPPED, located
 
 TEXT = """
@@ -113,3 +121,24 @@ def test_a_field_alone_names_its_files_and_a_preset_names_none() -> None:
         sections = assigned(field, value)
         assert named_files(sections) == files
         assert value_at(field, sections) == value
+
+
+def test_parameters_in_brackets_stand_where_they_belong() -> None:
+    """In YAML and as an override, where they replace those of the file."""
+    text = "name: a\nradio: {link: 'own.py:L(loss_db=3, name=far, on=true)'}\nfleet: {groups: [{drones: [1], mobility: random_waypoint(pause_s=2.5)}]}\n"
+    scenario = loads(text)
+    assert (scenario.radio.link, scenario.radio.link_params) == ("own.py:L", {"loss_db": 3, "name": "far", "on": True})
+    assert scenario.fleet.groups[0].mobility_params == {"pause_s": 2.5}
+    again = loads(text, overrides=["radio.link=other.py:M(x=-1e-3)", "fleet.airframe.power_model=own.py:P()"])
+    assert (again.radio.link, again.radio.link_params) == ("other.py:M", {"x": -0.001})
+    assert (again.fleet.airframe.power_model, again.fleet.airframe.power_params) == ("own.py:P", {})
+    built = build({"name": "a", "metrics": {"m": {"model": "own.py:f(a=1)"}}})
+    assert built.metrics["m"].params == {"a": 1}
+    assert named_files({"radio": {"link": "own.py:L(loss_db=3)"}}) == ["own.py"]
+
+
+@pytest.mark.parametrize("name", ["own.py:L(3)", "own.py:L(a=1", "own.py:L(a=(1))", "own.py:L(a=)", "(a=1)"])
+def test_brackets_that_are_none_are_refused(name: str) -> None:
+    assert without_brackets({"radio": {"link": name}}) == {"radio": {"link": name}}
+    with pytest.raises(ScenarioError, match=r"^--set radio.link=.*, must be path/to/file.py:Name$"):
+        loads("name: a", overrides=[f"radio.link={name}"])

@@ -358,7 +358,7 @@ def test_every_varied_model_is_in_the_key_wherever_it_is_named(tmp_path: Path) -
     for name in ("loss", "watts", "rain", "hail", "snow", "mine"):
         (tmp_path / f"{name}.py").write_text("def model(*_):\n    pass\n")
     base = BASE + "events: [{kind: own, at_s: 0, model: 'rain.py:model'}]\nmetrics: {m: {model: 'mine.py:model'}}\n"
-    vary = """radio.path_loss: {kind: grid, values: [two_ray, 'loss.py:model']}
+    vary = """radio.path_loss: {kind: grid, values: [two_ray, 'loss.py:model(db=3)']}
   fleet.airframe.power_model: {kind: grid, values: [level, 'watts.py:model']}
   events.0.model: {kind: choice, values: ['rain.py:model', 'hail.py:model']}
   metrics: {kind: grid, values: [{m: {model: 'snow.py:model'}}]}"""
@@ -368,6 +368,8 @@ def test_every_varied_model_is_in_the_key_wherever_it_is_named(tmp_path: Path) -
     assert set(before.spec["files"]) == files
     flown = [json.loads(before.task(run))["scenario"] for run in range(before.runs)]
     assert {s["radio"]["path_loss"] for s in flown} == {"two_ray", f"{tmp_path / 'loss.py'}:model"}
+    params = (s["radio"].get("path_loss_params") for s in flown if s["radio"]["path_loss"] != "two_ray")
+    assert next(params) == {"db": 3}
     assert {s["fleet"]["airframe"]["power_model"] for s in flown} == {"level", f"{tmp_path / 'watts.py'}:model"}
     assert {s["events"][0]["model"] for s in flown} == {f"{tmp_path / f}.py:model" for f in ("rain", "hail")}
     assert {s["metrics"]["m"]["model"] for s in flown} == {f"{tmp_path / 'snow.py'}:model"}
