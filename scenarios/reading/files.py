@@ -106,6 +106,9 @@ def found_beside(scenario: Scenario, folder: Path) -> Scenario:
     """The scenario with files that are not where they are named, but lie so beside `folder`, named there."""
     sections = scenario.model_dump(mode="json", exclude_none=True)
     changed = with_files(sections, lambda name: placed(name, folder))
+    for _, holder, key in _models(changed):
+        params = holder.get(params_of(key)) or {}
+        params |= {k: placed(v, folder) for k, v in params.items() if isinstance(v, str) and Path(v).suffix}
     return scenario if changed == sections else Scenario.model_validate_json(json.dumps(changed), strict=True)
 
 
@@ -153,6 +156,13 @@ def _places(sections: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
     for _, holder, key in _models(sections):
         if is_file(holder[key]):
             yield holder, key
+            params = holder.get(params_of(key)) or {}
+            yield from ((params, k) for k, v in params.items() if _names_a_file(v))
+
+
+def _names_a_file(value: object) -> bool:
+    """Whether a parameter of a model is the name of a file, such as a table that the model reads."""
+    return isinstance(value, str) and Path(value).suffix != "" and os.path.isfile(value)
 
 
 def _models(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:

@@ -128,7 +128,8 @@ def _by_policy(rows: CampaignRows) -> Iterator[str]:
 
 def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:
     valued = with_values(rows)
-    metrics = winner_metrics(valued) or valued[:1]
+    own = [metric for metric in valued if metric.startswith("metrics.")]
+    metrics = list(dict.fromkeys([*winner_metrics(valued), *own])) or valued[:1]
     if not rows.plan.campaign.vary or not metrics:
         return
     yield "\n## By varied field\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -101,8 +102,9 @@ class CampaignRows:
         distinct = list(dict.fromkeys(column.tolist()))
         if len(distinct) <= 2 * BINS:
             distinct.sort(key=lambda v: (isinstance(v, str), v))
+            names = short_names([v for v in distinct if isinstance(v, str)])
             return [
-                (v if isinstance(v, str) else f"{v:.10g}", i if isinstance(v, str) else v, column == v)
+                (names[v] if isinstance(v, str) else f"{v:.10g}", i if isinstance(v, str) else v, column == v)
                 for i, v in enumerate(distinct)
             ]
         if isinstance(distinct[0], str):
@@ -178,6 +180,17 @@ def find_row(folder: Path, run: int) -> tuple[CampaignPlan, dict[str, Any] | Non
         if not 0 <= run < store.plan.runs:
             raise RunError(f"--run {run}: {folder} has runs 0 … {store.plan.runs - 1}")
         return store.plan, store.row(run)
+
+
+def short_names(values: Sequence[str]) -> dict[str, str]:
+    """Models in files by their file's name alone, where that leaves all values distinct.
+
+    Example:
+        >>> short_names(["free_space", "/home/me/rain.py:Rain(mmph=3)"])
+        {'free_space': 'free_space', '/home/me/rain.py:Rain(mmph=3)': 'rain.py:Rain(mmph=3)'}
+    """
+    short = {value: re.sub(r"^.*/(?=[^/]*\.py:)", "", value) for value in values}
+    return short if len(set(short.values())) == len(short) else {value: value for value in values}
 
 
 def winner_metrics(metrics: Sequence[str]) -> list[str]:

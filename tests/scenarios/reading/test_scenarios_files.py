@@ -142,3 +142,17 @@ def test_brackets_that_are_none_are_refused(name: str) -> None:
     assert without_brackets({"radio": {"link": name}}) == {"radio": {"link": name}}
     with pytest.raises(ScenarioError, match=r"^--set radio.link=.*, must be path/to/file.py:Name$"):
         loads("name: a", overrides=[f"radio.link={name}"])
+
+
+def test_a_parameter_that_names_a_file_is_found_beside_the_scenario(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "heights.csv").write_text("1\n")
+    (tmp_path / "own.py").write_text("")
+    (tmp_path / "s.yaml").write_text("name: s\nfleet: {sensor: 'own.py:f(heights=heights.csv, kind=wide.v2)'}\n")
+    fleet = load(tmp_path / "s.yaml").fleet
+    assert fleet.sensor_params == {"heights": str(tmp_path / "heights.csv"), "kind": "wide.v2"}
+    monkeypatch.chdir(tmp_path)
+    sections = load("s.yaml").model_dump(mode="json", exclude_none=True)
+    assert sections["fleet"]["sensor_params"] == {"heights": "heights.csv", "kind": "wide.v2"}
+    assert named_files(sections) == ["own.py", "heights.csv"]

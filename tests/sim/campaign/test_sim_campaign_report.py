@@ -10,14 +10,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import CAMPAIGN, Pretended, plan, rows_of
+from campaign_examples import BASE, CAMPAIGN, Pretended, plan, rows_of
 
 from sortie.scenarios.intervals import SHARE, mean_interval
 from sortie.scenarios.report_text import prefixed
 from sortie.scenarios.schema.campaign import SampledField
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.figures import on_front
-from sortie.sim.campaign.rows import CampaignRows, find_row, read_rows, sign, winner_metrics
+from sortie.sim.campaign.rows import CampaignRows, find_row, read_rows, short_names, sign, winner_metrics
 from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sortie.sim.campaign.spread import design
 from sortie.sim.campaign.winners import other_winners, rule, winner
@@ -297,3 +297,24 @@ def test_a_folder_without_finished_parts_has_no_report(tmp_path: Path) -> None:
         run_campaign(plan(tmp_path), tmp_path / "a", Pretended(stop_after=3))
     with pytest.raises(RunError, match="a: no part is finished yet, go on with the campaign"):
         read_rows(tmp_path / "a")
+
+
+def test_a_metric_of_ones_own_has_a_table_by_varied_field_and_models_have_short_names(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from sortie.sim.campaign.report import write_report
+
+    for name in ("own", "rain"):
+        (tmp_path / f"{name}.py").write_text("def model(record):\n    return 1.0\n")
+    vary = "radio.path_loss: {kind: grid, values: [two_ray, 'rain.py:model(db=3)']}"
+    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", vary)
+    text = text.replace("energy_j.total]", "metrics.own]")
+    run_campaign(plan(tmp_path, text, BASE + "metrics: {own: {model: own.py:model}}\n"), tmp_path / "a", Pretended())
+    told = write_report(tmp_path / "a").read_text().partition("## By varied field")[2]
+    assert "| metrics.own | part |" in told
+    assert "| radio.path_loss | rain.py:model(db=3) |" in told
+
+
+def test_names_that_would_be_alike_stay_long() -> None:
+    alike = ["/a/rain.py:Rain", "/b/rain.py:Rain"]
+    assert short_names(alike) == {name: name for name in alike}
+    assert short_names([*alike[:1], "level"]) == {"/a/rain.py:Rain": "rain.py:Rain", "level": "level"}
