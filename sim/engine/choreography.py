@@ -54,8 +54,9 @@ class Choreography:
         if viewpoint is None:
             self._requests[drone] = (0.0, 0.0, "back to its slot")
             return
-        motion, at = self._world.motion, (self._frame, drone)
-        error_x_m, error_y_m, _ = (motion.est_position_m[at] - motion.position_m[at]).tolist()
+        believed_m = self._world.sensed(drone, self._frame).capture.est_position_m  # faults of its sensors included
+        true_m = self._world.motion.position_m[self._frame, drone]
+        error_x_m, error_y_m, _ = (np.array(believed_m) - true_m).tolist()
         shift = self._course.wanted_shift_m(drone, self._frame, viewpoint.x_m - error_x_m, viewpoint.y_m - error_y_m)
         self._requests[drone] = (*shift, viewpoint.reason)
 

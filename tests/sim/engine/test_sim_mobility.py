@@ -75,6 +75,29 @@ def test_a_place_is_reached_in_spite_of_what_the_drone_believes() -> None:
     np.testing.assert_allclose(wrong, (-35, 0), atol=0.1)
 
 
+@pytest.mark.parametrize(
+    ("offset_m", "stops_m"), [([5, 0, 0], (-45, 0, 70)), ([0, -3, 0], (-40, 3, 70)), ([0, 0, 6], (-40, 0, 64))]
+)
+def test_a_place_is_where_the_drone_believes_it_along_every_axis(
+    offset_m: list[float], stops_m: tuple[float, ...]
+) -> None:
+    fault = f"events=[{{kind: position_fault, at_s: 0, drone: 0, offset_m: {offset_m}}}]"
+    record = flown(GOES, params(x_m=-40, z_m=70), "fleet.drones=1", fault, "duration_s=13")
+    np.testing.assert_allclose(states(record, "x_m", "y_m", "z_m")[-1, 0], stops_m, atol=0.1)
+
+
+@pytest.mark.parametrize("comes", [True, False])
+def test_a_place_is_kept_free_for_a_drone_that_will_come_and_for_no_other(comes: bool) -> None:
+    """Drone 1 waits on the ground in its slot, or was lost there; drone 0 is sent to that slot."""
+    what = "{kind: drone_joins, at_s: 11, drone: 1}" if comes else "{kind: drone_lost, at_s: 0, drone: 1}"
+    settings = ("fleet.drones=2", "fleet.formation.shape=line", f"events=[{what}]", "fleet.steering.separation_m=6")
+    slot = states(flown(GOES, params(only=0, do="Hold"), *settings), "x_m", "y_m", "z_m")[0, 1]
+    x_m, y_m, z_m = slot.tolist()
+    place = states(flown(GOES, params(only=0, x_m=x_m, y_m=y_m, z_m=z_m), *settings), "x_m", "y_m", "z_m")[:, 0]
+    nearest_m = np.linalg.norm(place - slot, axis=-1).min()
+    assert nearest_m >= 6.0 if comes else nearest_m < 0.5
+
+
 def test_what_is_not_safe_is_refused_and_said_once() -> None:
     """All five are sent to one place: none comes nearer to another than the separation, and who comes late stays out."""
     record = flown(GOES, params(x_m=0, y_m=0, z_m=60), "fleet.steering.separation_m=8", "duration_s=8")

@@ -139,6 +139,19 @@ def test_drones_return_to_their_slots_when_the_policy_changes() -> None:
     assert aside[-1].max() < 1e-9
 
 
+@pytest.mark.parametrize("offset_m", [[0, 0, 0], [9, -4, 0]])
+def test_a_request_for_where_a_drone_is_moves_it_nowhere_whatever_it_believes(offset_m: list[float]) -> None:
+    """A drone that believes to be elsewhere asks for elsewhere. It is meant to stay, and not to run after its own error."""
+
+    def here(view: FleetView) -> Reposition | None:
+        return None if view.me is None else Reposition(*view.me.position_m[:2])
+
+    fault = f"events=[{{kind: position_fault, at_s: 1, drone: 2, offset_m: {offset_m}, drift_mps: [0, 0.5, 0]}}]"
+    settings = ("duration_s=5", "fleet.motion.pose_error_m=0.5", fault)
+    stays, asks = (flown_m(run_sortie(example(*settings), p)) for p in (share, looks_from(here)(lambda v: share(v))))
+    assert np.abs(asks - stays).max() < 0.6  # the jitter about its slot is not flown away either
+
+
 def test_nobody_keeps_clear_of_drones_that_left_the_air() -> None:
     lost = "events=[{kind: drone_lost, at_s: 0, drone: 0}, {kind: drone_lost, at_s: 0, drone: 1}]"
     bounds = ("fleet.viewpoints.separation_m=19", "fleet.viewpoints.reach_m=50")
