@@ -86,6 +86,7 @@ def test_it_is_the_wheel_that_is_imported_and_its_code_is_this_code(project: Pat
     assert told.split()[-1] == code_version()
 
 
+@pytest.mark.slow
 def test_the_projects_own_tests_run_and_so_do_its_scenarios(project: Path) -> None:
     assert "2 passed" in run(project, "-m", "pytest", "-p", "no:cacheprovider")
 

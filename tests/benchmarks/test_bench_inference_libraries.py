@@ -178,6 +178,7 @@ def threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # torch's compiler warns of its own calls
 @pytest.mark.parametrize("way", WAYS)
 def test_five_forward_passes(benchmark: Any, tmp_path: Path, way: str) -> None:

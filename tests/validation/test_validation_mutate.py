@@ -68,6 +68,7 @@ def test_a_sample_is_drawn_of_changes_with_a_meaning() -> None:
     assert some != list(mutate.drawn({"a.py": PLAIN}, 4, "2"))
 
 
+@pytest.mark.slow
 def test_what_a_test_holds_is_noticed_and_what_none_holds_survives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

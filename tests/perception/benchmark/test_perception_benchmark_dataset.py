@@ -47,6 +47,7 @@ def files(folder: Path) -> list[Path]:
     return sorted((folder / "tau").glob("scene_*.npz"))
 
 
+@pytest.mark.slow
 def test_frames_are_what_was_drawn(made: Path) -> None:
     frames = load_frames(files(made))
     assert frames.images.shape == (2, 5, 4, 256, 256)

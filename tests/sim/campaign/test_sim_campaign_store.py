@@ -202,6 +202,7 @@ def test_failed_runs_that_fail_again_stay_failed(tmp_path: Path) -> None:
     assert unasked.flown == []
 
 
+@pytest.mark.slow
 def test_a_driver_that_is_killed_at_any_statement_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -288,6 +289,7 @@ def test_two_drivers_do_not_share_a_folder(tmp_path: Path) -> None:
     CampaignStore(tmp_path / "a", p).close()
 
 
+@pytest.mark.slow
 def test_it_stops_when_enough_is_known_whoever_finished_first(tmp_path: Path) -> None:
     text = CAMPAIGN.replace("{count: 6}", "{count: 300}").replace(
         "seed: 5", "stop_when: {metric: bytes.data_sent, half_width: 0.05}\nseed: 5"
