@@ -9,6 +9,7 @@ from policies_examples import fleet_of
 
 from sortie.policies.catalogue.deputies import deputies
 from sortie.policies.contract import PERSON_FLAG, Directive, FleetView, Representation
+from sortie.policies.damping import DampedLink, damp
 from sortie.policies.verification.enforced import Steps, effective, judge
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.past import Past
@@ -80,3 +81,17 @@ def test_a_gate_that_rests_sends_no_share_of_its_cells(rung: Representation) -> 
     assert effective(moving) is moving
     (rule,) = parse("rho <= 0.1")
     assert not judge([rule], fleet_of(2), [Steps(asked, asked, asked)], [asked])
+
+
+@pytest.mark.parametrize("waits", [3, 5])
+def test_an_upgrade_that_waited_begins_with_the_disc_of_the_moment(waits: int) -> None:
+    """A target that drives on while its link waits: what is granted is aimed at where it is, and nothing waits any more."""
+    low = Directive(0, 1, Representation.FEATURES, 0.2, Disc(0.0, 0.0, 30.0), 2.0)
+    link = DampedLink(low)
+    for k in range(waits + 1):
+        disc = Disc(2.0 * k, 0.0, 30.0)
+        link = damp(link, low._replace(roi=disc, rate_hz=10.0, deadline_s=0.1 + 0.01 * k), 0.1 * k, 0.1 * waits)
+        assert link.enforced.roi == disc  # also while the rate waits
+        assert link.enforced.rate_hz == (10.0 if k == waits else 2.0)
+    assert link.enforced.deadline_s == pytest.approx(0.1 + 0.01 * waits)
+    assert link.proposals == ()

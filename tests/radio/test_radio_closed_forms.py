@@ -6,16 +6,19 @@ import math
 
 import numpy as np
 import pytest
+import simpy
 
+from sortie.radio import Air, Transmission
 from sortie.radio.channel.draws import fade_table_db
 from sortie.radio.channel.pathloss import path_loss_db
 from sortie.radio.channel.snr import earshot_m, noise_dbm
 from sortie.radio.goodput import Goodput
-from sortie.radio.mac.airtime import BLOCK_ACK_S, MPDU_DELIMITER, frame_bytes, repair_wire_bytes
+from sortie.radio.mac.airtime import BLOCK_ACK_S, MPDU_DELIMITER, frame_bytes, repair_wire_bytes, sample_wire
 from sortie.radio.mac.contention import SIFS_S, SLOT_S
 from sortie.radio.rates import CURVES, STANDARDS, group_curve, rate_table, snr_index
 from sortie.radio.sample import Service
 from sortie.radio.settings import AccessName, AirSettings
+from sortie.radio.transmission import Status
 from sortie.scenarios.link_state import MEASURED_FOR_S
 
 
@@ -99,3 +102,20 @@ def test_a_measurement_that_is_too_old_bounds_no_new_one() -> None:
     late.measured(0, 1, 90.0, 1.0 + MEASURED_FOR_S)
     assert 70.0 < late.read(0, 1.0 + MEASURED_FOR_S)[1] < 90.0
     assert np.isfinite(late.read(0, 4.0)).all()
+
+
+@pytest.mark.parametrize("payload", [100, 2000, 40 * 1344, 100 * 1344 + 5])
+def test_a_sample_s_wire_bytes_are_its_frames_and_where_reliable_one_question(payload: int) -> None:
+    """Over a link that loses nothing: every fragment once, and a heartbeat whose answer could name each of them."""
+    rows: list[Transmission] = []
+    env = simpy.Environment()
+    still = np.broadcast_to([[0.0, 0.0, 60.0], [10.0, 0.0, 60.0]], (20, 2, 3))
+    air = Air(env, AirSettings(shadowing_sigma_db=0.0, tx_power_dbm=30.0), still, seed=1, frame_s=0.1)
+    air.advance()
+    for reliable in (False, True):
+        air.send(0, 1, payload, kind=f"{reliable}", reliable=reliable, deadline_s=1.0, on_done=rows.append)
+    env.run(until=0.1)
+    fragments, once = sample_wire(payload, 1344)
+    assert [(r.status, r.wire_bytes) for r in rows] == [
+        (Status.DELIVERED, once), (Status.DELIVERED, once + repair_wire_bytes(fragments)),
+    ]  # fmt: skip
