@@ -205,3 +205,19 @@ def test_whatever_follows_whatever_a_velocity_is_the_slope_of_its_place(order: S
         base.est_position_m[:, 2] - base.position_m[:, 2],
         atol=1e-9,
     )
+
+
+# --- work ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("handshake", [0, 132])
+def test_every_byte_that_a_drone_sends_is_work(handshake: int) -> None:
+    """Payloads and handshakes, to each peer; what it looked at and decided as well."""
+    rig = Rig(to_all, dwell_s=0.0, handshake=handshake)
+    rig.hear(1, 2)
+    rig.env.run(until=0.25)
+    work = rig.memory.status.work
+    assert len(rig.sent) == 2 * 2
+    assert len(rig.shaken) == (2 * 2 if handshake else 0)
+    assert work.payload_bytes == sum(p.size_bytes for _, _, p, _ in rig.sent) + handshake * len(rig.shaken)
+    assert (work.looks, work.decisions, work.maps) == (3, 3, 0)

@@ -107,6 +107,16 @@ def test_a_small_move_of_a_disc_is_no_disagreement() -> None:
         assert bool(pair.episodes) == disagree
 
 
+def test_a_pair_is_compared_about_the_links_of_all_who_decide() -> None:
+    """Also of one whom neither of the two has heard: what it would send to each of them."""
+    a, b, c = (descriptor(i) for i in range(3))
+    pairs = {(p.drone, p.other): p for p in measured([view(0, a, b), view(1, a, b), view(2, c)])}
+    assert pairs[0, 1].compared_s == pytest.approx(4 * PERIOD_S)  # 0 to 1, 1 to 0, 2 to both
+    assert pairs[0, 2].compared_s == pairs[1, 2].compared_s == pytest.approx(6 * PERIOD_S)
+    heard = {(p.drone, p.other): p for p in measured([view(i, a, b, c) for i in range(3)])}
+    assert [p.compared_s for p in heard.values()] == pytest.approx([6 * PERIOD_S] * 3)
+
+
 @pytest.mark.parametrize(
     ("cause", "one", "other", "sends"),
     [

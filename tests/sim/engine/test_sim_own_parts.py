@@ -1,0 +1,119 @@
+"""Each drone's own part where a fleet has several: its network counts, shows and detects; mains and meetings of who is there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from sim_examples import example
+
+from sortie.fleet.energy.battery import FleetBatteries
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.schema import Battery
+from sortie.sim.engine.mixed import Mixed
+from sortie.sim.engine.separation import Separation
+from sortie.sim.engine.sortie import run_sortie
+
+
+class Network:
+    """A detector that names itself in everything that it is asked for."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def detect(self, jobs: Sequence[tuple[Capture, Sequence[Share]]]) -> list[Boxes]:
+        return [self._box() for _ in jobs]
+
+    def truth(self, t_s: float, ego: Capture) -> Boxes:
+        return Boxes.empty()
+
+    def count_boxes(self, capture: Capture, roi: Any) -> int:
+        return self.number
+
+    def camera_views(self, capture: Capture) -> Any:
+        return np.array([self.number])
+
+    def _box(self) -> Boxes:
+        at = np.array([[float(self.number), 0.0]])
+        return Boxes(at, np.array([[4.5, 1.9]]), np.zeros(1), np.ones(1))
+
+
+@pytest.mark.parametrize("of_drone", [(0, 1, 0, 2), (2, 2, 1, 0)])
+def test_every_drone_is_counted_shown_and_detected_by_its_own_network(of_drone: tuple[int, ...]) -> None:
+    fleet = Mixed([Network(k) for k in range(3)], of_drone, [None] * 3)
+    captures = [Capture(i, 0.0, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 60.0), 0.0) for i in range(4)]
+    assert tuple(fleet.count_boxes(c, None) for c in captures) == of_drone
+    assert tuple(int(fleet.camera_views(c)[0]) for c in captures) == of_drone
+    for order in (captures, captures[::-1]):
+        found = fleet.detect([(c, []) for c in order])
+        assert [b.xy_m[0, 0] for b in found] == [of_drone[c.drone] for c in order]
+    share = Share(captures[1], "detections", 0.0, None, 1.0)
+    ((_, (given,)),) = fleet._with_foreign_boxes([[(captures[0], [share])]])[0]
+    if of_drone[0] == of_drone[1]:
+        assert given.boxes is None  # its own network finds them
+    else:
+        assert given.boxes is not None
+        assert given.boxes.xy_m[0, 0] == of_drone[1]
+
+
+def test_the_mains_lose_nothing_to_a_fault() -> None:
+    packs = FleetBatteries(Battery(), (), 2, mains={0})
+    for drone in (0, 1):
+        packs.fault(drone, 0.5)
+    assert packs.energy_j["fault"][0] == 0.0
+    assert packs.soc[0] == 1.0
+    assert packs.energy_j["fault"][1] > 0.0
+    packs.step(1.0, [100.0, 100.0], [1.0, 1.0], [0.1, 0.1])
+    assert packs.spent_j[0] == 0.0
+    packs.fault(0, 1.0)
+    assert not packs.landed[0]
+
+
+MEET = "fleet.groups=[{drones: [1], formation: {shape: line, altitude_m: 60}, route: {waypoints_m: [[20, 0], [-20, 0]], speed_mps: 8, turn_time_s: 1}}]"
+STILL = ("fleet.drones=2", "duration_s=6", "fleet.route.waypoints_m=[[0, 0]]", "fleet.formation.shape=line", MEET)
+
+
+@pytest.mark.parametrize(("gone", "times"), [("", 1), ("{kind: drone_lost, at_s: 1, drone: 1}", 0)])
+@pytest.mark.parametrize("jitter_m", [0.0, 1.5])
+def test_who_left_the_air_meets_nobody_and_a_pair_meets_once(gone: str, times: int, jitter_m: float) -> None:
+    """Jitter about the separation is no second meeting."""
+    record = run_sortie(
+        example(
+            *STILL, f"events=[{gone}]", f"fleet.motion.pose_jitter_m={jitter_m}", "fleet.motion.pose_jitter_time_s=1.5"
+        )
+    )
+    assert sum(r["kind"] == "too_near" for r in record.tables["events"].to_pylist()) == times
+
+
+def test_a_headroom_is_of_the_time_that_was_flown() -> None:
+    """A drone that has flown for less than a second has worked for less: its share is over that time, not over a second."""
+    record = run_sortie(
+        example("duration_s=2", "policy.name=silence", "policy.params={}", "fleet.computer.driving_cores=6")
+    )
+    rows = [r for r in record.tables["descriptors"].to_pylist() if r["drone"] == 0]
+    busy = [1.0 - r["gpu_headroom"] for r in rows]
+    assert busy[0] == 0.0
+    assert busy[1:] == pytest.approx([0.03 / 0.1] * (len(busy) - 1), rel=0.02)  # a look of 30 ms in every frame
+
+
+def test_a_pair_has_parted_when_it_is_a_fifth_farther_away() -> None:
+    """By hand, metre by metre: nearer than 5 m is a meeting, and another one only after 6 m."""
+    away_m = [9.0, 4.9, 5.1, 5.9, 4.9, 6.1, 5.1, 4.9, 4.0]
+    place = np.zeros((len(away_m), 2, 3))
+    place[:, 1, 0] = away_m
+    told: list[tuple[int, str]] = []
+    world: Any = SimpleNamespace(
+        motion=SimpleNamespace(position_m=place), drones=[SimpleNamespace(airborne=True)] * 2,
+        note=lambda drone, kind, text: told.append((drone, text.partition(",")[0])),
+    )  # fmt: skip
+    watch = Separation(example(*STILL), world)
+    frames = []
+    for frame in range(len(away_m)):
+        before = len(told)
+        watch.check(frame)
+        frames += [frame] * (len(told) - before)
+    assert frames == [1, 7]
+    assert told == [(0, "4.9 m from drone 1")] * 2
