@@ -8,14 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import simpy
 from sim_examples import example
 
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.policies.verification.enforced import Violation
 from sortie.scenarios.schema import Battery
+from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.mixed import Mixed
 from sortie.sim.engine.separation import Separation
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.record import VIOLATIONS_OF, Recorder
 
 
 class Network:
@@ -117,3 +121,18 @@ def test_a_pair_has_parted_when_it_is_a_fifth_farther_away() -> None:
         frames += [frame] * (len(told) - before)
     assert frames == [1, 7]
     assert told == [(0, "4.9 m from drone 1")] * 2
+
+
+def test_a_decision_that_breaks_several_lines_is_one_violated_decision() -> None:
+    """Violations are counted by line and link, decisions once; a violation that goes on is the same one."""
+    env, recorder = simpy.Environment(), Recorder(classes=False)
+    audit = Audit(env, recorder)
+    one, other = (Violation(line, 1, "policy", "features") for line in ("rho <= 0.1", "rate_hz <= 5"))
+    for broken in ([one, other], [one], [], [one]):
+        audit.judged(0, "mine", broken)
+        env.run(until=env.now + 0.1)
+    audit.finish()
+    counts = audit.totals()
+    assert counts["violated_ticks"] == 3
+    assert counts["invariant_violations"] == 3
+    assert counts[f"{VIOLATIONS_OF}policy"] == 3
