@@ -21,6 +21,7 @@ from sortie.fleet.gate import Gate
 from sortie.fleet.memory import Received
 from sortie.fleet.messages.wire import decode_descriptor
 from sortie.fleet.staleness import LinkHealth
+from sortie.fleet.traces import DroneTrace, PoseTrace, follow
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.scenarios.schema import Fleet
 
@@ -221,3 +222,22 @@ def test_every_byte_that_a_drone_sends_is_work(handshake: int) -> None:
     assert len(rig.shaken) == (2 * 2 if handshake else 0)
     assert work.payload_bytes == sum(p.size_bytes for _, _, p, _ in rig.sent) + handshake * len(rig.shaken)
     assert (work.looks, work.decisions, work.maps) == (3, 3, 0)
+
+
+# --- traces -------------------------------------------------------------------------------------------------------
+
+
+def test_before_and_after_its_trace_a_drone_has_neither_speed_nor_acceleration() -> None:
+    """One that speeds up from its first row to its last; within, both are the slopes of what is flown."""
+    base = fly(STILL, 6.0, 0.1, 3)
+    t_s = np.arange(2.0, 4.01, 0.1)
+    along = 1.5 * (t_s - 1.0) ** 2
+    place = np.stack([along, 0 * along, 60 + 0 * along], axis=1)
+    flown = follow(base, {1: DroneTrace(PoseTrace(t_s, place, None, None), None)}, 0.1)
+    speed, push = flown.velocity_mps[:, 1], flown.acceleration_mps2[:, 1]
+    beyond = (base.time_s < 2.0 - 1e-6) | (base.time_s > 4.0 + 1e-6)
+    assert beyond.sum() == 39
+    assert not speed[beyond].any()
+    assert not push[beyond].any()
+    assert push[22:38, 0] == pytest.approx(np.full(16, 3.0), abs=1e-6)
+    assert speed[25, 0] == pytest.approx(3.0 * 1.5)

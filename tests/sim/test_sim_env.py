@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from sim_examples import example
 
@@ -212,3 +213,25 @@ def test_spaces_and_a_lone_drone() -> None:
     assert e.action_space("drone_0").nvec.tolist() == [*CHOICES, *CHOICES]
     with pytest.raises(ValueError, match=r"fleet\.drones is 1, must be at least 2"):
         env("fleet.drones=1")
+
+
+def test_a_region_lies_where_the_ego_sees_it_whoever_publishes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a drone pays for what it sent, not for what it was sent."""
+    from sortie.policies.contract import Disc
+    from sortie.policies.verification.views import draw_view
+    from sortie.sim import env as env_room
+
+    peer = next(iter(draw_view(1, 1).descriptors.values()))._replace(
+        agent_id=1, position_m=(300.0, 0.0, 60.0), region=Disc(50.0, 20.0, 32.0)
+    )
+    me = peer._replace(agent_id=0, position_m=(10.0, -20.0, 60.0))
+    for d in (me, peer):
+        assert env_room._row(me, d, 0.0)[-6:-2] == pytest.approx([1.0, 0.4, 0.4, 0.32])
+    flight = object.__new__(env_room._Flight)
+    fusions = pa.table({"drone": pa.array([], pa.int32())})
+    sent = pa.table({"drone": [0, 0, 1], "peer": [1, 1, 0], "payload_bytes": [10**6, 2 * 10**6, 7 * 10**6]})
+    flight._new, flight._mission, flight._scenario = {"fusions": fusions, "transmissions": sent}, None, None  # type: ignore[assignment]
+    monkeypatch.setattr(env_room, "matched", lambda record, mission: {})
+    monkeypatch.setattr(flight, "_spent_kj", lambda drone: 0.0)
+    assert flight.reward(0) == pytest.approx(-3 * env_room.COST_PER_MB)
+    assert flight.reward(1) == pytest.approx(-7 * env_room.COST_PER_MB)

@@ -200,3 +200,11 @@ def test_the_built_in_models_are_listed() -> None:
     lines = CliRunner().invoke(app, ["list", "mobility"]).output.splitlines()
     assert [line.partition("(")[0].split()[0] for line in lines] == ["formation", "random_waypoint", "gauss_markov"]
     assert "alpha=0.85" in lines[2]
+
+
+def test_drones_that_begin_too_near_each_other_may_part() -> None:
+    """The separation forbids to come nearer, not to be near."""
+    settings = ("fleet.drones=2", "fleet.formation={shape: line, spacing_m: 4}", "fleet.steering.separation_m=8")
+    record = flown(GOES, params(only=0, x_m=-40, y_m=-30), *settings, "duration_s=13")
+    assert not [text for text in texts(record, 0) if "refused" in text]
+    np.testing.assert_allclose(states(record, "x_m", "y_m")[-1, 0], (-40, -30), atol=0.1)
