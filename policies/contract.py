@@ -15,6 +15,7 @@ import inspect
 import math
 import operator
 import re
+import sys
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
@@ -569,12 +570,18 @@ def _compares(value: Any, low: float, high: float) -> bool:
     return True
 
 
-_HONEST = frozenset({"builtins", "numpy", "decimal", "fractions", "sortie"})
+_HONEST = frozenset({"builtins", "numpy", "sortie"})
 
 
 def _is_honest(value: object) -> bool:
     """Whether a value's type is known to compare the same each time: a type of the user's own may not."""
-    return type(value).__module__.partition(".")[0] in _HONEST
+    kind = type(value)
+    if kind is float or kind is int or kind is str or value is None:
+        return True
+    module = kind.__module__
+    if type(module) is not str or module.partition(".")[0] not in _HONEST:
+        return False
+    return getattr(sys.modules.get(module), kind.__name__, None) is kind  # a class may claim to be from any module
 
 
 _HALF_PAIR = re.compile("[\ud800-\udfff]")

@@ -6,9 +6,11 @@ views follow from them as in flight: charge never rises, a descriptor that is lo
 
 from __future__ import annotations
 
+import contextlib
 import math
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -23,6 +25,7 @@ from sortie.policies.contract import (
     TaskPhase,
 )
 from sortie.policies.verification.invariants import Invariant, Number
+from sortie.policies.verification.shield import Shielded
 from sortie.scenarios.plugins.user_calls import Guarded
 from sortie.scenarios.plugins.user_code import is_users
 from sortie.scenarios.streams import stream
@@ -131,27 +134,45 @@ def constants_of(policy: Any, rules: Sequence[Invariant] = ()) -> set[float]:
         if id(one) in met:
             continue
         met.add(id(one))
-        if isinstance(one, bool):
-            continue
-        if isinstance(one, int | float):
+        if type(one) in (int, float):
             found.add(float(one))
-        elif isinstance(one, types.CodeType):
-            waiting += one.co_consts
-        elif isinstance(one, tuple | list):
-            waiting += islice(one, 100)
-        elif isinstance(one, types.FunctionType):
-            waiting += [one.__code__, *(one.__defaults__ or ()), *(one.__kwdefaults__ or {}).values()]
-            waiting += [c.cell_contents for c in one.__closure__ or ()]
-            waiting += [one.__globals__[n] for n in one.__code__.co_names if n in one.__globals__]
-        elif isinstance(one, Guarded):
-            waiting += [one.__wrapped__]
-        elif hasattr(one, "func"):  # a partial
-            waiting += [one.func, *one.args, *one.keywords.values()]
-        elif hasattr(one, "policy"):  # a shielded one
-            waiting += [one.policy]
-        elif is_users(type(one).__module__):
-            waiting += [*vars(one).values(), getattr(type(one), "__call__", None)]  # noqa: B004
+        else:
+            with contextlib.suppress(Exception):  # a user's own class may answer in any way
+                waiting += _parts(one)
     return {x for x in found if math.isfinite(x)}
+
+
+def _parts(one: Any) -> Iterable[Any]:
+    """What an object has inside that may hold numbers of its code."""
+    if isinstance(one, types.CodeType):
+        return one.co_consts
+    if isinstance(one, tuple | list | set | frozenset):
+        return islice(one, 100)
+    if isinstance(one, dict):
+        return [*islice(one, 100), *islice(one.values(), 100)]
+    if isinstance(one, types.FunctionType):
+        cells = [c.cell_contents for c in one.__closure__ or () if _is_full(c)]
+        known = [one.__globals__[n] for n in one.__code__.co_names if n in one.__globals__]
+        return [one.__code__, *(one.__defaults__ or ()), *(one.__kwdefaults__ or {}).values(), *cells, *known]
+    if isinstance(one, types.MethodType):
+        return [one.__func__, one.__self__]
+    if isinstance(one, Guarded):
+        return [one.__wrapped__]
+    if isinstance(one, partial):
+        return [one.func, *one.args, *one.keywords.values()]
+    if isinstance(one, Shielded):
+        return [one.policy]
+    if isinstance(one, type):
+        return [*vars(one).values()] if is_users(one.__module__) else []
+    return [*getattr(one, "__dict__", {}).values(), type(one)] if is_users(type(one).__module__) else []
+
+
+def _is_full(cell: types.CellType) -> bool:
+    try:
+        cell.cell_contents  # noqa: B018
+    except ValueError:
+        return False
+    return True
 
 
 def draw_course(seed: int, number: int, still: Course, values: Values) -> Course:

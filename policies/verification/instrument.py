@@ -137,8 +137,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
             _stop("hands on a method of a text")
         if callable(value) and function not in (isinstance, issubclass) and (why := cannot_call(value)) is not None:
             _reach(why[1:]) if why.startswith("!") else _stop(why)
-        if type(value) in (set, frozenset) and function not in _BLIND_TO_SETS:
-            _each(value)
+        if type(value) in (set, frozenset) and (function not in _BLIND_TO_SETS or "key" in kwargs):
+            _each(value)  # with a key, the first of those with equal keys is found
     if not takes_ranges(function) and any(map(_has_text, (*args, *kwargs.values()))):
         _stop(f"gives a range to {getattr(function, '__qualname__', function)}")
     if function in (isinstance, issubclass) and len(args) == 2 and (why := _cannot_ask(args[1])):

@@ -25,6 +25,13 @@ _LEAVES = (
 )  # fmt: skip
 
 
+_PYTHONS_OWN = {
+    "__name__", "__doc__", "__package__", "__loader__", "__spec__", "__file__", "__cached__", "__builtins__", "__path__",
+    "__annotations__", "__dataclass_fields__", "__dataclass_params__", "__match_args__", "__dict__", "__weakref__",
+}  # fmt: skip
+"""Names that Python itself gives to a module or a class."""
+
+
 class Kept:
     """A policy's lasting objects as they were before its first decision."""
 
@@ -49,7 +56,7 @@ def kept_by(function: Callable[..., Any], module: types.ModuleType) -> Kept:
     Raises:
         Refused: one of them is of a kind that cannot be compared, such as an iterator.
     """
-    roots = {name: value for name, value in vars(module).items() if not name.startswith("__")}
+    roots = {name: value for name, value in vars(module).items() if name not in _PYTHONS_OWN}
     return Kept({**roots, "the policy itself": function})
 
 
@@ -64,7 +71,7 @@ def _fingerprint(value: Any, met: dict[int, int]) -> Any:
     if id(value) in met:
         return "again", met[id(value)]
     met[id(value)] = len(met)
-    if kind in (list, tuple) or isinstance(value, tuple):
+    if kind in (list, tuple) or (isinstance(value, tuple) and not is_users(kind.__module__)):
         return kind.__name__, tuple([_fingerprint(v, met) for v in value])
     if kind in (dict, types.MappingProxyType, collections.OrderedDict, collections.defaultdict, collections.Counter):
         return kind.__name__, tuple([(_fingerprint(k, met), _fingerprint(v, met)) for k, v in value.items()])
@@ -91,10 +98,11 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
             *(v for v in value.__dict__.values() if not isinstance(v, inspect.Signature)),
         ]
     elif isinstance(value, types.ModuleType):
-        found = [v for n, v in vars(value).items() if not n.startswith("__")] if is_users(value.__name__) else []
+        found = [v for n, v in vars(value).items() if n not in _PYTHONS_OWN] if is_users(value.__name__) else []
     elif isinstance(value, type):
-        own = {n: v for n, v in vars(value).items() if n[:2] != "__"} if is_users(value.__module__) else {}
-        found = [x for item in own.items() for x in item]
+        own = {n: v for n, v in vars(value).items() if _may_change(n, v)} if is_users(value.__module__) else {}
+        found = [*(x for item in own.items() for x in item), *(c for c in value.__mro__[1:] if is_users(c.__module__))]
+        found += [type(value)] if is_users(type(value).__module__) else []
     elif isinstance(value, functools.partial):
         found = [value.func, *value.args, *value.keywords.values()]
     elif isinstance(value, types.MethodType):
@@ -105,8 +113,9 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
         found = [value.fget, value.fset]
     elif is_users(type(value).__module__):
         found = [x for item in _attributes(value).items() for x in item]
-        if isinstance(value, list | set | dict):
+        if isinstance(value, list | tuple | set | frozenset | dict):
             found += [*value, *(value.values() if isinstance(value, dict) else ())]
+        found.append(type(value))  # its class may be reached through it alone
     elif type(value).__module__ in ("typing", "__future__", "operator", "sortie.policies.verification.instrument"):
         found = []
     elif hasattr(value, "__wrapped__") or hasattr(value, "cache_info"):
@@ -114,6 +123,14 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
     else:
         raise Refused(f"keeps a {type(value).__name__} from one decision to the next")
     return tuple([_fingerprint(v, met) for v in found])
+
+
+def _may_change(name: str, value: Any) -> bool:
+    """Whether an attribute of a class may keep something: all but what Python itself puts there."""
+    if name[:2] != "__":
+        return True
+    changes = (types.FunctionType, staticmethod, classmethod, property, list, dict, set, bytearray)
+    return name not in _PYTHONS_OWN and (isinstance(value, changes) or is_users(type(value).__module__))
 
 
 def _attributes(value: Any) -> dict[str, Any]:

@@ -43,6 +43,7 @@ from sortie.policies.contract import (
 from sortie.policies.verification.advice import advise
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.conformance import missing_links, older_views, raised_part, without_detached
+from sortie.policies.verification.courses import constants_of
 from sortie.policies.verification.invariants import (
     Invariant,
     InvariantError,
@@ -50,6 +51,7 @@ from sortie.policies.verification.invariants import (
     just_heard,
     violations,
 )
+from sortie.policies.verification.own_constants import views_at
 from sortie.policies.verification.search import Budget, Found, Searched, Stopped, search_size
 from sortie.policies.verification.solver import solver_paths
 from sortie.policies.verification.subject import searchable
@@ -60,6 +62,8 @@ DRONES = 5
 """The largest fleet that a proof covers if nothing else is asked for."""
 BUDGET_S = 60.0
 TRIED_VIEWS = 1000
+TRIED_AT_CONSTANTS = 200
+"""At most so many views more have the numbers of the policy's own code."""
 TRIED_LARGE = 2
 """Drawn views of the largest fleet that a scenario may have."""
 
@@ -205,7 +209,7 @@ def prove(
     properties = [*PLANE, *(property_of(i) for i in invariants)]
     searched = [Searched(p.name) for p in properties]
     coverage = _search(policy, list(zip(searched, properties, strict=True)), max_drones, period_s, Budget(budget_s))
-    tried = _Drawn(policy, seed, views)
+    tried = _Drawn(policy, invariants, seed, views)
     verdicts = []
     for found, prop in zip(searched, properties, strict=True):
         if found.fault is not None:
@@ -282,19 +286,23 @@ def _search(
 class _Drawn:
     """Drawn views and what the policy decides on them, each decision made once."""
 
-    def __init__(self, policy: Policy, seed: int, count: int) -> None:
+    def __init__(self, policy: Policy, rules: Sequence[Invariant], seed: int, count: int) -> None:
         self._policy, self._count = policy, count
         self._large = TRIED_LARGE if count else 0
         self._views = [
             *(draw_view(seed, number) for number in range(count)),
             *(draw_view(seed, count + number, LARGEST) for number in range(self._large)),
         ]
+        own = list(views_at(constants_of(policy, rules), seed, min(count, TRIED_AT_CONSTANTS)))
+        self._own = len(own)
+        self._views += own
         self._answers: dict[int, Any] = {}
 
     @property
     def text(self) -> str:
         """How many views were tried, in words."""
-        return f"{self._count} drawn views of up to {MAX_DRONES} drones and {self._large} of {LARGEST} keep it"
+        own = f", {self._own} at the policy's own constants" if self._own else ""
+        return f"{self._count} drawn views of up to {MAX_DRONES} drones{own} and {self._large} of {LARGEST} keep it"
 
     def first_fault(self, prop: Property) -> FleetView | None:
         """The first view on which a property fails, made smaller; None if all keep it."""

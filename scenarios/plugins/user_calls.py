@@ -93,6 +93,12 @@ class Guarded:
             if watch is not None and self._origin is not None:
                 watch.late[self._origin] = self._late
             raise TookTooLongError(self._late).with_traceback(late.__traceback__) from None
+        except BaseException as stop:
+            if isinstance(stop, Exception | KeyboardInterrupt) or type(stop).__module__.startswith("sortie."):
+                raise
+            raise ProgramExitError(f"raises {type(stop).__name__}, must return").with_traceback(
+                stop.__traceback__
+            ) from None
 
 
 def guarded(function: Callable[..., Any]) -> Callable[..., Any]:

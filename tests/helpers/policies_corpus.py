@@ -307,6 +307,8 @@ OUTSIDE = {
     "identity by operator": "bad = operator.is_(soc, me.battery_soc)",
     "order of a set": "bad = next(iter({'a', 'b', 'c'})) == 'c' and soc == 0.4",
     "order of a set in a loop": "for x in {'a', 'b', 'c'}:\n    bad = x == 'c' and soc == 0.4",
+    "order of a set by a key": "bad = max({'a', 'b', 'c'}, key=lambda _: 0) == 'c' and soc == 0.4",
+    "order of a set sorted by a key": "bad = sorted({'a', 'b', 'c'}, key=lambda _: 0)[0] == 'c' and soc == 0.4",
     "pop of a set": "bad = {'a', 'b', 'c'}.pop() == 'c' and soc == 0.4",
     "list of a set": "bad = list({'a', 'b', 'c'})[0] == 'c' and soc == 0.4",
     "unpacked set": "a, *_ = {'a', 'b', 'c'}\nbad = a == 'c' and soc == 0.4",
