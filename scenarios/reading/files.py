@@ -38,7 +38,8 @@ MODELS = {
 changes of policy policies, events of kind `own` events, and `metrics` metrics."""
 
 
-_CALLED = re.compile(r"([^()]*[^()\s])\s*\(((?:\s*[^\W\d]\w*\s*=[^=(),]+,?)*)\s*\)")
+_FUNCTION = re.compile(r"(.+)(:[^\W\d]\w*(?:\([^()]*\))?)")
+_CALLED = re.compile(r"(.*[^(\s])\s*\(((?:\s*[^\W\d]\w*\s*=[^=(),]+,?)*)\s*\)")
 """A model's name, and `key=value, …` in brackets."""
 _CALLABLE = frozenset(field.rpartition(".")[2] for field in MODELS) - {"name", "recorded_fusion"} | {"model"}
 
@@ -194,6 +195,5 @@ def _given(sections: dict[str, Any], fields: Iterable[str]) -> Iterator[tuple[di
 
 def _split(text: str) -> tuple[str, str]:
     """`file.py:function` or `file.py:function(key=value)` as the file, and the rest with its colon; else a file alone."""
-    name, bracket, given = text.partition("(")
-    file, colon, function = name.rpartition(":")
-    return (file, colon + function + bracket + given) if colon and function.isidentifier() else (text, "")
+    found = _FUNCTION.fullmatch(text)
+    return (found[1], found[2]) if found else (text, "")

@@ -156,3 +156,15 @@ def test_a_parameter_that_names_a_file_is_found_beside_the_scenario(
     sections = load("s.yaml").model_dump(mode="json", exclude_none=True)
     assert sections["fleet"]["sensor_params"] == {"heights": "heights.csv", "kind": "wide.v2"}
     assert named_files(sections) == ["own.py", "heights.csv"]
+
+
+@pytest.mark.parametrize(
+    ("given", "model", "params"),
+    [
+        ("moved to (another) place/own.py:Name", "moved to (another) place/own.py:Name", None),
+        ("d (x=1)/own.py:Name(y=2)", "d (x=1)/own.py:Name", {"y": 2}),
+    ],
+)
+def test_brackets_in_a_folders_name_are_the_folders(given: str, model: str, params: dict[str, int] | None) -> None:
+    plain = {"link": given}
+    assert without_brackets(plain) == {"link": model} | ({} if params is None else {"link_params": params})
