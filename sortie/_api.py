@@ -45,12 +45,12 @@ def load(scenario: ScenarioLike, overrides: Overrides = ()) -> Scenario:
     """Read and check a scenario.
 
     Args:
-        scenario: a library scenario's name (`sortie list scenarios` shows them), the path of a YAML file, plain
-            sections as a dict, or a `Scenario`.
-        overrides: fields that differ, `{"fleet.drones": 7}`, or a list of texts as after `--set`, `["fleet.drones=7"]`.
+        scenario: the name of a library scenario (`sortie list scenarios` prints them), the path of a YAML file, the
+            sections of a scenario as a dict, or a `Scenario`.
+        overrides: fields to change, as a dict, `{"fleet.drones": 7}`, or as a list of texts, `["fleet.drones=7"]`.
 
     Returns:
-        A frozen `Scenario`, every default filled in. Units stand in the field names.
+        A frozen `Scenario` with every default filled in. Field names end with their units.
 
     Raises:
         ScenarioError: one line that names the file, the field, the value and what is allowed.
@@ -91,11 +91,11 @@ def fly(
     """Fly one sortie.
 
     Args:
-        scenario, overrides: as `sortie.load` takes them.
-        policy: who decides; None takes the scenario's own. Another policy flies to the end: the scenario's changes of
-            policy and commands belong to its own.
-        seed: of every random draw; None takes the scenario's own.
-        replication: another draw of everything random under the same seed.
+        scenario, overrides: as for `sortie.load`.
+        policy: the policy that decides on every drone; None uses the scenario's own. A policy given here decides until
+            the end: the scenario's changes of policy and its commands are ignored.
+        seed: determines every random draw; None uses the scenario's own.
+        replication: the number of the repetition. Each has other random draws under the same seed.
         progress: called with the simulated time (s) once a simulated second.
         observer: gets the new rows of the record once a simulated second.
 
@@ -103,8 +103,8 @@ def fly(
         The `Run`. Equal scenario, policy, seed, replication and version give equal runs.
 
     Raises:
-        ScenarioError, PolicyError: what is wrong, before anything flies; PolicyError also in flight, when the policy
-            fails or breaks its contract.
+        ScenarioError, PolicyError: the scenario or the policy is wrong; raised before anything flies.
+        PolicyError: also in flight, when the policy fails or breaks its contract.
 
     Example:
         >>> short = {"duration_s": 2, "perception.detector": "none"}
@@ -127,10 +127,10 @@ def fly(
 
 
 def open_run(path: str | Path) -> Run:
-    """Read a run's folder back, as `Run.save` or `sortie fly` wrote it.
+    """Read a run from its folder, as `Run.save` or `sortie fly` wrote it.
 
     Raises:
-        RunError: there is no run, or it is damaged.
+        RunError: the folder has no run, or the run is damaged.
 
     Example:
         >>> run = sortie.fly("track_target", {"duration_s": 1, "perception.detector": "none"})
@@ -145,18 +145,19 @@ def open_run(path: str | Path) -> Run:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Sorties under several policies, the same scenario, seeds and draws; made by `sortie.compare`."""
+    """The result of `sortie.compare`: sorties under several policies with the same scenario, seeds and random draws."""
 
     sorties: tuple[Compared, ...]
-    """One a policy and seed; seed by seed, policies in the order in which they were named."""
+    """One for each policy and seed: seed by seed, policies in the order in which they were named."""
     gains: tuple[Gain, ...]
-    """AP@0.5 of every policy but the first, minus the first's, with a paired 95 % interval. Several seeds give the mean
-    of the sorties' own differences, and the interval covers sorties: `Gain.over` says so. Empty where `perception.detector` is none: nothing is scored then, while bytes, energy and
-    delays in `table` are compared all the same."""
+    """AP@0.5 (average precision) of every policy minus that of the first, with a paired 95 % interval. With several
+    seeds a gain is the mean of the sorties' differences, and the interval covers sorties (`Gain.over`). Empty if
+    `perception.detector` is none, because nothing is scored then; `table` still has bytes, energy and delays."""
 
     @cached_property
     def table(self) -> pa.Table:
-        """A row a sortie: `policy`, `seed`, `town_seed` (its `perception.scene.seed`), then every metric of the outcome by its dotted name."""
+        """One row for each sortie: `policy`, `seed`, `town_seed` (its `perception.scene.seed`), then every metric of the
+        outcome by its name with dots, such as `ap50.mission`."""
         import pyarrow as pa
 
         from sortie._run import numbers
@@ -169,9 +170,9 @@ class Comparison:
         return pa.table({name: [row.get(name) for row in rows] for name in names})
 
     def summary(self) -> Summary:
-        """The policies side by side and why their figures differ, as `sortie compare` prints it.
+        """The policies side by side, and why their figures differ, as `sortie compare` prints it.
 
-        A notebook shows it, `rich` prints it, and `str` gives plain text.
+        A notebook and `rich` show it as a table; `str` returns plain text.
         """
         from sortie.sim.results.summary import Summary
         from sortie.sim.studies.compare import Flown
@@ -205,17 +206,17 @@ def compare(
     """Fly a scenario under several policies, with the same seeds and draws.
 
     Args:
-        scenario, overrides: as `sortie.load` takes them.
+        scenario, overrides: as for `sortie.load`.
         policies: one or more; gains are over the first.
-        seeds: the seeds to fly, or how many from the scenario's own on. None flies eight where the detector is the
-            surrogate, whose sorties take seconds, and one for any other. Each of several has a town and random draws of
-            its own, the same for all policies, and intervals cover sorties. One flies in the scenario's own town, as
-            `sortie.fly` does, and intervals cover the instants of that one flight alone.
-        own_fusion: prior methods fly with the fusion that they were published with, in place of `perception.fusion`.
+        seeds: a list of seeds, or the number of seeds, beginning with the scenario's own. None flies eight with the
+            surrogate, which is fast, and one with any other detector. With several seeds, each has its own town and
+            random draws, the same for all policies; intervals then cover sorties. With one seed, the flight is over
+            the scenario's own town, and intervals cover the instants of that flight alone.
+        own_fusion: fly published methods with the fusion that they were published with, not `perception.fusion`.
         progress: called with the policy's label, the seed and the simulated time (s).
 
     Raises:
-        ScenarioError, PolicyError: what is wrong, before anything flies.
+        ScenarioError, PolicyError: the scenario or a policy is wrong; raised before anything flies.
 
     Example:
         >>> short = {"duration_s": 2, "perception.detector": "surrogate"}
@@ -251,21 +252,21 @@ def compare(
 
 
 def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = False) -> Replay:
-    """Decide again over the views that a run kept, and compare with what was decided in flight.
+    """Repeat the decisions of a run with the same or another policy, and compare them with those in flight.
 
-    The recorded world does not answer: a decision that differs changes no later view. Policies' own answers are
-    compared, before staleness and damping.
+    The policy reads the views that the run kept. A different decision does not change later views. What policies return
+    is compared, before staleness rules and damping.
 
     Args:
-        run: one that was flown with `record.views`.
-        policy: who decides; None takes the policies that decided in flight, each where it did. They must give the same
-            decisions, if they are functions of the view alone.
-        disagreement: also measure how often two drones' views lead to different choices about one link. Its time grows
-            with the third power of the number of drones.
+        run: a run that was flown with `record.views`.
+        policy: the policy that decides; None uses the policies that decided in flight, each where it did. Their
+            decisions must then be the same, unless they depend on more than the view.
+        disagreement: also measure how often two drones' views lead to different choices about one link. The time for
+            this grows with the third power of the number of drones.
 
     Raises:
-        RunError: the run kept no views, or a function decided in flight that the scenario does not name.
-        PolicyError: an unknown policy, or one that fails on a view or breaks its contract.
+        RunError: the run kept no views, or a function that the scenario does not name decided in flight.
+        PolicyError: the policy is unknown, fails on a view or breaks its contract.
 
     Example:
         >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none", "record.views": True})
@@ -287,22 +288,24 @@ def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = F
 
 @dataclass(frozen=True, eq=False)
 class CampaignResult:
-    """What is finished of a campaign; made by `sortie.campaign` and `sortie.open_campaign`."""
+    """The finished runs of a campaign, as `sortie.campaign` and `sortie.open_campaign` return them."""
 
     path: Path
-    """Its folder."""
+    """The campaign's folder."""
     finished: int
-    """Runs whose rows are on disk."""
+    """Number of runs with a row on disk."""
     failed: int
-    """Of those, runs that failed; their rows say why."""
+    """Number of these that failed; their rows have the error."""
     flown: int
-    """Runs that this call flew."""
+    """Number of runs that this call flew."""
     seconds: float
-    """How long it took."""
+    """Wall-clock time of this call, s."""
 
     @cached_property
     def rows(self) -> pa.Table:
-        """A row a run: its varied fields, policy, seed, status and the campaign's metrics. Each row is checked against its hash.
+        """One row for each run: its varied fields, policy, seed, status and the campaign's metrics.
+
+        Each row is checked against its hash.
 
         Raises:
             RunError: nothing is finished, a row is broken, or the Parquet table or its manifest was changed.
@@ -315,7 +318,7 @@ class CampaignResult:
         """Write `report.md` with its figures into the folder, and return its path.
 
         Raises:
-            RunError: nothing is finished, matplotlib is missing, or the disk refuses.
+            RunError: nothing is finished, matplotlib is missing, or the files cannot be written.
         """
         from sortie.sim.campaign.report import write_report
 
@@ -337,26 +340,28 @@ def campaign(
     progress: Callable[[Any], None] | None = None,
     notice: Callable[[str], None] | None = None,
 ) -> CampaignResult:
-    """Fly a campaign: many sorties over what its file varies. Interrupted at any moment, the same call goes on.
+    """Fly a campaign: many sorties over the fields that its file varies.
+
+    After an interruption, the same call continues the campaign.
 
     Args:
-        campaign: a campaign file, or a library campaign's name.
-        out: its folder; None takes `runs/campaign-NAME`.
-        workers: worker processes, at least one; None takes one a core. Nothing flies in this process.
-        scheduler: the address of a dask cluster that is running, `tcp://host:8786`.
-        security: PEM files for TLS with the cluster: the authority's certificate, one's own, its key.
-        worker_memory_gb: what a worker may take; a run that needs more is a failed run. None divides the machine's memory
-            among the workers, and leaves it to the workers of a cluster that is joined.
-        wait_for_workers_s: how long to wait while a cluster has no workers.
-        resume: only go on; an error if there is nothing to go on with.
-        retry_failed: fly runs that failed once more.
+        campaign: a campaign file, or the name of a library campaign.
+        out: the campaign's folder; None uses `runs/campaign-NAME`.
+        workers: number of worker processes, at least one; None uses one for each core. Nothing flies in this process.
+        scheduler: the address of a running dask cluster, `tcp://host:8786`.
+        security: PEM files for TLS with the cluster: the authority's certificate, your certificate, its key.
+        worker_memory_gb: memory limit of a worker, GB; a run that needs more is recorded as failed. None divides the
+            machine's memory among the workers; on a cluster, the workers' own limits apply.
+        wait_for_workers_s: how long to wait while a cluster has no workers, s.
+        resume: only continue; raise an error if the folder has no campaign.
+        retry_failed: fly failed runs once more.
         progress: called with a `sortie.sim.campaign.drive.Progress` after each batch.
-        notice: called with a line where a cluster has no workers, and for each thing that somebody else changed in the
-            folder; None warns.
+        notice: called with a line when a cluster has no workers, and for each file that somebody else changed in the
+            folder; None issues warnings.
 
     Raises:
-        ScenarioError, PolicyError: what is wrong with the campaign, before anything flies.
-        RunError: a folder that cannot be used, or a cluster that is not there.
+        ScenarioError, PolicyError: the campaign is wrong; raised before anything flies.
+        RunError: the folder cannot be used, or the cluster cannot be reached.
 
     Example:
         >>> done = sortie.campaign("link_battery", out="runs/c", workers=2)    # doctest: +SKIP
@@ -396,10 +401,10 @@ def campaign(
 
 
 def open_campaign(folder: str | Path) -> CampaignResult:
-    """A campaign's folder, to read what is finished of it.
+    """Open a campaign's folder, to read its finished runs.
 
     Raises:
-        RunError: no campaign there, a row of it is broken, or its Parquet table or manifest was changed.
+        RunError: the folder has no campaign, a row is broken, or the Parquet table or manifest was changed.
 
     Example:
         >>> sortie.open_campaign("runs/campaign-link_battery").rows    # doctest: +SKIP
@@ -428,7 +433,7 @@ def _warn(line: str) -> None:
 
 
 def campaign_folder(name: str) -> Path:
-    """Where a campaign is kept when nothing else is said."""
+    """The default folder of a campaign."""
     return Path("runs") / f"campaign-{name}"
 
 
@@ -439,20 +444,21 @@ def check(
     update: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Checked, ...]:
-    """Fly scenarios and compare their outcomes with their own expectations.
+    """Fly scenarios and test the expectations that they state.
 
     Args:
-        scenarios: a file, a library scenario's name, a folder (every scenario file below it that expects something), or
-            a list of those.
-        overrides: texts as after `--set`, for every scenario.
-        update: write golden outcomes instead of comparing with them.
-        progress: called with the simulated seconds of the scenario that flies.
+        scenarios: a file, the name of a library scenario, a folder, or a list of these. Of a folder, every scenario
+            file below it that has expectations is flown.
+        overrides: fields to change in every scenario, `["fleet.drones=7"]`.
+        update: write golden (stored) outcomes instead of comparing with them.
+        progress: called with the simulated time of the scenario that flies, s.
 
     Returns:
-        One `Checked` a scenario, with `.verdicts`, `.failed`, and `.replay(verdict)`, the command that shows a failure.
+        One `Checked` for each scenario, with `.verdicts`, `.failed`, and `.replay(verdict)`: the command that shows
+        a failure.
 
     Raises:
-        ScenarioError, PolicyError, RunError: what is wrong with a scenario, its policy or its golden outcome.
+        ScenarioError, PolicyError, RunError: a scenario, its policy or its golden outcome is wrong.
 
     Example:
         >>> text = "name: mine\\nduration_s: 1\\nperception: {detector: none}\\n"
@@ -471,14 +477,14 @@ def check(
 
 
 def env(scenario: ScenarioLike, overrides: Overrides = ()) -> SortieEnv:
-    """The sortie as a PettingZoo `ParallelEnv`: one agent a drone, for learners of sharing policies.
+    """Return a PettingZoo `ParallelEnv` in which each drone is an agent, to train sharing policies.
 
     Args:
-        scenario, overrides: as `sortie.load` takes them; at least two drones. The scenario's policy is not asked.
+        scenario, overrides: as for `sortie.load`, with at least two drones. The scenario's policy is not used.
 
     Raises:
-        ScenarioError: what is wrong with the scenario.
-        RunError: a lone drone, or the extra `env` is not installed.
+        ScenarioError: the scenario is wrong.
+        RunError: the fleet has a single drone, or the extra `env` is not installed.
 
     Example:
         >>> env = sortie.env("track_target", {"duration_s": 2, "perception.detector": "surrogate"})

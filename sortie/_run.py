@@ -1,4 +1,4 @@
-"""`Run`: one flown sortie, with everything that can be asked of it."""
+"""`Run`: one flown sortie, with its record, outcome and pages."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class UnknownMetricError(SortieError, KeyError):
 
 
 class Metrics(dict[str, float]):
-    """Numbers by their dotted names.
+    """Metrics by name, as a dict: `metrics["ap50.mission"]`.
 
     Raises:
-        UnknownMetricError: no such number, with the name that was probably meant.
+        UnknownMetricError: there is no metric of this name; the error suggests a similar one.
     """
 
     def __missing__(self, name: str) -> float:
@@ -47,9 +47,9 @@ class Metrics(dict[str, float]):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One flown sortie: its record, and what follows from it.
+    """One flown sortie: its record, and what is computed from it.
 
-    Made by `sortie.fly` and `sortie.open_run`.
+    `sortie.fly` and `sortie.open_run` return it.
 
     Example:
         >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
@@ -60,13 +60,13 @@ class Run:
     """
 
     record: SortieRecord
-    """Everything that the sortie left behind (`sortie.sim.results.record.SortieRecord`)."""
+    """Everything that happened in the sortie (`sortie.sim.results.record.SortieRecord`)."""
     path: Path | None = None
     """The folder that it was read from; None for a run that was just flown."""
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario as it was flown, every default filled in."""
+        """The scenario as it was flown, with every default filled in."""
         return self.record.scenario
 
     @property
@@ -81,7 +81,7 @@ class Run:
 
     @property
     def replication(self) -> int:
-        """Which repetition with other random draws this is; 0 is the first."""
+        """The number of the repetition; each has other random draws. 0 is the first."""
         return self.record.replication
 
     @property
@@ -105,14 +105,14 @@ class Run:
 
     @cached_property
     def outcome(self) -> dict[str, Any]:
-        """All figures of the sortie, nested as in `outcome.json`. Ratios of nothing are None."""
+        """All figures of the sortie, nested as in `outcome.json`. A ratio with a denominator of 0 is None."""
         return outcome(self.record)
 
     @property
     def metrics(self) -> Metrics:
-        """The outcome's numbers by their dotted names, as `expect`, `compare` and campaigns use them.
+        """The numbers of the outcome by name, such as `ap50.mission`, as `expect`, `compare` and campaigns use them.
 
-        Ratios of nothing are left out. A name that is not there raises a `SortieError` that is a `KeyError` too.
+        Numbers without a value are left out. An unknown name raises a `SortieError` that is a `KeyError` too.
 
         Example:
             >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
@@ -122,9 +122,9 @@ class Run:
         return Metrics(numbers(self.outcome))
 
     def summary(self) -> Summary:
-        """What the fleet saw and what it cost, as the table that `sortie fly` prints.
+        """Accuracy, bytes, energy and delays, as the table that `sortie fly` prints.
 
-        A notebook shows it, `rich` prints it, and `str` gives plain text.
+        A notebook and `rich` show it as a table; `str` returns plain text.
 
         Example:
             >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
@@ -136,7 +136,7 @@ class Run:
         return Summary(outcome_table(self.outcome))
 
     def decisions(self) -> Summary:
-        """What the links carried from when on and why, with the events, as the table that `sortie fly` prints.
+        """When each link changed what it carries, and why, with all events: the second table that `sortie fly` prints.
 
         Example:
             >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
@@ -150,11 +150,11 @@ class Run:
     def save(self, path: str | Path, *, recording: bool = True, replace: bool = False) -> Path:
         """Write the run's folder: outcome, tables as Parquet, scenario and, unless `recording` is False, `sortie.rrd`.
 
-        The folder is written whole or not at all. The same run may be there already, with the same fingerprint. Another
-        run is replaced only where `replace` is True.
+        The folder is written completely or not at all. It may already have the same run, with the same fingerprint.
+        Another run is replaced only if `replace` is True.
 
         Raises:
-            RunError: the folder holds another run, or something that is no run; or the disk refuses.
+            RunError: the folder has another run, or other files; or it cannot be written.
         """
 
         def add_recording(folder: Path) -> None:
@@ -167,7 +167,7 @@ class Run:
         return place
 
     def report(self, path: str | Path) -> Path:
-        """Write the run as one HTML page that needs nothing else.
+        """Write the run as one HTML page that loads no other files.
 
         Raises:
             RunError: the page cannot be written, or matplotlib is missing.

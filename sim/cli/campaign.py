@@ -78,7 +78,7 @@ def run(
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Fly failed runs again.")] = False,
     report_: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
 ) -> None:
-    """Fly a campaign. After an interruption the same command continues it; the table is the same in the end."""
+    """Fly a campaign. After an interruption, the same command continues it and gives the same table."""
     folder = out_dir
     try:
         with ended_by_sigterm():

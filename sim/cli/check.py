@@ -36,7 +36,7 @@ def check(
         Path | None, typer.Option("--junit", help="Write the verdicts as JUnit XML too, for build servers.")
     ] = None,
 ) -> None:
-    """Fly scenarios and compare their outcomes with their own expectations. Exit code 1 if one fails."""
+    """Fly scenarios and test the expectations that they state. Exit code 1 if one fails."""
     from sortie.sim.check.checking import flights
     from sortie.sim.check.discovery import scenario_files
 

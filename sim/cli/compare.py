@@ -25,14 +25,14 @@ def compare(
     policies: Annotated[
         str,
         typer.Option(
-            help="Policies separated by commas: worked,best-2(received_budget=0.1),silence. With conditions, all: every policy."
+            help="Policies separated by commas: worked,best-2(received_budget=0.1),silence. With conditions, `all` means every policy."
         ),
     ],
     seed: SeedOption = None,
     seeds: Annotated[
         int | None,
         typer.Option(
-            help="Fly this many seeds, from --seed or the scenario's own on, each in a town of its own. Left out: 8 with "
+            help="Fly this many seeds, beginning with --seed or the scenario's, each in its own town. Default: 8 with "
             "the surrogate and no --seed, else 1.",
             min=1,
         ),

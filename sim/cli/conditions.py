@@ -122,7 +122,7 @@ def learn(
     by_torch: Annotated[
         bool,
         typer.Option(
-            "--by-torch", help="Score with the torch detector what the surrogate flies; half an hour on one core."
+            "--by-torch", help="Fly with the surrogate, score with the torch detector; takes half an hour on one core."
         ),
     ] = False,
     out_file: Annotated[
@@ -130,7 +130,7 @@ def learn(
         typer.Option("--out", help="File for the fit; `learned` flies with policies/catalogue/learned.json."),
     ] = Path("runs/learned.json"),
 ) -> None:
-    """Fit the policy `learned`: fly every choice in random conditions, and regress AP on what a policy sees."""
+    """Fit the policy `learned`: fly each of its choices in random conditions, and fit the gain in AP."""
     from sortie.sim.studies.learn import BUDGETS, fly_lessons, gains, save, thresholds
 
     ensure_files(out_file)

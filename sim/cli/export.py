@@ -45,7 +45,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write a run as a ROS 2 bag, for `ros2 bag play` and Foxglove, as a log for ground stations, or as packets."""
+    """Write a run for other tools: a ROS 2 bag (also for Foxglove), a log for ground stations, or a packet capture."""
     if mcap + tlog + pcap != 1:
         raise typer.BadParameter("name one format: --mcap, --tlog or --pcap")
     if key is not None and not tlog:

@@ -57,7 +57,7 @@ def import_log(
         ),
     ] = None,
 ) -> None:
-    """Make a log's flight a context trace (pose, velocity, battery, signal) and a scenario that flies it.
+    """Turn a flight log into a context trace (pose, velocity, battery, signal) and a scenario that flies it.
 
     Telemetry of several vehicles becomes several drones, by ascending system id. Gaps, restarts, damaged and missing
     messages are reported and skipped. Gaps are empty cells of the trace.

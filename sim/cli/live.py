@@ -52,7 +52,7 @@ def live(
     fallback: Annotated[
         str,
         typer.Option(
-            metavar="RUNG@HZ", help="What links get while a policy gives no answer: detections, tracks, none."
+            metavar="RUNG@HZ", help="What links carry while a policy does not answer: detections, tracks, none."
         ),
     ] = "detections@2",
     decide_within: Annotated[
@@ -79,10 +79,10 @@ def live(
     set_: SetOption = None,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write all measurements to this JSON file.")] = None,
 ) -> None:
-    """Run the context plane in real time over DDS: one process a drone, with publisher, policy node and gate.
+    """Run the context plane in real time over DDS: one process for each drone, with publisher, policy node and gate.
 
     Topics, types and QoS are those of ROS 2, so that its nodes can join: /fleet/context, /drone_0/to_drone_1/directive.
-    Ctrl-C ends the flight and reports what has been measured.
+    Ctrl-C ends the flight and prints the measurements.
     """
     try:
         number = int(os.environ.get("ROS_DOMAIN_ID", "0")) if domain is None else domain

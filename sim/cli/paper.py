@@ -77,9 +77,9 @@ def paper(
     ego: Annotated[int, typer.Option(help="With --frame: the ego, whose peers' cells are shown.", min=0)] = 0,
     show: Annotated[bool, typer.Option("--view", help="With --frame: open the viewer.")] = False,
 ) -> None:
-    """The paper's Evaluation, claim by claim: its value, ours, and a verdict by rule.
+    """Measure the claims of the paper's Evaluation again: its value, ours, and a verdict for each.
 
-    What is finished is kept, so that a run that was cut off goes on where it was.
+    Finished frames are kept, so an interrupted run continues.
     """
     from sortie.perception.evaluation import figures, rows
     from sortie.perception.evaluation.results import TableSettings

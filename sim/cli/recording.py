@@ -41,7 +41,7 @@ def evaluate(
     tau: Annotated[float, typer.Option(help="Score threshold.")] = 0.1,
     save: Annotated[Path | None, typer.Option("--out", help="Write every match as Parquet here.")] = None,
 ) -> None:
-    """AP and bytes of a recording under several ways of sharing. Without --fusion, boxes arrive with their cells."""
+    """Compute AP and bytes of a recording under several ways of sharing. Without --fusion, boxes arrive with their cells."""
     from sortie.perception.evaluation.condition import Sharing
     from sortie.perception.evaluation.matched import FLOOR
     from sortie.perception.recordings.instrument import evaluate_recording

@@ -25,9 +25,9 @@ def replay(
     ] = False,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write every difference here, as CSV.")] = None,
 ) -> None:
-    """Decide again over the recorded views of a run, and print where the decisions differ and why.
+    """Repeat the decisions of a run on its recorded views, and print where they differ and why.
 
-    Without --policy the policies that flew decide again. The recorded world does not answer to other decisions.
+    Without --policy the policies that flew decide again. A different decision does not change later views.
     """
     ensure_files(out_file)
     replayed = sortie.replay(sortie.open_run(run), policy, disagreement=disagreement)

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from sortie.perception.study.measure import StudyRow
 
 study = typer.Typer(
-    no_args_is_help=True, help="The study of why the flip exists: train its networks, measure them, write the report."
+    no_args_is_help=True,
+    help="The study of the flip (does the best choice of peers change with the budget?): train, measure, report.",
 )
 TABLE, REPORT = "study.parquet", "README.md"
 WorkOption = Annotated[Path, typer.Option("--work", help="Folder for weights, checkpoints and finished frames.")]

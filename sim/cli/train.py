@@ -54,7 +54,7 @@ def train(
     seed: Annotated[int, typer.Option(help="Seed of weights and batches.", min=0)] = 0,
     peak_lr: Annotated[float, typer.Option(help="The cycle's highest learning rate.")] = 2.5e-3,
     cell_dropout: Annotated[
-        float, typer.Option(help="Share of the links whose cells are randomly dropped, 0 to 1.", min=0, max=1)
+        float, typer.Option(help="Share of the links on which cells are randomly dropped, 0 to 1.", min=0, max=1)
     ] = 0.0,
     unsent: Annotated[Unsent, typer.Option(help="How a dropped cell enters the fusion in training.")] = Unsent.masked,
     fusion: Annotated[
@@ -72,14 +72,19 @@ def train(
         typer.Option(help="Share of the steps on dense scenes, any height and differing headings.", min=0, max=1),
     ] = 0.0,
     precision: Annotated[
-        Precision, typer.Option(help="Of the passes; bfloat16 takes about half the time where the processor has it.")
+        Precision,
+        typer.Option(
+            help="Precision of the computation; bfloat16 takes about half the time if the processor supports it."
+        ),
     ] = Precision.float32,
     range_: Annotated[Range, typer.Option("--range", help="How far the grids reach, ± metres.")] = Range.full,
     bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
     bench_dir: Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")] = Path("runs/bench"),
     warm_start: Annotated[
         Path | None,
-        typer.Option(help="Start from this weights file, or from those shipped for a fusion, where shapes fit."),
+        typer.Option(
+            help="Start from this weights file, or from the shipped weights of a fusion, as far as shapes fit."
+        ),
     ] = None,
     minutes: Annotated[float | None, typer.Option(help="Stop after this many minutes.", min=0.1)] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda; default: cuda where available.")] = None,

@@ -79,11 +79,15 @@ def verify(
 ) -> None:
     """Test a policy or another model against the rules of its kind. Exit code 1 if a rule fails.
 
-    A policy is tried on random views, and its properties are proved. The options apply to policies alone. Each verdict says
-    what it covers: *proved* for all views of fleets up to a size, *proved over the reals*, *searched*, or *drawn* views alone.
-    Lines about time (`within 0.5 s: …`, `climbs_in(dwell) <= 1`) are judged on what the gates enforce, after staleness
-    rules and damping, over courses of views. Exit code 1 too if a property is refuted. A counterexample is a view as JSON,
-    and a scenario that shows it to the policy in flight: `sortie check` on it fails until the policy is mended.
+    The options are for policies. A policy is tested on random views, and its properties (*invariants*) are proved.
+    Each verdict says what it covers: *proved* for all views of fleets up to a size, *proved over the reals*, *searched*
+    (some of all views), or *drawn* (random views alone). The exit code is also 1 if a property is refuted.
+
+    Invariants about time (`within 0.5 s: …`, `climbs_in(dwell) <= 1`) are tested on sequences of views. What counts is
+    what the gates enforce, after staleness rules and damping.
+
+    A counterexample is written as a view (JSON), and as a scenario in which the policy meets that view in flight.
+    `sortie check` on this scenario fails until the policy is corrected.
     """
     kind, reference = model if len(model) == 2 else ("policy", model[0])
     if len(model) > 2 or (model[0] in KITS and len(model) == 1):

@@ -22,7 +22,7 @@ def view(
         float, typer.Option("--at", help="With --picture: the simulated time that it shows, s.", min=0)
     ] = 0.0,
 ) -> None:
-    """Open a run's recording in the Rerun viewer; where the run has none, it is made for the occasion."""
+    """Open a run's recording in the Rerun viewer. If the run has none, it is made now."""
     if at_s and picture is None:
         raise RunError("--at goes with --picture: the viewer has a time line of its own")
     opened = sortie.open_run(run)

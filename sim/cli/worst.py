@@ -19,9 +19,12 @@ def worst(
     count: Annotated[int, typer.Option(help="How many runs to show.", min=1)] = 10,
     policy: Annotated[str | None, typer.Option(help="Runs of this policy alone.")] = None,
     most: Annotated[
-        bool | None, typer.Option("--most/--least", help="Whether more of the metric is worse; default: as is known.")
+        bool | None,
+        typer.Option("--most/--least", help="Whether high or low values are worse; default: by the metric."),
     ] = None,
-    fly: Annotated[int, typer.Option(help="Fly so many of them again, below the campaign's folder.", min=0)] = 0,
+    fly: Annotated[
+        int, typer.Option(help="Fly this many of them again, into folders below the campaign's.", min=0)
+    ] = 0,
 ) -> None:
     """Show the worst runs by a metric, and the commands that fly them again."""
     with user_errors():
