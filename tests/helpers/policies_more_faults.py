@@ -20,7 +20,7 @@ COUNTS = (
 SIZES = (
     "bad = X >= N", "bad = X > N", "bad = not X < N", "bad = X // N >= 1", "bad = X * 2 >= 2 * N",
     "bad = any(k >= N - 1 for k in range(X))", "bad = list(range(X))[N - 1:] != []", "bad = bool(list(range(X))[N:])",
-    "n = X\nwhile n >= N:\n    bad, n = True, 0", "bad = (X - N) >= 0", "bad = X.bit_length() >= N.bit_length() + 1",
+    "n = X\nwhile n >= N:\n    bad, n = True, 0", "bad = (X - N) >= 0", "bad = (X).bit_length() >= (N).bit_length() + 1",
     "bad = [2, 20][X >= N] == 20", "bad = min(X, N) == N", "bad = max(X, N - 1) >= N", "bad = math.log2(X) >= math.log2(N)",
     "try:\n    list(range(X))[N - 1]\n    bad = True\nexcept IndexError:\n    pass",
     "match list(range(X)):\n    case [*most] if len(most) >= N:\n        bad = True",

