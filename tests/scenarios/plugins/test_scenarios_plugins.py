@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from installed_package import installed_package
 
 from sortie.scenarios.plugins.reference import (
     Guard,
     PluginError,
     checked_array,
     checked_call,
-    installed,
     name_of,
     package_of,
     resolve,
@@ -36,19 +36,11 @@ class Fails:
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def package(tmp_path: Path) -> Iterator[str]:
     """An installed package that offers a path loss, and one that does not load."""
-    (tmp_path / "drizzle.py").write_text("def wet(distance_m, *, db=2.0):\n    return distance_m * db\n")
-    about = tmp_path / "drizzle-1.2.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: drizzle\nVersion: 1.2\n")
-    (about / "RECORD").write_text("drizzle.py,,\n")
-    (about / "entry_points.txt").write_text("[sortie.path_loss]\nwet = drizzle:wet\nbroken = nowhere:x\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    installed.cache_clear()
-    yield "wet"
-    installed.cache_clear()
-    sys.modules.pop("drizzle", None)
+    source = "def wet(distance_m, *, db=2.0):\n    return distance_m * db\n"
+    with installed_package(tmp_path, "drizzle", source, {"path_loss": {"wet": "drizzle:wet", "broken": "nowhere:x"}}):
+        yield "wet"
 
 
 def test_a_built_in_name_comes_with_its_parameters() -> None:

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 from cli_examples import command
+from installed_package import installed_package
 from places import ROOT
 
-from sortie.scenarios.plugins.reference import PluginError, installed
+from sortie.scenarios.plugins.reference import PluginError
 from sortie.sim.check.kits import KITS, verify
 from sortie.sim.check.model_rules import plain
 
@@ -219,19 +220,13 @@ def test_values_are_compared_by_what_they_hold() -> None:
 
 
 def test_an_installed_model_is_listed_with_its_parameters_and_verified(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "drizzle.py").write_text(
+    source = (
         'import numpy as np\n\ndef wet(distance_m, a, b, ghz, *, db=2.0):\n    """Rain everywhere."""\n'
         "    return 60 + 20 * np.log10(np.maximum(distance_m, 1.0)) + db\n"
     )
-    about = tmp_path / "drizzle-1.2.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: drizzle\nVersion: 1.2\n")
-    (about / "entry_points.txt").write_text("[sortie.path_loss]\nwet = drizzle:wet\nbroken = nowhere:x\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    installed.cache_clear()
-    try:
+    with installed_package(tmp_path, "drizzle", source, {"path_loss": {"wet": "drizzle:wet", "broken": "nowhere:x"}}):
         assert command("list", "path_loss") == 0
         lines = capsys.readouterr().out.splitlines()
         assert "wet(db=2.0)  Rain everywhere. (drizzle 1.2)" in lines
@@ -239,5 +234,3 @@ def test_an_installed_model_is_listed_with_its_parameters_and_verified(
             line.startswith("broken  (drizzle 1.2) path_loss 'broken' of drizzle does not load: Mod") for line in lines
         )
         assert command("verify", "path_loss", "wet(db=0)") == 0
-    finally:
-        installed.cache_clear()

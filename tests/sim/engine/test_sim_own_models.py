@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from installed_package import installed_package
 from sim_examples import example
 
 from sortie.scenarios.errors import SortieError
-from sortie.scenarios.plugins.reference import installed
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.report import page
@@ -183,27 +183,18 @@ def test_a_metric_that_is_no_number_is_told(function: str, message: str, models:
         fly(f"metrics={{all: {{model: '{models}:{function}'}}}}")
 
 
-def test_a_run_is_read_without_the_package_that_offered_its_models(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_read_without_the_package_that_offered_its_models(tmp_path: Path) -> None:
     """Every kind of name; a new flight still needs them."""
-    shutil.copy(SOURCE, tmp_path / "drizzle.py")
-    about = tmp_path / "drizzle-1.2.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: drizzle\nVersion: 1.2\n")
     offers = {"path_loss": "wall", "link": "Noisy", "detector": "Omniscient", "power": "constant", "sensor": "drifts",
               "event": "Storm", "metric": "sent"}  # fmt: skip
-    (about / "entry_points.txt").write_text("".join(f"[sortie.{k}]\nmine = drizzle:{n}\n" for k, n in offers.items()))
     names = (
         "radio={path_loss: mine, link: mine}", "perception={detector: mine, fusion: none}", "fleet.airframe={power_model: mine}",
         "fleet.sensor=mine", "events=[{kind: own, at_s: 1, model: mine}]", "metrics={m: {model: mine}}",
     )  # fmt: skip
-    with monkeypatch.context() as there:
-        there.syspath_prepend(str(tmp_path))
-        installed.cache_clear()
+    models = {kind: {"mine": f"drizzle:{name}"} for kind, name in offers.items()}
+    with installed_package(tmp_path, "drizzle", SOURCE.read_text(), models):
         record = run_sortie(example("duration_s=2", *names))
         save(record, tmp_path / "run")
-    installed.cache_clear()
     again = load(tmp_path / "run")
     assert again.fingerprint == record.fingerprint
     assert outcome(again) == outcome(record)
