@@ -9,7 +9,7 @@ from sortie.scenarios.errors import SortieError
 from sortie.sim.folders import RunError
 
 EXTRAS = {"matplotlib": "report", "SALib": "campaign", "threadpoolctl": "campaign", "cyclonedds": "dds", "pettingzoo": "env",
-          "gymnasium": "env", "rosbags": "ros2", "zarr": "zarr", "distributed": "campaign", "torch": "torch"}  # fmt: skip
+          "gymnasium": "env", "rosbags": "ros2", "zarr": "zarr", "distributed": "campaign", "torch": "torch", "rerun": "view", "pymavlink": "mavlink"}  # fmt: skip
 """Which extra brings a library that not everybody needs."""
 
 

@@ -181,11 +181,12 @@ class Comparison:
         flown = Flown(self.sorties, self.gains)
         return Summary(comparison_table(flown), *explanations(flown))
 
+    @user_errors()
     def save_recording(self, path: str | Path) -> Path:
         """Save the policies' sorties of the first seed side by side as one Rerun recording.
 
         Raises:
-            RunError: the file cannot be written.
+            RunError: the file cannot be written, or Rerun is missing (extra `view`).
         """
         from sortie.sim.playback.recording import save_comparison
 

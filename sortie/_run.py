@@ -17,6 +17,7 @@ from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.user_errors import missing, user_errors
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -147,23 +148,30 @@ class Run:
 
         return Summary(transitions_table(self.outcome))
 
-    def save(self, path: str | Path, *, recording: bool = True, replace: bool = False) -> Path:
-        """Write the run's folder: outcome, tables as Parquet, scenario and, unless `recording` is False, `sortie.rrd`.
+    def save(self, path: str | Path, *, recording: bool | None = None, replace: bool = False) -> Path:
+        """Write the run's folder: outcome, tables as Parquet, scenario, and the recording for Rerun (`sortie.rrd`).
+
+        `recording` says whether the recording is written. None writes it if Rerun is installed (extra `view`).
 
         The folder is written completely or not at all. It may already have the same run, with the same fingerprint.
         Another run is replaced only if `replace` is True.
 
         Raises:
-            RunError: the folder has another run, or other files; or it cannot be written.
+            RunError: the folder has another run, or other files; it cannot be written; or `recording` is True and Rerun
+                is missing.
         """
 
         def add_recording(folder: Path) -> None:
-            from sortie.sim.playback.recording import save_rrd
-
+            try:
+                from sortie.sim.playback.recording import save_rrd
+            except ImportError as error:
+                if recording:
+                    raise missing(error) from error
+                return
             save_rrd(self.record, folder / run_folder.RECORDING)
 
         place = as_path("path", path)
-        run_folder.save(self.record, place, add_recording if recording else None, replace=replace)
+        run_folder.save(self.record, place, None if recording is False else add_recording, replace=replace)
         return place
 
     def report(self, path: str | Path) -> Path:
@@ -178,17 +186,19 @@ class Run:
         save_page(self.record, place)
         return place
 
+    @user_errors()
     def view(self) -> None:
         """Open the run in the Rerun viewer and wait until it is closed.
 
         Raises:
-            RunError: no viewer or no display.
+            RunError: no viewer or no display; or Rerun is missing (extra `view`).
         """
         from sortie.sim.playback.viewer import open_viewer
 
         with tempfile.TemporaryDirectory() as made:
             open_viewer(self._recording(Path(made)))
 
+    @user_errors()
     def picture(self, path: str | Path, at_s: float = 0.0) -> Path:
         """Save what the viewer shows at simulated time `at_s` as a PNG file. It needs no screen.
 
@@ -196,7 +206,7 @@ class Run:
             UserWarning: what a view of the viewer could not draw.
 
         Raises:
-            RunError: the viewer cannot draw here, or the file cannot be written.
+            RunError: the viewer cannot draw here, the file cannot be written, or Rerun is missing (extra `view`).
         """
         from sortie.sim.playback.picture import take_picture
 

@@ -1,8 +1,6 @@
 """Drone states as MAVLink 2 messages, and as a telemetry log that ground stations open.
 
-MAVLink is NED, FRD and w-first quaternions in scaled integers; `sortie.fleet.flight.frames` does the turning. Positions on the
-globe lie on a plane through a stated origin, with the WGS-84 ellipsoid's two radii of curvature there: within 5 km
-of the origin the error stays below 2 m · tan(latitude) horizontally, and height is height above the plane.
+MAVLink is NED, FRD and w-first quaternions in scaled integers; `sortie.fleet.flight.frames` does the turning.
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ from pathlib import Path
 from pymavlink.dialects.v20 import common as mavlink2
 
 from sortie.fleet.flight.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, yaw_rad
+from sortie.fleet.logs.geodesy import Origin, geodetic
 
 _SENSORS = (
     mavlink2.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -31,35 +30,12 @@ _SENSORS = (
 )
 _UNKNOWN_U16 = 0xFFFF
 _MAX_I16 = 0x7FFF
-_FARTHEST_UP_M = 100_000.0
-"""Of an origin; altitudes go in 32-bit millimetres."""
 LOG_STAMP = struct.Struct(">Q")
 """Before each frame of a telemetry log: µs since 1970."""
 SIGNING_EPOCH_US = 1_420_070_400_000_000
 """2015-01-01, from which the clocks of signed frames count."""
 _BAD_SIGNATURE = "Invalid signature"
 """pymavlink's reason."""
-
-
-Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Where ENU (0, 0, 0) lies: WGS-84 degrees, metres above mean sea level."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (abs(self.latitude_deg) <= 85 and abs(self.longitude_deg) <= 180):
-            raise ValueError(
-                f"origin is ({self.latitude_deg}, {self.longitude_deg}), must lie within ±85° and ±180°: a local "
-                "east and north mean nothing at a pole"
-            )
-        if not abs(self.altitude_m) <= _FARTHEST_UP_M:
-            raise ValueError(f"its altitude is {self.altitude_m} m, must be within ±{_FARTHEST_UP_M:g} m")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,33 +57,6 @@ class Telemetry:
     landed: bool
     ground_station: bool = False
     """Whether it is no vehicle."""
-
-
-def geodetic(position_m: tuple[float, float, float], origin: Origin) -> tuple[float, float, float]:
-    """ENU metres to latitude and longitude in degrees and altitude in metres."""
-    east_m, north_m = _metres_per_radian(origin)
-    east, north, up = position_m
-    latitude = origin.latitude_deg + math.degrees(north / north_m)
-    longitude = origin.longitude_deg + math.degrees(east / east_m)
-    return latitude, (longitude + 180) % 360 - 180, origin.altitude_m + up
-
-
-def local_enu(latitude_deg: float, longitude_deg: float, altitude_m: float, origin: Origin) -> Vector:
-    """The inverse of `geodetic`: ENU metres."""
-    east_m, north_m = _metres_per_radian(origin)
-    east_deg = (longitude_deg - origin.longitude_deg + 180) % 360 - 180
-    north_deg = latitude_deg - origin.latitude_deg
-    return math.radians(east_deg) * east_m, math.radians(north_deg) * north_m, altitude_m - origin.altitude_m
-
-
-def _metres_per_radian(origin: Origin) -> tuple[float, float]:
-    """Metres eastward per radian of longitude and northward per radian of latitude, on the WGS-84 ellipsoid."""
-    a, e2 = 6378137.0, 6.69437999014e-3
-    phi = math.radians(origin.latitude_deg)
-    w = math.sqrt(1 - e2 * math.sin(phi) ** 2)
-    meridian_m = a * (1 - e2) / w**3 + origin.altitude_m
-    normal_m = a / w + origin.altitude_m
-    return normal_m * math.cos(phi), meridian_m
 
 
 def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]:

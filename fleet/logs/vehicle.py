@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sortie.fleet.flight.frames import swap_attitude, swap_enu_ned, to_xyzw
-from sortie.fleet.logs.mavlink import Origin, Vector, local_enu
+from sortie.fleet.logs.geodesy import Origin, Vector, local_enu
 
 WANTED_HZ = {30: 20.0, 31: 20.0, 32: 20.0, 33: 20.0, 1: 1.0, 147: 1.0, 245: 1.0}
 """Messages that a drone asks its vehicle for, by id: ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED,

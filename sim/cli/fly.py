@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -63,7 +64,13 @@ def fly(
             metavar="FILE", help="With --mavlink: sign messages with the key in this file (32 bytes or 64 hex digits)."
         ),
     ] = None,
-    recording: Annotated[bool, typer.Option(help="Save the Rerun recording, sortie.rrd.")] = True,
+    recording: Annotated[
+        bool | None,
+        typer.Option(
+            "--recording/--no-recording",
+            help="Save the Rerun recording, sortie.rrd. Without this option it is saved if Rerun is installed.",
+        ),
+    ] = None,
     profile: Annotated[bool, typer.Option("--profile", help="Print how the wall-clock time was spent.")] = False,
     campaign: Annotated[
         Path | None,
@@ -88,6 +95,8 @@ def fly(
         run_folder.ensure_same(path, flown, drawn, number, files)
     if words := ensure_room(flown, path, force=force):
         err.print(f"{flown.name}: {words}", soft_wrap=True)
+    if view_ or recording:
+        import_module("sortie.sim.playback.recording")  # a missing Rerun is reported before the flight
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
@@ -103,8 +112,11 @@ def fly(
     out.print(flight.summary())
     out.print(flight.decisions())
     report(flight.outcome)
-    see = f", see it with: sortie view {path}" if recording else ""
+    recorded = (path / run_folder.RECORDING).is_file()
+    see = f", see it with: sortie view {path}" if recorded else ""
     out.print(f"kept in [bold]{path}[/bold]{escape(note)}{see}", soft_wrap=True)
+    if not recorded and recording is None:
+        out.print("without a recording, as Rerun is missing: pip install 'sortie-sim[view]'", markup=False)
     if expected is not None:
         same = "is" if flight.fingerprint[:16] == expected else "[red]is not[/red]"
         out.print(f"the record {same} the campaign's")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -92,7 +94,7 @@ def train(
 ) -> None:
     """Train the detector on the benchmark's train split. An interrupted run continues.
 
-    Loss and validation AP are kept as CSV and as a Rerun recording (training.rrd) beside the weights.
+    Loss and validation AP are kept as CSV beside the weights, and if Rerun is installed as its recording (training.rrd).
     """
     from sortie.perception.benchmark.dataset import Benchmark  # here: torch takes a second to import
     from sortie.perception.geometry import Geometry
@@ -104,7 +106,6 @@ def train(
     from sortie.perception.training.train import train as train_detector
     from sortie.scenarios.plugins.reference import resolve
     from sortie.sim.cli import tables
-    from sortie.sim.playback.training import TrainingLog
 
     half_extent_m = float(range_.value)
     with user_errors():  # before scenes are rendered, which takes minutes
@@ -128,8 +129,7 @@ def train(
             raise ValueError(f"{warm_start}: no such weights")
         ensure_files(out_file)
     config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value, grid.value)
-    curves = TrainingLog(out_file.parent / "training.rrd", out_file.stem)
-    with stages() as progress, user_errors():
+    with stages() as progress, user_errors(), _curves(out_file) as scalars:
         result = train_detector(
             out_file,
             recipe,
@@ -141,7 +141,19 @@ def train(
             resume=resume,
             device=device,
             progress=progress,
-            scalars=curves.log,
+            scalars=scalars,
         )
-    curves.close()
     out.print(tables.training_table(result))
+
+
+@contextmanager
+def _curves(weights: Path) -> Iterator[Callable[[int, dict[str, float]], None] | None]:
+    """Keeps curves as a recording beside the weights; None if Rerun is missing."""
+    try:
+        from sortie.sim.playback.training import TrainingLog
+    except ImportError:
+        yield None
+        return
+    log = TrainingLog(weights.parent / "training.rrd", weights.stem)
+    yield log.log
+    log.close()

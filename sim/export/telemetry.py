@@ -13,17 +13,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from sortie.fleet.logs.mavlink import (
-    KEY_BYTES,
-    STATUS,
-    Listener,
-    Origin,
-    Telemetry,
-    Transmitter,
-    answers,
-    messages,
-    write_tlog,
-)
+from sortie.fleet.logs.geodesy import Origin
+from sortie.fleet.logs.mavlink import KEY_BYTES, STATUS, Listener, Telemetry, Transmitter, answers, messages, write_tlog
 from sortie.fleet.traces import flown_at
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Fleet, Scenario

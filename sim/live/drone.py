@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
 from sortie.fleet.agent import Agent
-from sortie.fleet.logs.mavlink import Origin
+from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.memory import PeerMemory
 from sortie.policies.contract import Directive, FleetView, PolicyError
 from sortie.scenarios.schema import Scenario

@@ -14,7 +14,8 @@ import numpy as np
 from sortie.fleet.agent import Platform, Task
 from sortie.fleet.coverage import Poses, footprint_radius_m, views
 from sortie.fleet.flight.frames import yaw_rad
-from sortie.fleet.logs.mavlink import Companion, Listener, Origin
+from sortie.fleet.logs.geodesy import Origin
+from sortie.fleet.logs.mavlink import Companion, Listener
 from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
 from sortie.fleet.plane import PlaneRules
 from sortie.fleet.senses import Sensed

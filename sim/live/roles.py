@@ -24,7 +24,7 @@ import simpy
 from sortie.fleet.agent import Agent
 from sortie.fleet.coverage import View
 from sortie.fleet.flight.frames import yaw_rad
-from sortie.fleet.logs.mavlink import Origin
+from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.senses import Sensed
 from sortie.fleet.staleness import cap_by_age, health

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from sortie.fleet.logs.mavlink import Origin
+from sortie.fleet.logs.geodesy import Origin
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
 from sortie.sim.export.telemetry import parse_address

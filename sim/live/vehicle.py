@@ -14,7 +14,8 @@ from typing import Annotated
 
 import typer
 
-from sortie.fleet.logs.mavlink import STATUS, Origin, Telemetry, Transmitter, messages
+from sortie.fleet.logs.geodesy import Origin
+from sortie.fleet.logs.mavlink import STATUS, Telemetry, Transmitter, messages
 from sortie.sim.export.telemetry import ORIGIN, parse_address
 from sortie.sim.live.seals import read_own_key
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import rerun as rr
@@ -18,13 +17,8 @@ class TrainingLog:
         self._recording = rr.RecordingStream("sortie_training", recording_id=name)
         self._recording.save(path)
 
-    @property
-    def scalars(self) -> Callable[[int, dict[str, float]], None]:
-        """What `sortie.perception.training.train` calls: (step, values by entity path)."""
-        return self.log
-
     def log(self, step: int, values: dict[str, float]) -> None:
-        """One row."""
+        """One row: values by entity path."""
         self._recording.set_time(STEP, sequence=step)
         for name, value in values.items():
             self._recording.log(name, rr.Scalars(value))

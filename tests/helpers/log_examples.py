@@ -6,7 +6,8 @@ import struct
 
 import numpy as np
 
-from sortie.fleet.logs.mavlink import Origin, Telemetry, Transmitter, geodetic, messages
+from sortie.fleet.logs.geodesy import Origin, geodetic
+from sortie.fleet.logs.mavlink import Telemetry, Transmitter, messages
 
 ORIGIN = Origin(47.0, 8.0, 400.0)
 STEPS = 100

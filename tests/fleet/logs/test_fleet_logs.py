@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from sortie.fleet.logs.dataflash import RawLog, read_dataflash
 from sortie.fleet.logs.fields import from_dataflash, from_ulog
 from sortie.fleet.logs.flightlog import FlightLog, LogError, _assemble, local_m, read_log
+from sortie.fleet.logs.geodesy import geodetic
 from sortie.fleet.logs.identify import predicted_voltage
-from sortie.fleet.logs.mavlink import geodetic
 from sortie.fleet.logs.tlog import read_tlog
 from sortie.fleet.logs.ulog import read_ulog
 from sortie.scenarios.schema import Battery

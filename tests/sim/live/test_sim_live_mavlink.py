@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from sim_examples import example
 from typer.testing import CliRunner
 
-from sortie.fleet.logs.mavlink import Companion, Listener, Origin, Transmitter, geodetic, local_enu, messages
+from sortie.fleet.logs.geodesy import Origin, geodetic, local_enu
+from sortie.fleet.logs.mavlink import Companion, Listener, Transmitter, messages
 from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
 from sortie.policies.contract import TaskPhase
 from sortie.sim.cli.app import app
