@@ -44,6 +44,9 @@ def export(
             metavar="FILE", help="With --tlog: sign the frames with the key in this file (32 bytes or 64 hex digits)."
         ),
     ] = None,
+    drone: Annotated[
+        int | None, typer.Option(help="With --tlog: the log of this drone alone; default: all.", min=0)
+    ] = None,
 ) -> None:
     """Write a run for other tools: a ROS 2 bag (also for Foxglove), a log for ground stations, or a packet capture."""
     if mcap + tlog + pcap != 1:
@@ -52,6 +55,8 @@ def export(
         raise typer.BadParameter("--key signs --tlog alone")
     if origin is not None and not tlog:
         raise typer.BadParameter("--origin places --tlog alone")
+    if drone is not None and not tlog:
+        raise typer.BadParameter("--drone selects from --tlog alone")
     # ROS counts seconds in 32 bits, signatures from 2015 on; beyond 2096 a log's stamps are no times
     first, end = (1970, 2038) if mcap or pcap else (2015 if key is not None else 1970, 2096)
     began_us = (moment(begin, first, end) - EPOCH) // timedelta(microseconds=1)
@@ -61,7 +66,7 @@ def export(
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
         where = None if origin is None else parse_origin(origin)
         try:
-            frames = save_tlog(run_folder.load(run), path, began_us, where, secret)
+            frames = save_tlog(run_folder.load(run), path, began_us, where, secret, drone)
         except TraceError as error:
             raise RunError(f"{error}; the log's origin is in it, or --origin names one") from error
         out.print(f"{frames} MAVLink frames, in [bold]{path}[/bold]", soft_wrap=True)
