@@ -12,8 +12,6 @@ from collections.abc import Mapping
 
 from pymavlink.dialects.v20 import common as mavlink2
 
-Message = mavlink2.MAVLink_message
-
 TEXT_BYTES = 50
 """Of one STATUSTEXT; longer texts go in several."""
 _LONGEST_TEXT = TEXT_BYTES * 0xFF
@@ -32,7 +30,7 @@ _FTP_SEQUENCE, _FTP_SESSION, _FTP_OPCODE, _FTP_SIZE, _FTP_REQUEST, _FTP_DATA = s
 _FTP_BYTES = 251
 
 
-def status_texts(text: str, number: int, *, warning: bool = False) -> list[Message]:
+def status_texts(text: str, number: int, *, warning: bool = False) -> list[mavlink2.MAVLink_message]:
     """A text as STATUSTEXT messages in ASCII: one, or for over 50 bytes several that ground stations join.
 
     Args:
@@ -57,7 +55,7 @@ def status_texts(text: str, number: int, *, warning: bool = False) -> list[Messa
     return [mavlink2.MAVLink_statustext_message(severity, part, name, k) for k, part in enumerate(parts)]
 
 
-def parameter_values(parameters: Mapping[str, float]) -> list[Message]:
+def parameter_values(parameters: Mapping[str, float]) -> list[mavlink2.MAVLink_message]:
     """Every parameter as PARAM_VALUE, numbered in the mapping's order."""
     return [
         mavlink2.MAVLink_param_value_message(
@@ -68,8 +66,11 @@ def parameter_values(parameters: Mapping[str, float]) -> list[Message]:
 
 
 def answers(
-    request: Message, drone: int, parameters: Mapping[str, float], latest: Mapping[int, Message]
-) -> list[Message]:
+    request: mavlink2.MAVLink_message,
+    drone: int,
+    parameters: Mapping[str, float],
+    latest: Mapping[int, mavlink2.MAVLink_message],
+) -> list[mavlink2.MAVLink_message]:
     """What a drone answers to a ground station's message; nothing to one that is for another system.
 
     Args:
@@ -92,7 +93,9 @@ def answers(
     return []
 
 
-def _parameters(request: Message, values: list[Message]) -> list[Message]:
+def _parameters(
+    request: mavlink2.MAVLink_message, values: list[mavlink2.MAVLink_message]
+) -> list[mavlink2.MAVLink_message]:
     """All of them, or the one that is meant; one that is set is told unchanged."""
     if request.get_type() == "PARAM_REQUEST_LIST":
         return values
@@ -102,7 +105,7 @@ def _parameters(request: Message, values: list[Message]) -> list[Message]:
     return [value for value in values if value.param_id == request.param_id]
 
 
-def _mission(request: Message) -> list[Message]:
+def _mission(request: mavlink2.MAVLink_message) -> list[mavlink2.MAVLink_message]:
     """There are no mission items, fences or rally points; clearing them succeeds, and new ones are refused."""
     asked, sender = request.get_type(), (request.get_srcSystem(), request.get_srcComponent())
     if asked == "MISSION_REQUEST_LIST":
@@ -118,7 +121,9 @@ def _mission(request: Message) -> list[Message]:
     return [mavlink2.MAVLink_mission_ack_message(*sender, result, request.mission_type)]
 
 
-def _command(request: Message, drone: int, latest: Mapping[int, Message]) -> list[Message]:
+def _command(
+    request: mavlink2.MAVLink_message, drone: int, latest: Mapping[int, mavlink2.MAVLink_message]
+) -> list[mavlink2.MAVLink_message]:
     """A message that is asked for is sent once; every other command is refused."""
     wanted: float | None = _ASKS_FOR.get(request.command)
     if request.command == mavlink2.MAV_CMD_REQUEST_MESSAGE:
@@ -131,14 +136,14 @@ def _command(request: Message, drone: int, latest: Mapping[int, Message]) -> lis
     return [ack] if message is None else [ack, message]
 
 
-def _version(drone: int) -> Message:
+def _version(drone: int) -> mavlink2.MAVLink_message:
     none = bytes(8)
     return mavlink2.MAVLink_autopilot_version_message(
         mavlink2.MAV_PROTOCOL_CAPABILITY_MAVLINK2, 0, 0, 0, 0, none, none, none, 0, 0, drone + 1
     )
 
 
-def _no_files(request: Message) -> Message:
+def _no_files(request: mavlink2.MAVLink_message) -> mavlink2.MAVLink_message:
     """NAK with the error *unknown command*: the session ends at once, and nobody waits for a time-out."""
     asked, answer = request.payload, [0] * _FTP_BYTES
     sequence = (int.from_bytes(bytes(asked[_FTP_SEQUENCE]), "little") + 1) % 0x10000

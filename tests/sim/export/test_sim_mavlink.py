@@ -502,9 +502,9 @@ def test_a_key_with_nothing_to_sign_is_named(tmp_path: Path) -> None:
     said = CliRunner().invoke(app, ["export", str(tmp_path), "--mcap", "--key", str(tmp_path / "key")])
     assert said.exit_code == 2
     assert "--key signs --tlog alone" in said.output
-    said = CliRunner().invoke(app, ["export", str(tmp_path), "--mcap", "--origin", "47,8"])
+    said = CliRunner().invoke(app, ["export", str(tmp_path), "--pcap", "--origin", "47,8"])
     assert said.exit_code == 2
-    assert "--origin places --tlog alone" in said.output
+    assert "--origin places --tlog and --mcap alone" in said.output
 
 
 # --- what can go wrong -----------------------------------------------------------------------------
