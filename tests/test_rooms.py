@@ -30,7 +30,7 @@ HOMES = {
     "simpy": ("sim/*", "fleet/agent.py", "radio/mac/medium.py", "radio/air.py"),
     "torch": ("perception/*",),
     "rerun": ("sim/playback/*",),
-    "pymavlink": ("fleet/logs/mavlink.py", "fleet/logs/tlog.py"),
+    "pymavlink": ("fleet/logs/ground_station.py", "fleet/logs/mavlink.py", "fleet/logs/tlog.py"),
     "yaml": ("scenarios/reading/strict_yaml.py", "scenarios/reading/top_keys.py"),
     "distributed": ("sim/campaign/cluster.py",),
     "dask": ("sim/campaign/cluster.py",),
@@ -176,7 +176,7 @@ def test_every_package_at_the_root_is_a_room() -> None:
         (
             "fleet/agent.py",
             "from pymavlink.dialects import v20",
-            "pymavlink is at home in fleet/logs/mavlink.py, fleet/logs/tlog.py",
+            "pymavlink is at home in fleet/logs/ground_station.py, fleet/logs/mavlink.py, fleet/logs/tlog.py",
         ),
         (
             "scenarios/reading/nodes.py",

@@ -20,16 +20,23 @@ from pathlib import Path
 from pymavlink.dialects.v20 import common as mavlink2
 
 from sortie.fleet.flight.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, yaw_rad
-from sortie.fleet.logs.geodesy import Origin, geodetic
+from sortie.fleet.logs.geodesy import Origin, Vector, geodetic
 
+_GNSS = mavlink2.MAV_SYS_STATUS_SENSOR_GPS
 _SENSORS = (
     mavlink2.MAV_SYS_STATUS_SENSOR_3D_GYRO
     | mavlink2.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    | mavlink2.MAV_SYS_STATUS_SENSOR_GPS
     | mavlink2.MAV_SYS_STATUS_SENSOR_BATTERY
+    | mavlink2.MAV_SYS_STATUS_PREARM_CHECK
+    | _GNSS
 )
+_ALL_WELL = 0xFFFFFFFF
+"""Ground stations announce a failure for every zero bit of health, such as a fence breach, even of what is absent."""
+_UNKNOWN_U8 = 0xFF
 _UNKNOWN_U16 = 0xFFFF
 _MAX_I16 = 0x7FFF
+_STILL_MPS = 0.1
+"""Below this a course over ground means nothing."""
 LOG_STAMP = struct.Struct(">Q")
 """Before each frame of a telemetry log: µs since 1970."""
 SIGNING_EPOCH_US = 1_420_070_400_000_000
@@ -57,11 +64,15 @@ class Telemetry:
     landed: bool
     ground_station: bool = False
     """Whether it is no vehicle."""
+    home_m: Vector = (0.0, 0.0, 0.0)
+    """Where on the ground it took off."""
+    fixed: bool = True
+    """Whether it has GNSS."""
 
 
 def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]:
     """HEARTBEAT, ATTITUDE_QUATERNION and ATTITUDE, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYS_STATUS,
-    EXTENDED_SYS_STATE, BATTERY_STATUS."""
+    EXTENDED_SYS_STATE, BATTERY_STATUS; of a vehicle also VFR_HUD, GPS_RAW_INT and HOME_POSITION."""
     time_ms = round(state.time_s * 1000)
     q = to_wxyz(swap_attitude(state.orientation_xyzw)).tolist()
     rates = swap_flu_frd(state.body_rates_radps).tolist()
@@ -94,7 +105,7 @@ def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]
         mavlink2.MAVLink_sys_status_message(
             _SENSORS,
             _SENSORS,
-            _SENSORS,
+            _ALL_WELL if state.fixed else _ALL_WELL & ~_GNSS,
             round(state.cpu_load * 1000),
             min(round(state.voltage_v * 1000), _UNKNOWN_U16),
             current_ca,
@@ -115,6 +126,47 @@ def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]
             -1,  # charge used is not kept; energy is
             round(state.energy_used_j / 100),
             charge,
+        ),
+        *([] if station else _of_a_vehicle(state, origin, heading)),
+    ]
+
+
+def _of_a_vehicle(state: Telemetry, origin: Origin, heading_cdeg: int) -> list[mavlink2.MAVLink_message]:
+    """What ground stations read of a vehicle alone. The place in GPS_RAW_INT is the true one: errors are not recorded."""
+    latitude, longitude, altitude = geodetic(state.position_m, origin)
+    home = geodetic(state.home_m, origin)
+    east, north, up = state.velocity_mps
+    ground_mps = math.hypot(east, north)
+    course_cdeg = round(math.degrees(math.atan2(east, north)) * 100) % 36000
+    fix = mavlink2.GPS_FIX_TYPE_3D_FIX if state.fixed else mavlink2.GPS_FIX_TYPE_NO_FIX
+    return [
+        mavlink2.MAVLink_vfr_hud_message(
+            math.nan,  # there is no airspeed sensor
+            ground_mps,
+            heading_cdeg // 100,
+            0,  # throttle is not modelled
+            altitude,
+            up,
+        ),
+        mavlink2.MAVLink_gps_raw_int_message(
+            round(state.time_s * 1e6),
+            fix,
+            round(latitude * 1e7),
+            round(longitude * 1e7),
+            round(altitude * 1000),
+            _UNKNOWN_U16,
+            _UNKNOWN_U16,
+            min(round(ground_mps * 100), _UNKNOWN_U16 - 1),
+            course_cdeg if ground_mps > _STILL_MPS else _UNKNOWN_U16,
+            _UNKNOWN_U8 if state.fixed else 0,
+        ),
+        mavlink2.MAVLink_home_position_message(
+            round(home[0] * 1e7),
+            round(home[1] * 1e7),
+            round(home[2] * 1000),
+            *swap_enu_ned(state.home_m).tolist(),
+            [math.nan] * 4,  # neither a heading there nor a way to it
+            *(math.nan,) * 3,
         ),
     ]
 
@@ -139,7 +191,7 @@ def _pack_voltage_mv(voltage_v: float) -> list[int]:
     return slots + [_UNKNOWN_U16] * (10 - len(slots))
 
 
-STATUS = frozenset({"HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "BATTERY_STATUS"})
+STATUS = frozenset({"HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "BATTERY_STATUS", "GPS_RAW_INT", "HOME_POSITION"})
 """Messages of `messages` that an autopilot sends once a second; the others go at the telemetry's own rate."""
 KEY_BYTES = 32
 
@@ -236,39 +288,6 @@ class Listener:
             self.refused += sum(m.get_type() == "BAD_DATA" and m.reason == _BAD_SIGNATURE for m in known)
             return [m for m in known if m.get_type() != "BAD_DATA" and not m.get_type().startswith("UNKNOWN")]
         return []
-
-
-def answers(request: mavlink2.MAVLink_message, drone: int) -> list[mavlink2.MAVLink_message]:
-    """What a drone says to a ground station that asks: who it is; that it has no parameters to set, no mission, no commands.
-
-    Nothing that a ground station sends changes a sortie.
-    """
-    asked, target = request.get_type(), getattr(request, "target_system", 0)
-    if target not in (0, drone + 1):
-        return []
-    if asked == "PARAM_REQUEST_LIST":
-        kind = mavlink2.MAV_PARAM_TYPE_REAL32
-        return [mavlink2.MAVLink_param_value_message(b"SYSID_THISMAV", float(drone + 1), kind, 1, 0)]
-    if asked == "MISSION_REQUEST_LIST":
-        peer, component = request.get_srcSystem(), request.get_srcComponent()
-        return [mavlink2.MAVLink_mission_count_message(peer, component, 0, request.mission_type)]
-    if asked == "COMMAND_LONG":
-        # compared as the float that it is: it may be no number
-        version = request.command == mavlink2.MAV_CMD_REQUEST_MESSAGE and request.param1 == _VERSION_ID
-        result = mavlink2.MAV_RESULT_ACCEPTED if version else mavlink2.MAV_RESULT_UNSUPPORTED
-        said: list[mavlink2.MAVLink_message] = [mavlink2.MAVLink_command_ack_message(request.command, result)]
-        return [*said, _version(drone)] if version else said
-    return []
-
-
-_VERSION_ID = mavlink2.MAVLINK_MSG_ID_AUTOPILOT_VERSION
-
-
-def _version(drone: int) -> mavlink2.MAVLink_message:
-    none = bytes(8)
-    return mavlink2.MAVLink_autopilot_version_message(
-        mavlink2.MAV_PROTOCOL_CAPABILITY_MAVLINK2, 0, 0, 0, 0, none, none, none, 0, 0, drone + 1
-    )
 
 
 def write_tlog(path: Path | str, frames: Iterable[tuple[int, bytes]]) -> None:

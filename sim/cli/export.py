@@ -35,7 +35,7 @@ def export(
     origin: Annotated[
         str | None,
         typer.Option(
-            help="With --tlog: LATITUDE,LONGITUDE[,ALTITUDE] of ENU (0, 0, 0); default: fleet.origin, then where a trace in latitude and longitude begins, then a field in Zurich."
+            help="With --tlog and --mcap: LATITUDE,LONGITUDE[,ALTITUDE] of ENU (0, 0, 0); default: fleet.origin, then where a trace in latitude and longitude begins, then a field in Zurich."
         ),
     ] = None,
     key: Annotated[
@@ -44,24 +44,29 @@ def export(
             metavar="FILE", help="With --tlog: sign the frames with the key in this file (32 bytes or 64 hex digits)."
         ),
     ] = None,
+    drone: Annotated[
+        int | None, typer.Option(help="With --tlog: the log of this drone alone; default: all.", min=0)
+    ] = None,
 ) -> None:
     """Write a run for other tools: a ROS 2 bag (also for Foxglove), a log for ground stations, or a packet capture."""
     if mcap + tlog + pcap != 1:
         raise typer.BadParameter("name one format: --mcap, --tlog or --pcap")
     if key is not None and not tlog:
         raise typer.BadParameter("--key signs --tlog alone")
-    if origin is not None and not tlog:
-        raise typer.BadParameter("--origin places --tlog alone")
+    if origin is not None and pcap:
+        raise typer.BadParameter("--origin places --tlog and --mcap alone")
+    if drone is not None and not tlog:
+        raise typer.BadParameter("--drone selects from --tlog alone")
     # ROS counts seconds in 32 bits, signatures from 2015 on; beyond 2096 a log's stamps are no times
     first, end = (1970, 2038) if mcap or pcap else (2015 if key is not None else 1970, 2096)
     began_us = (moment(begin, first, end) - EPOCH) // timedelta(microseconds=1)
-    if tlog:
-        from sortie.sim.export.telemetry import parse_origin, read_key, save_tlog
+    from sortie.sim.export.telemetry import parse_origin, read_key, save_tlog
 
+    if tlog:
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
         where = None if origin is None else parse_origin(origin)
         try:
-            frames = save_tlog(run_folder.load(run), path, began_us, where, secret)
+            frames = save_tlog(run_folder.load(run), path, began_us, where, secret, drone)
         except TraceError as error:
             raise RunError(f"{error}; the log's origin is in it, or --origin names one") from error
         out.print(f"{frames} MAVLink frames, in [bold]{path}[/bold]", soft_wrap=True)
@@ -74,17 +79,23 @@ def export(
         parts = ", ".join(f"{count} {kind}" for kind, count in sent.items())
         out.print(f"{sum(sent.values())} packets ({parts}), in [bold]{path}[/bold]", soft_wrap=True)
         return
+    from sortie.sim.export.foxglove import LAYOUT
+
     path = out_path or run / BAG
     path = path if path.name.strip(".") else path.resolve()  # the bag is called as its folder is
-    ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap"})
+    ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap", LAYOUT})
+    where = None if origin is None else parse_origin(origin)
     record = run_folder.load(run)
     try:
         from sortie.sim.export.bag import write_bag
 
-        counts = write_bag(record, path, began_us * 1000)
+        counts = write_bag(record, path, began_us * 1000, where)
     except ImportError as error:
         raise RunError("rosbags is missing: pip install 'sortie-sim[ros2]'") from error
+    except TraceError as error:
+        raise RunError(f"{error}; the bag's origin is in it, or --origin names one") from error
     out.print(f"{sum(counts.values())} messages on {len(counts)} topics, in [bold]{path}[/bold]", soft_wrap=True)
+    out.print(f"layout for Foxglove, in [bold]{path / LAYOUT}[/bold]", soft_wrap=True)
 
 
 def moment(text: str, first: int, end: int) -> datetime:

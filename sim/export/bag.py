@@ -5,22 +5,30 @@
 | `/fleet/context` | `sortie_msgs/msg/ContextDescriptor` | best effort, keep last 1 |
 | `/drone_0/to_drone_1/directive` | `sortie_msgs/msg/DataPlaneDirective` | reliable, keep last 1 |
 | `/drone_0/pose`, `/tf` | `geometry_msgs/msg/PoseStamped`, `tf2_msgs/msg/TFMessage` | reliable, keep last 10 |
+| `/drone_0/fix` | `sensor_msgs/msg/NavSatFix` | reliable, keep last 10 |
 | `/drone_0/battery` | `sensor_msgs/msg/BatteryState` | reliable, keep last 10 |
 | `/decisions` | `rcl_interfaces/msg/Log` | reliable, keep last 100 |
+| `/clock` | `rosgraph_msgs/msg/Clock` | reliable, keep last 10 |
+| `/scene/…`, `/drone_0/boxes` | `visualization_msgs/msg/MarkerArray` (`sortie.sim.export.scene_markers`) | reliable, keep last 10; `/scene/town` stays for late readers |
 
 The frame `world` is ENU in metres, `drone_0` its body in FLU. The plane's topics are the live bus's (`sortie.sim.export.topics`). The
-record holds no estimated pose, so a descriptor's is the true one here.
+record holds no estimated pose, so a descriptor's is the true one here. All stamps count from the begin of the bag, also those
+that drones put into descriptors by their own clocks, which may be wrong. The bag is compressed (zstd, in chunks).
 """
 
 from __future__ import annotations
 
+import heapq
+import json
 from collections.abc import Iterator
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sortie.fleet.logs.geodesy import Origin, geodetic
 from sortie.fleet.messages.wire import (
     DESCRIPTOR_MSG,
     DESCRIPTOR_NAME,
@@ -29,18 +37,23 @@ from sortie.fleet.messages.wire import (
     encode_descriptor,
     encode_directive,
 )
+from sortie.sim.export.foxglove import LAYOUT, layout
 from sortie.sim.export.messages import descriptors, directives
+from sortie.sim.export.scene_markers import MARKERS, TOWN, SceneMarkers, Timed
+from sortie.sim.export.telemetry import Telemeter, origin_of
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import replacing
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words, event_in_words
 
-POSE, TF, BATTERY, LOG = (
+POSE, TF, BATTERY, LOG, FIX, CLOCK = (
     "geometry_msgs/msg/PoseStamped",
     "tf2_msgs/msg/TFMessage",
     "sensor_msgs/msg/BatteryState",
     "rcl_interfaces/msg/Log",
+    "sensor_msgs/msg/NavSatFix",
+    "rosgraph_msgs/msg/Clock",
 )
 INFO, WARN = 20, 30
 """Levels of rcl_interfaces/msg/Log."""
@@ -56,36 +69,41 @@ class Message(NamedTuple):
     value: bytes | Any
 
 
-def write_bag(record: SortieRecord, path: Path, begin_ns: int) -> dict[str, int]:
-    """Write a bag (a folder with metadata.yaml and one .mcap file); there whole or not at all.
+def write_bag(record: SortieRecord, path: Path, begin_ns: int, origin: Origin | None = None) -> dict[str, int]:
+    """Write a bag (a folder with metadata.yaml, one .mcap file and a layout for Foxglove); there whole or not at all.
 
     Args:
         record: the sortie.
         path: the bag's folder; an older one there is replaced.
         begin_ns: when the sortie is said to have begun, ns since 1970.
+        origin: where on the globe ENU (0, 0, 0) lies; None: as in `sortie.sim.export.telemetry.origin_of`.
 
     Returns:
         How many messages each topic has.
 
     Raises:
         RunError: the disk refuses.
+        TraceError: its trace is needed for the origin and cannot be read.
         ImportError: rosbags is not installed (extra `ros2`).
     """
-    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(DESCRIPTOR_MSG, DESCRIPTOR_NAME))
     store.register(get_types_from_msg(DIRECTIVE_MSG, DIRECTIVE_NAME))
-    messages = sorted(_messages(record, _makers(store.types), begin_ns), key=lambda m: m.t_s)
+    origin = origin_of(record.scenario.fleet) if origin is None else origin
+    streams = _streams(record, _makers(store.types), begin_ns, origin)
     counts: dict[str, int] = {}
     with replacing(path) as partial:
         folder = partial / path.name
-        with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        with writer:
             topics: dict[str, Any] = {}
-            for m in messages:
+            for m in heapq.merge(*streams, key=attrgetter("t_s")):
                 if m.topic not in topics:
-                    qos = [_qos(m.type)]
+                    qos = [_qos(m.type, stays=m.topic == TOWN)]
                     topics[m.topic] = writer.add_connection(m.topic, m.type, typestore=store, offered_qos_profiles=qos)
                 data = m.value if isinstance(m.value, bytes) else store.serialize_cdr(m.value, m.type)
                 writer.write(topics[m.topic], begin_ns + round(m.t_s * 1e9), data)
@@ -93,37 +111,60 @@ def write_bag(record: SortieRecord, path: Path, begin_ns: int) -> dict[str, int]
         for file in folder.iterdir():
             file.rename(partial / file.name)
         folder.rmdir()
+        (partial / LAYOUT).write_text(json.dumps(layout(record.scenario.fleet.drones), indent=2) + "\n", "utf-8")
     return counts
 
 
-def _qos(type_: str) -> Any:
-    """The QoS profile that a topic of this type offers."""
+def _qos(type_: str, *, stays: bool) -> Any:
+    """The QoS profile that a topic of this type offers; what stays is kept for late readers."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     depth = {DESCRIPTOR_NAME: 1, DIRECTIVE_NAME: 1, LOG: 100}.get(type_, 10)
     reliability = QosReliability.BEST_EFFORT if type_ == DESCRIPTOR_NAME else QosReliability.RELIABLE
+    durability = QosDurability.TRANSIENT_LOCAL if stays else QosDurability.VOLATILE
     ever = QosTime(9223372036, 854775807)
     return Qos(
-        QosHistory.KEEP_LAST, depth, reliability, QosDurability.VOLATILE, ever, ever, QosLiveliness.AUTOMATIC, ever, False
+        QosHistory.KEEP_LAST, depth, reliability, durability, ever, ever, QosLiveliness.AUTOMATIC, ever, False
     )  # fmt: skip
 
 
 def _makers(types: Any) -> SimpleNamespace:
     """The message classes by their short names."""
     names = (
-        "builtin_interfaces/msg/Time", "std_msgs/msg/Header", "geometry_msgs/msg/Point", "geometry_msgs/msg/Quaternion",
-        "geometry_msgs/msg/Vector3", "geometry_msgs/msg/Pose", "geometry_msgs/msg/Transform",
-        "geometry_msgs/msg/TransformStamped", POSE, TF, BATTERY, LOG,
+        "builtin_interfaces/msg/Duration", "builtin_interfaces/msg/Time", "geometry_msgs/msg/Point",
+        "geometry_msgs/msg/Pose", "geometry_msgs/msg/Quaternion", "geometry_msgs/msg/Transform",
+        "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/Vector3", "sensor_msgs/msg/CompressedImage",
+        "sensor_msgs/msg/NavSatStatus", "std_msgs/msg/ColorRGBA", "std_msgs/msg/Header", "visualization_msgs/msg/Marker",
+        "visualization_msgs/msg/MeshFile", POSE, TF, BATTERY, LOG, FIX, CLOCK, MARKERS,
     )  # fmt: skip
     return SimpleNamespace(**{name.rsplit("/", 1)[1]: types[name] for name in names})
 
 
-def _messages(record: SortieRecord, make: SimpleNamespace, begin_ns: int) -> Iterator[Message]:
-    for t_s, d in descriptors(record):
-        yield Message(t_s, CONTEXT.name, DESCRIPTOR_NAME, encode_descriptor(d))
-    for t_s, order in directives(record):
-        topic = Topic(TopicKind.DIRECTIVE, order.source, order.destination)
-        yield Message(t_s, topic.name, DIRECTIVE_NAME, encode_directive(order))
+def _streams(record: SortieRecord, make: SimpleNamespace, begin_ns: int, origin: Origin) -> list[Iterator[Message]]:
+    """The messages, in streams that are in order of time each."""
+
+    def drawn(stream: Iterator[Timed]) -> Iterator[Message]:
+        return (Message(t_s, topic, MARKERS, value) for t_s, topic, value in stream)
+
+    scene = SceneMarkers(record, make, begin_ns).messages()
+    return [_plane(record, begin_ns), _flight(record, make, begin_ns, origin), *map(drawn, scene)]
+
+
+def _plane(record: SortieRecord, begin_ns: int) -> Iterator[Message]:
+    """Descriptors and directives, as they would go over the air of a flight that began then."""
+    said = (
+        Message(t_s, CONTEXT.name, DESCRIPTOR_NAME, encode_descriptor(d._replace(stamp_ns=begin_ns + d.stamp_ns)))
+        for t_s, d in descriptors(record)
+    )
+    ordered = (
+        Message(t_s, Topic(TopicKind.DIRECTIVE, d.source, d.destination).name, DIRECTIVE_NAME, encode_directive(d))
+        for t_s, d in directives(record)
+    )
+    return heapq.merge(said, ordered, key=attrgetter("t_s"))
+
+
+def _flight(record: SortieRecord, make: SimpleNamespace, begin_ns: int, origin: Origin) -> Iterator[Message]:
+    """The clock, what each drone does in each frame, and the log."""
 
     def header(t_s: float, frame: str) -> Any:
         return make.Header(_time(t_s), frame)
@@ -131,20 +172,32 @@ def _messages(record: SortieRecord, make: SimpleNamespace, begin_ns: int) -> Ite
     def _time(t_s: float) -> Any:
         return make.Time(*divmod(begin_ns + round(t_s * 1e9), 1_000_000_000))
 
-    for row in record.tables["states"].to_pylist():
-        t_s, name = row["t_s"], f"drone_{row['drone']}"
-        x, y, z = row["x_m"], row["y_m"], row["z_m"]
-        turn = make.Quaternion(*(row[q] for q in ("qx", "qy", "qz", "qw")))
-        yield Message(
-            t_s, f"/{name}/pose", POSE, make.PoseStamped(header(t_s, "world"), make.Pose(make.Point(x, y, z), turn))
-        )
-        moved = make.Transform(make.Vector3(x, y, z), turn)
-        yield Message(
-            t_s, "/tf", TF, make.TFMessage([make.TransformStamped(header(t_s, "world"), name, moved)])
-        )  # fmt: skip
-        yield Message(t_s, f"/{name}/battery", BATTERY, _battery(make, header(t_s, name), row))
-    for t_s, level, who, text in _log(record):
-        yield Message(t_s, "/decisions", LOG, make.Log(_time(t_s), level, who, text, "", "", 0))
+    def states() -> Iterator[Message]:
+        told = (state for _, state in Telemeter(record.scenario).add(record.tables))
+        last_s = -1.0
+        for row, state in zip(record.tables["states"].to_pylist(), told, strict=True):
+            t_s, name = row["t_s"], f"drone_{row['drone']}"
+            if t_s > last_s:
+                yield Message(t_s, "/clock", CLOCK, make.Clock(_time(t_s)))
+                last_s = t_s
+            x, y, z = row["x_m"], row["y_m"], row["z_m"]
+            turn = make.Quaternion(*(row[q] for q in ("qx", "qy", "qz", "qw")))
+            pose = make.Pose(make.Point(x, y, z), turn)
+            yield Message(t_s, f"/{name}/pose", POSE, make.PoseStamped(header(t_s, "world"), pose))
+            moved = make.TransformStamped(header(t_s, "world"), name, make.Transform(make.Vector3(x, y, z), turn))
+            yield Message(t_s, "/tf", TF, make.TFMessage([moved]))
+            fix = make.NavSatFix(
+                header(t_s, name), make.NavSatStatus(0 if state.fixed else -1, 1), *geodetic((x, y, z), origin),
+                np.zeros(9), 0,
+            )  # fmt: skip
+            yield Message(t_s, f"/{name}/fix", FIX, fix)
+            yield Message(t_s, f"/{name}/battery", BATTERY, _battery(make, header(t_s, name), row))
+
+    log = (
+        Message(t_s, "/decisions", LOG, make.Log(_time(t_s), level, who, text, "", "", 0))
+        for t_s, level, who, text in _log(record)
+    )
+    return heapq.merge(states(), log, key=attrgetter("t_s"))
 
 
 def _battery(make: SimpleNamespace, header: Any, row: dict[str, Any]) -> Any:
@@ -172,7 +225,12 @@ def _battery(make: SimpleNamespace, header: Any, row: dict[str, Any]) -> Any:
 
 def _log(record: SortieRecord) -> Iterator[tuple[float, int, str, str]]:
     """What was decided and what happened, in words."""
-    for change in transitions(record.tables["directives"], {}):
-        yield change["t_s"], INFO, f"drone_{change['drone']}", decision_in_words(change)
-    for row in record.tables["events"].to_pylist():
-        yield row["t_s"], WARN, "fleet" if row["drone"] < 0 else f"drone_{row['drone']}", event_in_words(row)
+    decided = (
+        (change["t_s"], INFO, f"drone_{change['drone']}", decision_in_words(change))
+        for change in transitions(record.tables["directives"], {})
+    )
+    happened = (
+        (row["t_s"], WARN, "fleet" if row["drone"] < 0 else f"drone_{row['drone']}", event_in_words(row))
+        for row in record.tables["events"].to_pylist()
+    )
+    return heapq.merge(decided, happened, key=itemgetter(0))

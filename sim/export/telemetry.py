@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
+import heapq
 import select
 import socket
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from sortie.fleet.energy.cell import MEAN_CELL_V
 from sortie.fleet.logs.geodesy import Origin
-from sortie.fleet.logs.mavlink import KEY_BYTES, STATUS, Listener, Telemetry, Transmitter, answers, messages, write_tlog
+from sortie.fleet.logs.ground_station import answers, parameter_values, status_texts
+from sortie.fleet.logs.mavlink import KEY_BYTES, STATUS, Listener, Telemetry, Transmitter, messages, write_tlog
 from sortie.fleet.traces import flown_at
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Fleet, Scenario
 from sortie.sim.folders import RunError
+from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.sentences import decision_in_words, event_in_words
 
 ORIGIN = Origin(47.397742, 8.545594, 488.0)
 """Where ENU (0, 0, 0) lies where nobody says otherwise: the field in Zurich at which PX4's simulators start."""
+
+
+DATAGRAM_BYTES = 1400
+"""At most, with which a datagram passes Ethernet whole."""
+_GNSS = {"gnss_loss": False, "gnss_back": True}
+"""Kinds of events, and whether there is GNSS afterwards."""
 
 
 def origin_of(fleet: Fleet) -> Origin:
@@ -40,16 +53,28 @@ def given_origin(fleet: Fleet) -> Origin | None:
     return None if fleet.origin is None else Origin(**fleet.origin.model_dump())
 
 
+def parameters_of(scenario: Scenario) -> list[dict[str, float]]:
+    """Each drone's parameters, by ArduPilot's names: its system id, and its pack's capacity in mAh."""
+    packs = enumerate(scenario.fleet.batteries)
+    return [
+        {"SYSID_THISMAV": drone + 1.0, "BATT_CAPACITY": 1000 * pack.capacity_wh / (pack.cells * MEAN_CELL_V)}
+        for drone, pack in packs
+    ]
+
+
 class Telemeter:
-    """Turns rows of the record into telemetry; load is kept from slice to slice."""
+    """Turns rows of the record into telemetry; load, home and GNSS are kept from slice to slice."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._frame_s = scenario.frame_s
         self._load = np.zeros(scenario.fleet.drones)
         self._stations = {station.drone for station in scenario.fleet.ground}
+        self._home_m: dict[int, tuple[float, float, float]] = {}
+        self._fixed = [True] * scenario.fleet.drones
 
     def add(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[int, Telemetry]]:
-        """Each drone's state in each frame of the tables `states` and `descriptors`, in order of time."""
+        """Each drone's state in each frame of the tables `states`, `descriptors` and `events`, in order of time."""
+        happened = deque(row for row in new["events"].to_pylist() if row["kind"] in _GNSS)
         descriptors = new["descriptors"]
         published = iter(zip(*(descriptors[k].to_pylist() for k in ("t_s", "drone", "cpu_headroom")), strict=True))
         said = next(published, None)
@@ -57,10 +82,15 @@ class Telemeter:
             while said is not None and said[0] <= row["t_s"] + self._frame_s / 2:
                 self._load[said[1]] = 1.0 - said[2]
                 said = next(published, None)
+            while happened and happened[0]["t_s"] <= row["t_s"]:
+                event = happened.popleft()
+                self._fixed[event["drone"]] = _GNSS[event["kind"]]
             yield row["drone"], self._telemetry(row)
         while said is not None:
             self._load[said[1]] = 1.0 - said[2]
             said = next(published, None)
+        for event in happened:
+            self._fixed[event["drone"]] = _GNSS[event["kind"]]
 
     def _telemetry(self, row: dict[str, Any]) -> Telemetry:
         drone, landed = row["drone"], not row["airborne"]
@@ -78,11 +108,14 @@ class Telemeter:
             cpu_load=float(np.clip(self._load[drone], 0.0, 1.0)),
             landed=landed,
             ground_station=drone in self._stations,
+            home_m=self._home_m.setdefault(drone, (row["x_m"], row["y_m"], 0.0)),
+            fixed=self._fixed[drone],
         )
 
 
 class Stream:
-    """The messages of the whole fleet, in order of time: pose at every frame of the sortie, status once a second.
+    """The messages of the whole fleet, in order of time: parameters at first, pose at every frame of the sortie, status
+    once a second, and decisions and events as texts. What happens to the whole fleet is said by drone 0.
 
     They are packed by `transmitters`, each when it is sent: packing numbers a frame and stamps its signature.
     """
@@ -92,22 +125,51 @@ class Stream:
     ) -> None:
         n, signed_at = scenario.fleet.drones, {} if begin_us is None else {"signed_at_us": begin_us}
         self.transmitters = [Transmitter(i, key, **signed_at) for i in range(n)]
+        self.parameters = parameters_of(scenario)
+        self.latest: list[dict[int, Any]] = [{} for _ in range(n)]
+        """The last message of each kind, by drone and message id."""
         self._telemeter, self._origin = Telemeter(scenario), origin
         self._second = [-1] * n
+        self._carried: dict[tuple[int, int], str] = {}
+        self._texts = [0] * n
 
     def add(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[float, int, Any]]:
-        """Time, drone and message of everything that new rows have to tell."""
+        """Time, drone and message of everything in new rows."""
+        for at_s, drone, message in heapq.merge(self._states(new), self._said(new), key=itemgetter(0)):
+            self.latest[drone][message.get_msgId()] = message
+            yield at_s, drone, message
+
+    def _states(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[float, int, Any]]:
         for drone, state in self._telemeter.add(new):
             second = int(state.time_s + 1e-6)
-            status = second != self._second[drone]
+            status, first = second != self._second[drone], self._second[drone] < 0
             self._second[drone] = second
-            for message in messages(state, self._origin):
+            told = messages(state, self._origin)
+            if first and not state.ground_station:
+                told += parameter_values(self.parameters[drone])
+            for message in told:
                 if status or message.get_type() not in STATUS:
                     yield state.time_s, drone, message
 
+    def _said(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[float, int, Any]]:
+        decisions = (
+            (row["t_s"], row["drone"], decision_in_words(row), False)
+            for row in transitions(new["directives"], self._carried)
+        )
+        events = ((row["t_s"], max(row["drone"], 0), event_in_words(row), True) for row in new["events"].to_pylist())
+        for at_s, drone, text, warning in heapq.merge(decisions, events, key=itemgetter(0)):
+            self._texts[drone] += 1
+            for message in status_texts(text, self._texts[drone], warning=warning):
+                yield at_s, drone, message
+
 
 def save_tlog(
-    record: SortieRecord, path: Path, begin_us: int, origin: Origin | None = None, key: bytes | None = None
+    record: SortieRecord,
+    path: Path,
+    begin_us: int,
+    origin: Origin | None = None,
+    key: bytes | None = None,
+    drone: int | None = None,
 ) -> int:
     """Write a run as one telemetry log of all its drones, system ids 1 … N; returns the number of frames.
 
@@ -115,16 +177,20 @@ def save_tlog(
         begin_us: when the sortie began, µs since 1970.
         origin: where on the globe ENU (0, 0, 0) lies; None: by `origin_of`.
         key: 32 B with which frames are signed.
+        drone: this drone alone, with the system id that it has anyway.
 
     Raises:
-        RunError: the file cannot be written.
+        RunError: no such drone, or the file cannot be written.
         TraceError: its trace is needed for the origin and cannot be read.
     """
+    if drone is not None and drone >= record.scenario.fleet.drones:
+        raise RunError(f"drone is {drone}, must be below fleet.drones = {record.scenario.fleet.drones}")
     origin = origin_of(record.scenario.fleet) if origin is None else origin
     stream = Stream(record.scenario, origin, key, None if key is None else begin_us)
     frames = [
-        (begin_us + round(t_s * 1e6), stream.transmitters[drone].pack(message))
-        for t_s, drone, message in stream.add(record.tables)
+        (begin_us + round(t_s * 1e6), stream.transmitters[sender].pack(message))
+        for t_s, sender, message in stream.add(record.tables)
+        if drone in (None, sender)
     ]
     try:
         write_tlog(path, frames)
@@ -158,6 +224,7 @@ class MavlinkEndpoint:
         self._stream: Stream | None = None
         self._listener = Listener()
         self._begin_s = 0.0
+        self._datagram = b""
         self._peer: Any = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -185,8 +252,10 @@ class MavlinkEndpoint:
             return
         for at_s, drone, message in self._stream.add(new):
             while self._pace is not None and (left_s := self._begin_s + at_s / self._pace - self._clock()) > 0:
+                self._flush()
                 self._listen(left_s)
             self._send(drone, message)  # after the answers that were sent while it waited
+        self._flush()
         self._listen(0.0)
 
     def close(self) -> None:
@@ -206,15 +275,25 @@ class MavlinkEndpoint:
         assert self._stream is not None  # noqa: S101 - set in `begin`
         for request in self._listener.heard(data):
             for drone in range(len(self._stream.transmitters)):
-                for message in answers(request, drone):
+                known = self._stream.parameters[drone], self._stream.latest[drone]
+                for message in answers(request, drone, *known):
                     self._send(drone, message)
+        self._flush()
 
     def _send(self, drone: int, message: Any) -> None:
+        """Put a frame into the next datagram: a datagram for each frame would overflow a ground station's buffer."""
         assert self._stream is not None  # noqa: S101 - set in `begin`
         if self._peer is not None:
             frame = self._stream.transmitters[drone].pack(message)
+            if len(self._datagram) + len(frame) > DATAGRAM_BYTES:
+                self._flush()
+            self._datagram += frame
+
+    def _flush(self) -> None:
+        if self._datagram:
             with suppress(OSError):  # best effort, as on any telemetry radio
-                self._socket.sendto(frame, self._peer)
+                self._socket.sendto(self._datagram, self._peer)
+            self._datagram = b""
 
 
 def parse_address(address: str) -> tuple[bool, str, int]:

@@ -41,8 +41,8 @@ def sent(state: Telemetry = STATE) -> dict[str, mavlink2.MAVLink_message]:
 def test_mavlink_2_from_system_drone_plus_one_and_numbered_in_a_row() -> None:
     transmitter = Transmitter(2)
     frames = [transmitter.pack(m) for m in messages(STATE, ZURICH)]
-    assert [frame[0] for frame in frames] == [0xFD] * 8
-    assert [frame[4] for frame in frames] == [0, 1, 2, 3, 4, 5, 6, 7]
+    assert [frame[0] for frame in frames] == [0xFD] * 11
+    assert [frame[4] for frame in frames] == list(range(11))
     assert {frame[5] for frame in frames} == {3}
     assert [m.get_type() for m in messages(STATE, ZURICH)] == [
         "HEARTBEAT",
@@ -53,10 +53,13 @@ def test_mavlink_2_from_system_drone_plus_one_and_numbered_in_a_row() -> None:
         "SYS_STATUS",
         "EXTENDED_SYS_STATE",
         "BATTERY_STATUS",
+        "VFR_HUD",
+        "GPS_RAW_INT",
+        "HOME_POSITION",
     ]
     for _ in range(300):
         last = transmitter.pack(messages(STATE, ZURICH)[0])
-    assert last[4] == (7 + 300) % 256
+    assert last[4] == (10 + 300) % 256
 
 
 def test_position_and_velocity_are_ned() -> None:
@@ -122,6 +125,37 @@ def test_what_a_trace_may_tell_fits_the_wire() -> None:
     assert (far["GLOBAL_POSITION_INT"].vx, far["GLOBAL_POSITION_INT"].vy) == (-32767, 32767)
 
 
+def test_what_a_ground_station_s_instruments_show() -> None:
+    """Course 323.13° of 5 m/s over ground, climbing at 1 m/s; home is the ground below the start."""
+    seen = sent(replace(STATE, home_m=(10.0, -20.0, 0.0)))
+    hud, fix, home, globe = (seen[k] for k in ("VFR_HUD", "GPS_RAW_INT", "HOME_POSITION", "GLOBAL_POSITION_INT"))
+    assert (hud.groundspeed, hud.climb, hud.heading, hud.alt) == (5.0, 1.0, 315, 460.0)
+    assert math.isnan(hud.airspeed)
+    assert (fix.fix_type, fix.vel, fix.cog, fix.time_usec) == (3, 500, 32313, 12_345_600)
+    assert (fix.lat, fix.lon, fix.alt) == (globe.lat, globe.lon, globe.alt)
+    assert (home.x, home.y, home.z, home.altitude) == (-20.0, 10.0, 0.0, 400_000)
+    assert home.latitude / 1e7 == pytest.approx(47 - 20 / 111_177, abs=2e-7)
+    hovering = sent(replace(STATE, velocity_mps=(0.0, 0.01, 0.0)))["GPS_RAW_INT"]
+    assert hovering.cog == 65535
+
+
+def test_a_ground_station_of_the_fleet_has_no_instruments() -> None:
+    seen = sent(replace(STATE, ground_station=True))
+    assert not {"VFR_HUD", "GPS_RAW_INT", "HOME_POSITION"} & seen.keys()
+    assert seen["HEARTBEAT"].type == mavlink2.MAV_TYPE_GCS
+
+
+def test_health_says_what_fails_and_nothing_else() -> None:
+    """A zero bit of health is announced by ground stations, even of a fence that is absent."""
+    fence, gnss = mavlink2.MAV_SYS_STATUS_GEOFENCE, mavlink2.MAV_SYS_STATUS_SENSOR_GPS
+    well, lost = (sent(replace(STATE, fixed=fixed)) for fixed in (True, False))
+    assert not well["SYS_STATUS"].onboard_control_sensors_present & fence
+    assert well["SYS_STATUS"].onboard_control_sensors_health & fence
+    assert well["SYS_STATUS"].onboard_control_sensors_health & gnss
+    assert lost["SYS_STATUS"].onboard_control_sensors_health == 0xFFFFFFFF & ~gnss
+    assert (lost["GPS_RAW_INT"].fix_type, lost["GPS_RAW_INT"].satellites_visible) == (1, 0)
+
+
 def test_geodetic_against_the_ellipsoid() -> None:
     """Earth-centred coordinates of both ends are as far apart as the drone is from the origin."""
 
@@ -158,9 +192,9 @@ def test_pymavlink_opens_the_log(tmp_path: Path) -> None:
     while (m := log.recv_match()) is not None:
         read.append((m.get_type(), m._timestamp))
     log.close()
-    assert len(read) == 24
+    assert len(read) == 33
     assert "BAD_DATA" not in {name for name, _ in read}
-    assert read[-1] == ("BATTERY_STATUS", pytest.approx(1_700_000_000.2))
+    assert read[-1] == ("HOME_POSITION", pytest.approx(1_700_000_000.2))
 
 
 def test_a_log_is_there_whole_or_not_at_all(tmp_path: Path) -> None:

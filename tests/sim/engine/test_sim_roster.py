@@ -16,8 +16,8 @@ from sortie.policies.contract import Descriptor
 from sortie.sim.engine import sortie as engine
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.messages import descriptors
-from sortie.sim.playback.links import LinkArrows
 from sortie.sim.results import run_folder
+from sortie.sim.results.link_traffic import LinkTraffic
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.views import Decision, decisions
 
@@ -128,10 +128,8 @@ def test_the_record_lists_goodput_to_all_and_the_rosters(
     )
     run_folder.save(flown, tmp_path / "run")
     assert run_folder.load(tmp_path / "run").tables["rosters"].equals(flown.tables["rosters"])
-    arrows = LinkArrows.__new__(LinkArrows)
-    arrows._n, arrows._goodput = 5, np.zeros((5, 5))
-    at_s = np.array([5.9])
-    seen = arrows._goodput_at(at_s, rows)[0]
+    goodput, _ = LinkTraffic(5, 10.0).add(np.array([5.9]), rows, flown.tables["transmissions"])
+    seen = goodput[0]
     assert seen[0, 2] == 0.0
     assert seen[0, 4] == [r["goodput_mbps"][3] for r in rows.to_pylist() if r["drone"] == 0 and r["t_s"] < 5.9][-1]
 

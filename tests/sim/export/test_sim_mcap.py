@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter, defaultdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -16,12 +18,15 @@ from sim_examples import example
 from typer.testing import CliRunner
 
 import sortie.fleet.agent
+from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.messages.wire import decode_descriptor, decode_directive
 from sortie.policies.contract import Descriptor
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.bag import write_bag
+from sortie.sim.export.foxglove import layout
 from sortie.sim.export.messages import descriptors
+from sortie.sim.playback.recording import scene_of
 from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
@@ -45,7 +50,7 @@ def flown() -> tuple[SortieRecord, list[tuple[float, bytes]]]:
 
         patch.setattr(sortie.fleet.agent, "encode_descriptor", tapped)
         event = "events=[{kind: link_drop, at_s: 3.5, drone: 2, loss_db: 60}]"
-        return run_sortie(example("duration_s=5", event)), sent
+        return run_sortie(example("duration_s=5", "perception.detector=surrogate", event)), sent
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +68,12 @@ def path(record: SortieRecord, tmp_path_factory: pytest.TempPathFactory) -> Path
 @pytest.fixture(scope="module")
 def bag(path: Path) -> Bag:
     """Read by mcap-ros2-support, from the schemas inside the file alone."""
+    return read_bag(path / "bag.mcap")
+
+
+def read_bag(path: Path) -> Bag:
     found: Bag = defaultdict(list)
-    with (path / "bag.mcap").open("rb") as file:
+    with path.open("rb") as file:
         for _, channel, m, decoded in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
             found[channel.topic].append((m.log_time - BEGIN_NS, decoded))
     return found
@@ -109,7 +118,8 @@ def test_a_descriptor_is_the_one_that_was_sent_but_for_where_the_drone_thought_i
 def test_fields_come_out_as_the_record_has_them(bag: Bag, record: SortieRecord) -> None:
     row = [d for d in record.tables["descriptors"].to_pylist() if d["drone"] == 1][40]
     m = [m for _, m in bag["/fleet/context"] if m.agent_id == 1][40]
-    assert (m.agent_id, m.task_phase, m.stamp.sec * 1_000_000_000 + m.stamp.nanosec) == (1, 2, row["stamp_ns"])
+    assert (m.agent_id, m.task_phase) == (1, 2)
+    assert m.stamp.sec * 1_000_000_000 + m.stamp.nanosec == BEGIN_NS + row["stamp_ns"]
     assert list(m.peer_goodput) == pytest.approx(row["goodput_mbps"], rel=1e-6)
     assert list(m.region) == pytest.approx([row["region_x_m"], row["region_y_m"], 32.0, 1.0], rel=1e-6)
     assert bytes(m.coverage_grid) == row["coverage_grid"]
@@ -134,6 +144,124 @@ def test_the_log_is_the_decisions_in_words(bag: Bag, record: SortieRecord) -> No
     assert [(t_ns, m.name, m.msg) for t_ns, m in bag["/decisions"] if m.level == 30] == [
         (3_500_000_000, "drone_2", "drone 2: links of 2 lose 60 dB")
     ]
+
+
+def stamp_ns(stamp: Any) -> int:
+    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
+
+
+def test_every_stamp_agrees_with_the_log_s_time_and_time_never_steps_back(bag: Bag, path: Path) -> None:
+    """Descriptors are stamped at the pose that they tell, which is up to a frame old when they are published."""
+    for topic, messages in bag.items():
+        for t_ns, m in messages:
+            if topic == "/fleet/context":
+                assert 0 <= t_ns - (stamp_ns(m.stamp) - BEGIN_NS) <= 100_000_000
+            elif topic == "/clock":
+                assert stamp_ns(m.clock) - BEGIN_NS == t_ns
+            elif topic == "/decisions":
+                assert stamp_ns(m.stamp) - BEGIN_NS == t_ns
+            elif hasattr(m, "markers"):
+                assert {stamp_ns(each.header.stamp) - BEGIN_NS for each in m.markers} == {t_ns}
+            elif hasattr(m, "transforms"):
+                assert stamp_ns(m.transforms[0].header.stamp) - BEGIN_NS == t_ns
+            elif hasattr(m, "header"):
+                assert stamp_ns(m.header.stamp) - BEGIN_NS == t_ns
+    with (path / "bag.mcap").open("rb") as file:
+        times = [m.log_time for _, _, m in make_reader(file).iter_messages(log_time_order=False)]
+    assert times == sorted(times)
+
+
+def test_the_clock_ticks_with_every_frame(bag: Bag, record: SortieRecord) -> None:
+    frames = np.unique(record.tables["states"]["t_s"].to_numpy())
+    assert [t_ns for t_ns, _ in bag["/clock"]] == [round(t_s * 1e9) for t_s in frames.tolist()]
+
+
+def test_chunks_are_compressed(path: Path) -> None:
+    with (path / "bag.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunks = summary.chunk_indexes
+    assert {each.compression for each in chunks} == {"zstd"}
+    assert sum(c.compressed_size for c in chunks) < 0.3 * sum(c.uncompressed_size for c in chunks)
+
+
+def test_places_on_the_globe_and_the_loss_of_gnss(tmp_path: Path) -> None:
+    """A degree of latitude is 111.2 km and one of longitude 75.5 km there."""
+    lost = "events=[{kind: gnss_loss, at_s: 1, until_s: 2, drone: 1}]"
+    record = run_sortie(example("duration_s=3", "perception.detector=none", lost))
+    write_bag(record, tmp_path / "globe", BEGIN_NS, Origin(47.4, 8.5, 400.0))
+    found = read_bag(tmp_path / "globe" / "globe.mcap")
+    for drone, statuses in ((0, [0] * 30), (1, [0] * 10 + [-1] * 10 + [0] * 10)):
+        fixes = [m for _, m in found[f"/drone_{drone}/fix"]]
+        assert [m.status.status for m in fixes] == statuses
+        states = [s for s in record.tables["states"].to_pylist() if s["drone"] == drone]
+        for m, s in zip(fixes, states, strict=True):
+            assert (m.latitude - 47.4) * 111_190 == pytest.approx(s["y_m"], abs=0.3)
+            assert (m.longitude - 8.5) * 75_520 == pytest.approx(s["x_m"], abs=0.5)
+            assert m.altitude == pytest.approx(400.0 + s["z_m"])
+
+
+def test_the_scene_shows_cars_region_links_and_boxes(bag: Bag, record: SortieRecord) -> None:
+    """Numbers of cars, discs, ends of links and detections are the record's; each message clears what was before it."""
+    markers = {topic: [(t * 1e-9, m.markers) for t, m in found] for topic, found in bag.items() if "/scene" in topic}
+    boxes = {i: [(t * 1e-9, m.markers) for t, m in bag[f"/drone_{i}/boxes"]] for i in range(5)}
+    for each in (*markers.values(), *boxes.values()):
+        assert all(first.action == 3 and all(m.action == 0 for m in rest) for _, (first, *rest) in each)
+        assert all(len({m.id for m in rest}) == len(rest) for _, (_, *rest) in each)
+        assert all(m.header.frame_id == "world" for _, all_of in each for m in all_of)
+    ((town_s, town),) = markers["/scene/town"]
+    parked = scene_of(record).parked_cars
+    assert (town_s, sum(m.ns == "parked" for m in town)) == (0.0, len(parked))
+    first = next(m for m in town if m.ns == "parked")
+    assert (first.pose.position.x, first.scale.x, first.scale.y) == (
+        parked.x_m[0],
+        parked.length_m[0],
+        parked.width_m[0],
+    )
+    assert [round(t_s, 6) for t_s, _ in markers["/scene/cars"]] == [round(0.2 * k, 6) for k in range(25)]
+    at_s, drawn = markers["/scene/mission"][20]
+    row = next(r for r in record.tables["mission"].to_pylist() if r["t_s"] == pytest.approx(at_s))
+    disc = next(m for m in drawn if m.type == 3)
+    assert (disc.pose.position.x, disc.pose.position.y, disc.scale.x) == pytest.approx(
+        (row["region_x_m"], row["region_y_m"], 2 * row["region_radius_m"])
+    )
+    target = next(m for m in drawn if m.ns == "target")
+    assert (target.points[0].x, target.points[0].y) == pytest.approx((row["target_x_m"], row["target_y_m"]), abs=0.1)
+    _, (_, links) = markers["/scene/links"][-1]
+    assert len(links.points) == len(links.colors) == 2 * 5 * 4
+    assert record.tables["detections"].num_rows > 100
+    fused = Counter(record.tables["fusions"]["drone"].to_pylist())
+    assert {i: len(each) for i, each in boxes.items()} == {i: fused[i] for i in range(5)}
+    rows = [f for f in record.tables["fusions"].to_pylist() if f["drone"] == 2]
+    for (_, (_, *each)), row in zip(boxes[2], rows, strict=True):
+        assert sum(m.ns in ("found", "false") for m in each) == row["detections"]
+
+
+def test_a_jammer_is_shown_while_it_is_on(tmp_path: Path) -> None:
+    jam = "events=[{kind: jam, at_s: 1, until_s: 2, position_m: [10, 20, 5]}]"
+    write_bag(run_sortie(example("duration_s=3", "perception.detector=none", jam)), tmp_path / "jam", BEGIN_NS)
+    shown = [(t, m.markers) for t, m in read_bag(tmp_path / "jam" / "jam.mcap")["/scene/mission"]]
+    on = [t * 1e-9 for t, markers in shown if any(m.ns == "jammer" for m in markers)]
+    assert (on[0], on[-1], len(on)) == (1.0, 1.8, 5)
+
+
+def test_the_layout_names_topics_of_the_bag_alone(bag: Bag, path: Path) -> None:
+    made = json.loads((path / "foxglove_layout.json").read_text("utf-8"))
+    assert made == layout(5)
+    panels = made["configById"]
+    named = {
+        *panels["3D!fleet"]["topics"],
+        *panels["map!fleet"]["topicColors"],
+        panels["RosOut!decisions"]["topicToRender"],
+    }
+    named |= {each["value"].split(".")[0] for each in panels["Plot!battery"]["paths"]}
+    assert named <= bag.keys()
+    assert {f"/drone_{i}/fix" for i in range(5)} < named
+
+    def ids(node: Any) -> set[str]:
+        return {node} if isinstance(node, str) else ids(node["first"]) | ids(node["second"])
+
+    assert ids(made["layout"]) == panels.keys()
 
 
 def test_as_a_folder_it_is_a_bag_of_ros_2_with_the_paper_s_qos(path: Path, record: SortieRecord) -> None:
@@ -172,7 +300,7 @@ def test_the_command_writes_the_bag_into_the_run(record: SortieRecord, tmp_path:
     for _ in range(2):  # a second one replaces the first
         said = CliRunner().invoke(app, ["export", str(run), "--mcap", "--begin", "2026-11-21T09:00:00+01:00"])
         assert said.exit_code == 0, said.output
-    assert sorted(p.name for p in (run / "bag").iterdir()) == ["bag.mcap", "metadata.yaml"]
+    assert sorted(p.name for p in (run / "bag").iterdir()) == ["bag.mcap", "foxglove_layout.json", "metadata.yaml"]
     with (run / "bag" / "bag.mcap").open("rb") as file:
         _, _, first = next(iter(make_reader(file).iter_messages()))
     assert first.log_time == 1_795_248_000_000_000_000  # 2026-11-21 08:00 UTC
@@ -196,7 +324,7 @@ def test_a_bag_may_be_the_folder_one_stands_in(
     monkeypatch.chdir(here)
     said = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--mcap", "--out", "."])
     assert said.exit_code == 0, said.exception
-    assert sorted(p.name for p in here.iterdir()) == ["here.mcap", "metadata.yaml"]
+    assert sorted(p.name for p in here.iterdir()) == ["foxglove_layout.json", "here.mcap", "metadata.yaml"]
 
 
 def test_a_bag_replaces_no_file_that_it_did_not_write(record: SortieRecord, tmp_path: Path) -> None:
