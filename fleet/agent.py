@@ -11,21 +11,24 @@ from collections.abc import Callable, Generator, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol, cast
 
+import numpy as np
 import simpy
+from numpy.typing import NDArray
 
-from sortie.fleet.coverage import LOOK_STANDS_S, NOTHING_SEEN, NOVEL_FLAG, TARGET_FLAG, Chart, View, marked, placed
+from sortie.fleet.chart import Chart
+from sortie.fleet.coverage import LOOK_STANDS_S, NOTHING_SEEN, NOVEL_FLAG, TARGET_FLAG, View, placed
 from sortie.fleet.gate import Gate, Payload, make_payload
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import FULL, encode_compact
 from sortie.fleet.messages.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
+from sortie.fleet.peers import loops
 from sortie.fleet.plane import PlaneRules
 from sortie.fleet.senses import Sensed
 from sortie.fleet.staleness import LinkHealth, cap_by_age, health
 from sortie.fleet.trust import JUDGED_EVERY_S, Standing
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture
-from sortie.policies.catalogue.coverage_cells import well_cells
 from sortie.policies.contract import (
     PERSON_FLAG,
     Descriptor,
@@ -36,6 +39,7 @@ from sortie.policies.contract import (
     Roster,
     TaskPhase,
     check_directives,
+    differing,
     nothing,
 )
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
@@ -84,13 +88,16 @@ class Modem(Protocol):
     def goodput_mbps(self) -> tuple[float, ...]: ...
 
 
+Ages = Sequence[float] | NDArray[np.float64]
+
+
 class AgentLog(Protocol):
     """Where an agent's acts are written down."""
 
     def descriptor(self, t_s: float, descriptor: Descriptor, wire_bytes: int) -> None: ...
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None: ...
     def trust(self, t_s: float, drone: int, peer: int, standing: Standing) -> None: ...
-    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None: ...
+    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Ages) -> None: ...
     def event(self, t_s: float, drone: int, kind: str, text: str) -> None: ...
     def alert(self, t_s: float, drone: int, known: bool) -> None: ...
 
@@ -170,6 +177,11 @@ class Agent:
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
         self._links: dict[int, _OutgoingLink] = {}
+        self._asked_of: dict[int, Directive] = {}  # what the policy answered last, by peer; it was checked
+        self._ids: NDArray[np.int64] | None = None  # `memory.ids` as it was then
+        table, row = memory.table, memory.row
+        self._busy, self._at_rest, self._blamed = table.busy[row], table.at_rest[row], table.blamed[row]
+        self._find_overdue = loops().overdue
         self._alert = False  # whether it knows of a person in its region
         self._published: Descriptor | None = None
         self._roster = Roster(0, (self.drone,))
@@ -250,7 +262,7 @@ class Agent:
             battery_soc=soc,
             cpu_headroom=cpu_headroom,
             gpu_headroom=gpu_headroom,
-            peer_goodput_mbps=self.memory.probes.fill(self.drone, measured_mbps, self._env.now),
+            peer_goodput_mbps=self.memory.probes.fill(self.drone, measured_mbps, self._env.now, self.memory.ids),
             coverage_grid=grid,
             novelty_flags=NOVEL_FLAG * novel + TARGET_FLAG * bool(target_ids) + PERSON_FLAG * person,
             task_phase=phase,
@@ -289,8 +301,7 @@ class Agent:
         if look is None or now_s - look.capture.t_s > LOOK_STANDS_S + 1e-9:
             return NOTHING_SEEN, False
         grid = placed(look.view, here.row, here.column)
-        new = self._chart.new(well_cells(grid, here.row, here.column), self.memory.believed, told)
-        return (marked(grid, here.row, here.column, new), True) if new else (grid, False)
+        return self._chart.mark(grid, here.row, here.column, self.memory.believed, told)
 
     def _check_clock(self) -> None:
         """Report where the own clock is off the fleet's, and where it no longer is."""
@@ -308,34 +319,53 @@ class Agent:
 
     def _decide(self) -> None:
         now_s, me, links, fresh_s = self._env.now, self.drone, self._links, self._fresh_s
-        view = self.memory.view(now_s)
+        memory = self.memory
+        ages = memory.ages(now_s)
+        heard = view = memory.view(now_s, ages)
         if self._reads is not None:
-            view = self._reads(view)
+            view = self._reads(heard)
         if self._rules.people and view.human_in_region != self._alert:
             self._alert = not self._alert
             self._log.alert(now_s, me, self._alert)
         begin_ns = time.perf_counter_ns()
         directives = self._policy(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns
-        check_directives(directives, view)
-        asked_of = {d.destination: d for d in directives}
-        peer_ages_s = []
-        for peer, age_s in view.age_s.items():
-            if peer == me:
-                continue
-            peer_ages_s.append(age_s)
+        is_heard = view is heard
+        changed = differing(self._asked_of, directives, view) if is_heard and self._ids is memory.ids else None
+        if changed is None:
+            check_directives(directives, view)
+            self._asked_of = {d.destination: d for d in directives}
+            self._ids = memory.ids if is_heard else None
+            peers = [peer for peer in view.age_s if peer != me]
+        else:
+            peers = sorted({*self._overdue(ages, now_s), *[d.destination for d in changed]})
+            self._asked_of.update([(d.destination, d) for d in changed])
+        asked_of = self._asked_of
+        for peer in peers:
             link = links.get(peer)
             if link is None:
                 link = links[peer] = _OutgoingLink(me, peer)
                 self._gate.enforce(link.state.enforced)  # until more is asked of it, it asks for perception in full
-            asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
-            changed = asked is not link.asked and asked != link.asked
-            if changed or age_s > fresh_s or link.state.proposals:
+            asked, age_s = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive"), view.age_s[peer]
+            is_new = asked is not link.asked and asked != link.asked
+            if is_new or age_s > fresh_s or link.state.proposals:
                 self._enforce(link, asked, age_s, now_s)
         if self._guard is not None:
             self._keep_invariants(self._guard, view, asked_of)
         self.status.work.decisions += 1
-        self._log.decision(now_s, me, elapsed_ns, peer_ages_s)
+        others = ages[memory.ids != me] if is_heard else [age_s for peer, age_s in view.age_s.items() if peer != me]
+        self._log.decision(now_s, me, elapsed_ns, others)
+
+    def _overdue(self, ages_s: NDArray[np.float64], now_s: float) -> list[int]:
+        """Peers to which the link's directive may change although the policy asks for nothing new."""
+        memory, rules = self.memory, self._rules
+        table, row, ids = memory.table, memory.row, memory.ids
+        places = self._find_overdue(
+            self.drone, now_s, self._fresh_s, self._period_s, rules.degraded_after_periods, memory.clocks.delay_s, ids,
+            ages_s, table.heard_s[row], table.busy[row], table.at_rest[row], table.blamed[row],
+        )  # fmt: skip
+        found: list[int] = ids[places].tolist()
+        return found
 
     def _enforce(self, link: _OutgoingLink, asked: Directive, age_s: float, now_s: float) -> None:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
@@ -345,11 +375,15 @@ class Agent:
         if is_aged:
             fidelity, link.asked = self._health(age_s), None
         self._blame_clock(link, asked.destination, fidelity, age_s, now_s)
-        if not before.proposals and asked[2:8] == _NOTHING and asked == before.enforced:
+        is_at_rest = not before.proposals and asked[2:8] == _NOTHING and asked == before.enforced
+        self._at_rest[asked.destination] = is_at_rest
+        if is_at_rest:
+            self._busy[asked.destination] = False
             return  # nothing is left for age to reduce
         if is_aged:
             capped = cap_by_age(asked, fidelity, age_s)
         link.state = after = damp(before, capped, now_s, self._rules.dwell_s)
+        self._busy[asked.destination] = is_aged or bool(after.proposals)
         if self._guard is None and after.enforced is not before.enforced:
             self._put_in_force(link, asked, after.enforced, fidelity)
 
@@ -384,6 +418,8 @@ class Agent:
         """Report a link that begins to be reduced because a descriptor was too old when it came."""
         heard_ago_s, before = self.memory.heard_ago_s(peer, now_s), link.by_clock
         link.by_clock = fidelity != _FRESH and age_s - heard_ago_s > self.memory.clocks.delay_s
+        if link.by_clock != before:
+            self._blamed[peer] = link.by_clock
         if link.by_clock and not before:
             text = (
                 f"link to {peer} {fidelity.name.lower()}: its descriptor came {heard_ago_s:.2f} s ago and is {age_s:.2f} s "

@@ -15,6 +15,10 @@ from collections.abc import Iterable
 from statistics import median
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from sortie.scenarios.disc import AGENT_IDS
 from sortie.scenarios.schema import Clocks
 from sortie.scenarios.streams import stream
 
@@ -67,9 +71,17 @@ def oscillators(config: Clocks, drones: int, seed: int, replication: int) -> lis
 class PeerClocks:
     """How far one drone's clock is ahead of each peer's, as their descriptors show."""
 
-    def __init__(self, delay_s: float) -> None:
-        """Args: `delay_s`: the longest way of a descriptor, a frame."""
+    def __init__(
+        self, delay_s: float, ahead_s: NDArray[np.float64] | None = None, watched: NDArray[np.uint8] | None = None
+    ) -> None:
+        """Args:
+        delay_s: the longest way of a descriptor, a frame.
+        ahead_s: [ids] gets the offset from every peer's clock, 0 where none shows.
+        watched: [ids] gets whether every lag of a peer counts: its clock showed an offset lately.
+        """
         self.delay_s = delay_s
+        self._ahead_s = np.zeros(AGENT_IDS) if ahead_s is None else ahead_s
+        self._watched = np.zeros(AGENT_IDS, np.uint8) if watched is None else watched
         self.offset_s: dict[int, float] = {}
         """By peer; peers without a visible offset are left out. Each is known to ± `delay_s` / 2."""
         self._lags: dict[int, deque[float]] = {}
@@ -80,11 +92,13 @@ class PeerClocks:
             if peer in self._lags:
                 del self._lags[peer]
                 self.offset_s.pop(peer, None)
+                self._ahead_s[peer] = self._watched[peer] = 0
             return
+        self._watched[peer] = 1
         lags = self._lags.setdefault(peer, deque(maxlen=WINDOW))
         lags.append(lag_s)
         if len(lags) == WINDOW:
-            self.offset_s[peer] = min(lags) - self.delay_s / 2
+            self._ahead_s[peer] = self.offset_s[peer] = min(lags) - self.delay_s / 2
 
     def own_offset_s(self, peers: Iterable[int]) -> float:
         """How far the own clock is ahead of the fleet's: the median over the peers."""

@@ -10,7 +10,7 @@ It is seen well where the picture is as fine there as the network's map. Roofs h
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple, overload
 
@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from sortie.perception.geometry import FULL, USUAL, Cameras, camera_depth_m
 from sortie.perception.scene.height_field import HeightField
-from sortie.policies.catalogue.coverage_cells import Cells, seen_well
-from sortie.policies.contract import COVERAGE_BYTES, COVERAGE_CELLS, Coverage, Descriptor
+from sortie.policies.contract import COVERAGE_BYTES, COVERAGE_CELLS
 from sortie.policies.contract import COVERAGE_CELL_M as CELL_M
 from sortie.scenarios.schema import Fleet
 
@@ -184,36 +183,6 @@ def _in_sight(poses: Poses, corner: npt.NDArray[np.int64], turn: Array, field: H
     return enough[at]
 
 
-class Chart:
-    """The ground that the fleet has seen well, as far as one drone knows: from its own looks and its peers' grids."""
-
-    def __init__(self) -> None:
-        self._known: set[tuple[int, int]] = set()
-
-    def fold(self, claims: Iterable[Descriptor]) -> None:
-        """Take note of all that peers see well. Once a second is enough, for cells stay in sight for longer."""
-        for claim in claims:
-            self._known |= seen_well(claim)
-
-    def new(self, cells: Cells, claims: Callable[[], Iterable[Descriptor]], told: bool) -> Cells:
-        """Those of the cells that a drone sees well that are newly seen by the fleet.
-
-        Args:
-            cells: what it sees well.
-            claims: gives the latest descriptors of the peers that it believes; called where they matter.
-            told: whether the answer goes on the air. From then on the cells are known.
-        """
-        new = cells - self._known
-        if new:
-            for claim in claims():
-                new -= seen_well(claim)
-                if not new:
-                    break
-            if told:
-                self._known |= cells
-        return new
-
-
 @lru_cache(maxsize=256)
 def placed(view: View, row: int, column: int) -> bytes:
     """The grid of a view, on the cells of a grid whose south-west cell is (row, column)."""
@@ -224,12 +193,3 @@ def placed(view: View, row: int, column: int) -> bytes:
     states[COVERAGE_CELLS:-COVERAGE_CELLS, COVERAGE_CELLS:-COVERAGE_CELLS] = unpack_grid(view.grid)
     north, east = (COVERAGE_CELLS + min(max(by, -COVERAGE_CELLS), COVERAGE_CELLS) for by in (north, east))
     return pack_grid(states[north : north + COVERAGE_CELLS, east : east + COVERAGE_CELLS])
-
-
-def marked(grid: bytes, row: int, column: int, new: Cells) -> bytes:
-    """The grid with some of its cells marked as newly seen."""
-    out = bytearray(grid)
-    for at_row, at_column in new:
-        cell = (at_row - row) * COVERAGE_CELLS + at_column - column
-        out[cell // 4] |= Coverage.NOVEL << 2 * (cell % 4)
-    return bytes(out)

@@ -112,17 +112,25 @@ class Gate:
     """One drone's gate: the directive in force on each link, and when the link last sent."""
 
     def __init__(self) -> None:
-        self._directives: dict[int, Directive] = {}  # by ascending peer
+        self._directives: dict[int, Directive] = {}
+        self._sending: dict[int, Directive] = {}  # those that send anything, by ascending peer
         self._last_slot_s: dict[int, float] = {}
         self.duty_percent = 100
         """The highest duty cycle of the links' directives, 100 where there is no link."""
 
     def enforce(self, directive: Directive) -> None:
         """Put a directive in force. Repeating one changes nothing: timers run from the last send, not from here."""
-        if directive.destination not in self._directives:
-            self._directives = dict(sorted([*self._directives.items(), (directive.destination, directive)]))
-        self._directives[directive.destination] = directive
-        self.duty_percent = max([d.duty_percent for d in self._directives.values()])
+        peer, sending = directive.destination, self._sending
+        before = self._directives.get(peer)
+        self._directives[peer] = directive
+        if before is None or before.duty_percent != directive.duty_percent:
+            self.duty_percent = max([d.duty_percent for d in self._directives.values()])
+        if directive.representation == _NONE or directive.rate_hz <= 0:
+            sending.pop(peer, None)
+        elif peer in sending:
+            sending[peer] = directive
+        else:
+            self._sending = dict(sorted([*sending.items(), (peer, directive)]))
 
     def in_force(self, peer: int) -> Directive | None:
         """The directive of a link, None before the first."""
@@ -131,11 +139,8 @@ class Gate:
     def due(self, now_s: float) -> list[Directive]:
         """Directives of the links that may send now, by ascending peer; marks them as sent."""
         ready = []
-        for peer, directive in self._directives.items():
-            rate_hz = directive.rate_hz
-            if directive.representation == _NONE or rate_hz <= 0:
-                continue
-            period_s = 1.0 / rate_hz
+        for peer, directive in self._sending.items():
+            period_s = 1.0 / directive.rate_hz
             slot_s = self._last_slot_s.get(peer, -1e9) + period_s
             if now_s < slot_s - _EPSILON_S:
                 continue

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from types import MappingProxyType
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sortie.fleet.clock import PeerClocks
 from sortie.fleet.coverage import LOOK_STANDS_S
 from sortie.fleet.gate import Payload
-from sortie.fleet.messages.auth import Dropped, DropReason, Inbox, Opened
+from sortie.fleet.messages.auth import Dropped, DropReason, Opened
+from sortie.fleet.peers import PeerTable, loops
 from sortie.fleet.plane import DroneStatus, PlaneRules
-from sortie.fleet.probes import Probes
+from sortie.fleet.probes import Probes, window_of
 from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge, split_arrivals
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, FleetView
@@ -37,36 +42,36 @@ class Received(NamedTuple):
 class PeerMemory:
     """The descriptors and payloads that one drone received, and its trust in each peer."""
 
-    def __init__(self, drone: int, rules: PlaneRules, status: DroneStatus) -> None:
+    def __init__(self, drone: int, rules: PlaneRules, status: DroneStatus, table: PeerTable | None = None) -> None:
+        """Args: `table` holds the times of all receivers that hear the same datagrams; None makes one for this drone alone."""
         self.drone, self.status = drone, status
         self.held: dict[int, Received] = {}
         """The newest payload of each peer."""
-        self.probes = Probes(rules.descriptor_period_s, rules.detached_after_periods)
+        self.table = table = table or PeerTable(1, window_of(rules.detached_after_periods), drone)
+        self.row = row = drone - table.first
+        self.probes = Probes(table, row, rules.descriptor_period_s)
         self._rules = rules
         self._period_s, self._fresh_s = rules.descriptor_period_s, rules.fresh_s
-        self.clocks = PeerClocks(rules.period_s)
-        self._inbox = Inbox()
+        self.clocks = PeerClocks(rules.period_s, table.ahead_s[row], table.watched[row])
+        self._heard_s, self._stamps_s, self._ahead_s = table.heard_s[row], table.stamps_s[row], table.ahead_s[row]
         self._known: dict[int, Descriptor] = {}  # by ascending id
-        self._heard_at_s: dict[int, float] = {}
+        self.ids: NDArray[np.int64] = np.empty(0, np.int64)
+        """Of whom it has a descriptor, itself included, ascending; another array once there is one more."""
         self._standings: dict[int, Standing] = {}
         self._doubted: frozenset[int] = frozenset()
         self._arrivals: dict[int, list[Arrival]] = {}
         self._judged_at_s = -math.inf
+        self._loops = loops()
 
     def hear(self, opened: Opened | Dropped, now_s: float) -> DropReason | None:
-        """Take a datagram in: a credible one replaces the last descriptor of its sender.
+        """Take a datagram in, as `hear`; returns why it was refused, None if it was accepted."""
+        refused = hear([self], opened, now_s)
+        return refused[0][1] if refused else None
 
-        Returns:
-            Why the datagram was refused; None if it was accepted.
-        """
-        heard = self._inbox.accept(opened)
-        if isinstance(heard, DropReason):
-            return heard
-        if heard.agent_id != self.drone:
-            self.clocks.heard(heard.agent_id, now_s + self.status.clock_skew_s - heard.stamp_ns * 1e-9)
-            self.hold(heard, now_s)
-            self.probes.heard(heard.agent_id, now_s)
-        return None
+    def meet(self, descriptor: Descriptor, now_s: float) -> None:
+        """Take in a descriptor of a new peer, or of one with another clock."""
+        self.clocks.heard(descriptor.agent_id, now_s + self.status.clock_skew_s - descriptor.stamp_ns * 1e-9)
+        self.hold(descriptor, now_s)
 
     def hold(self, descriptor: Descriptor, now_s: float) -> None:
         """Replace the last descriptor of this sender, which may be the drone itself."""
@@ -75,7 +80,8 @@ class PeerMemory:
             known[sender] = descriptor
         else:  # by ascending id, so that the order of arrival decides nothing
             self._known = dict(sorted([*known.items(), (sender, descriptor)]))
-        self._heard_at_s[sender] = now_s
+            self.ids = np.array(list(self._known), np.int64)
+        self._heard_s[sender], self._stamps_s[sender] = now_s, descriptor.stamp_ns * 1e-9
 
     def can_fuse(self, payload: Payload) -> bool:
         """Whether the drone can use it. Feature cells of another network mean nothing to it; without one all maps do."""
@@ -117,28 +123,34 @@ class PeerMemory:
 
     def heard_ago_s(self, peer: int, now_s: float) -> float:
         """Time since the last descriptor of a peer arrived, whatever its stamp; infinite if none did."""
-        return now_s - self._heard_at_s.get(peer, -math.inf)
+        return now_s - float(self._heard_s[peer]) if peer in self._known else math.inf
+
+    def ages(self, now_s: float) -> NDArray[np.float64]:
+        """Age of the descriptor of each of `ids`, by this drone's clock and the peers' offsets from it, and at least the
+        time since it arrived."""
+        clock_s = now_s + self.status.clock_skew_s
+        found: NDArray[np.float64] = self._loops.ages(
+            clock_s, now_s, self.ids, self._heard_s, self._stamps_s, self._ahead_s
+        )
+        return found
 
     def ages_s(self, now_s: float) -> dict[int, float]:
-        """Age of every descriptor by this drone's clock and the peers' offsets from it, and at least the time since it arrived."""
-        clock_s, heard_at_s, ahead_s = now_s + self.status.clock_skew_s, self._heard_at_s, self.clocks.offset_s
-        if ahead_s:
-            return {
-                i: max(clock_s - d.stamp_ns * 1e-9 - ahead_s.get(i, 0.0), now_s - heard_at_s[i])
-                for i, d in self._known.items()
-            }
-        return {
-            i: stamped_s if (stamped_s := clock_s - d.stamp_ns * 1e-9) > (heard_s := now_s - heard_at_s[i]) else heard_s
-            for i, d in self._known.items()
-        }
+        """The same by peer."""
+        return dict(zip(self._known, self.ages(now_s).tolist(), strict=True))
 
-    def view(self, now_s: float) -> FleetView:
-        """What a policy reads: the fleet as this drone knows it, without the claims that it doubts."""
+    def view(self, now_s: float, ages: NDArray[np.float64] | None = None) -> FleetView:
+        """What a policy reads: the fleet as this drone knows it, without the claims that it doubts.
+
+        Args: `ages`: those of this moment; None works them out.
+        """
         known = dict(self._known)
         for doubted in self._doubted:
             known[doubted] = discounted(known[doubted])
-        frozen, ages_s = MappingProxyType(known), MappingProxyType(self.ages_s(now_s))
-        return FleetView(self.drone, self._period_s, frozen, ages_s, self._rules.detached_after_periods)
+        ages_s = self.ages(now_s) if ages is None else ages
+        by_peer = MappingProxyType(dict(zip(known, ages_s.tolist(), strict=True)))
+        return FleetView(
+            self.drone, self._period_s, MappingProxyType(known), by_peer, self._rules.detached_after_periods
+        )
 
     def believed(self) -> list[Descriptor]:
         """The latest descriptors of the peers that it does not doubt."""
@@ -158,11 +170,12 @@ class PeerMemory:
         since_s, self._judged_at_s = max(now_s - self._fresh_s, self._judged_at_s), now_s
         looking: set[int] = set()
         # its own claims stand, however long ago another of its nodes published them
-        heard = {i: d for i, d in self._known.items() if i == self.drone or self._heard_at_s[i] > since_s}
+        since = (self._heard_s[self.ids] > since_s).tolist()
+        heard = {i: d for (i, d), is_new in zip(self._known.items(), since, strict=True) if is_new or i == self.drone}
         arrivals, too_old_s = {}, now_s - max(2.0 * JUDGED_EVERY_S, 2.0 * self._period_s)
         for i, came in self._arrivals.items():
             claimed_s = (
-                min(self._heard_at_s[i], self.in_own_time(i, heard[i].stamp_ns * 1e-9)) if i in heard else too_old_s
+                min(float(self._heard_s[i]), self.in_own_time(i, heard[i].stamp_ns * 1e-9)) if i in heard else too_old_s
             )
             arrivals[i], later = split_arrivals(came, claimed_s)
             if any(claimed_s - a.sent_s < LOOK_STANDS_S / 2 for a in arrivals[i]):
@@ -173,3 +186,42 @@ class PeerMemory:
         )
         self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])
         return [(peer, after[peer]) for peer in heard if after[peer].trust != before.get(peer, UNJUDGED).trust]
+
+
+def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float) -> list[tuple[int, DropReason]]:
+    """Take a datagram in at all drones that it reached: a credible one replaces the last descriptor of its sender.
+
+    It was opened and decoded once for all of them. Whether it is a replay is each receiver's own question: a drone takes only
+    counters above the highest that it has taken from this sender with this key. What is refused changes nothing.
+
+    Args:
+        receivers: rows of one table.
+        opened: the datagram.
+        now_s: when it arrived.
+
+    Returns:
+        The drones that refused it, and why.
+    """
+    if isinstance(opened, Dropped):
+        return [(memory.drone, opened.reason) for memory in receivers]
+    if not receivers:
+        return []
+    descriptor, key_id, counter = opened
+    sender, first = descriptor.agent_id, receivers[0]
+    table, rules = first.table, first._rules
+    module = loops()
+    found = module.hear(
+        np.array([memory.row for memory in receivers]), table.first,
+        np.array([memory.status.clock_skew_s for memory in receivers]), sender, descriptor.stamp_ns * 1e-9, now_s,
+        key_id is not None, np.uint64(counter), rules.period_s, rules.descriptor_period_s, table.window,
+        table.counters(key_id or 0), table.heard_s, table.stamps_s, table.watched, table.bits,
+    )  # fmt: skip
+    refused = []
+    for memory, what in zip(receivers, found.tolist(), strict=True):
+        if what == module.TAKEN:
+            memory._known[sender] = descriptor
+        elif what == module.UNUSUAL:
+            memory.meet(descriptor, now_s)
+        elif what == module.REFUSED:
+            refused.append((memory.drone, DropReason.REPLAYED))
+    return refused

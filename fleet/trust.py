@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Container, Mapping, Sequence
-from functools import lru_cache
 from itertools import pairwise
 from statistics import median
 from typing import NamedTuple
@@ -142,6 +141,10 @@ def judge(
     after = {
         i: s if i in known else s._replace(seconds=s.seconds + 1, unheard=s.unheard + 1) for i, s in standings.items()
     }
+    peers = [i for i in known if i != ego] if math.isfinite(form.blur_m) else []
+    cells = dict(
+        zip(peers, count_cells([known[i] for i in peers], form.blur_m, [cameras(i) for i in peers]), strict=True)
+    )
     for peer, claim in known.items():
         standing = before[peer]
         doubt = ""
@@ -149,11 +152,7 @@ def judge(
             came = arrivals.get(peer, ()) if claim.counts(ego) else ()  # who leaves the ego out claims no goodput to it
             others_fell = _median_without(by_fall, fell_per_s[peer]) * standing.elapsed
             doubt = (
-                (
-                    coverage_doubt(claim, form.blur_m, peer in looking, cameras(peer))
-                    if math.isfinite(form.blur_m)
-                    else ""
-                )
+                (_coverage_doubt(cells[peer], peer in looking) if cells else "")
                 or goodput_doubt(claim.goodput_to(ego), came, form.goodput_step_mbps)
                 or battery_doubt(
                     claim.battery_soc,
@@ -197,7 +196,6 @@ def discounted(d: Descriptor) -> Descriptor:
 # --- the three checks ----------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=1024)  # a claim is judged by everyone who heard it
 def coverage_doubt(d: Descriptor, blur_m: float = 0.0, looks: bool = False, cameras: Cameras = USUAL) -> str:
     """What a coverage grid says that its pose or its payloads forbid; empty where it may be so.
 
@@ -209,21 +207,71 @@ def coverage_doubt(d: Descriptor, blur_m: float = 0.0, looks: bool = False, came
         looks: whether the drone is known to look.
         cameras: the drone's.
     """
-    states = unpack_grid(d.coverage_grid)
-    row, column = d.coverage_corner
-    half, (x_m, y_m, z_m) = COVERAGE_CELLS // 2, d.position_m
-    away_x, away_y = x_m - (column + half) * COVERAGE_CELL_M, y_m - (row + half) * COVERAGE_CELL_M
-    body = attitude(np.array(d.orientation_xyzw))
-    could = camera_states(np.array(away_x), np.array(away_y), np.array(z_m), body, cameras)
-    flown_m = math.hypot(*d.velocity_mps) * LOOK_STANDS_S + blur_m
-    reach = 1 + math.ceil(flown_m / COVERAGE_CELL_M)  # and a cell, since the drone may have turned since it looked
-    possible = binary_dilation(could >= Coverage.WELL, np.ones((3, 3)), iterations=reach)
-    false = int(np.count_nonzero((states >= Coverage.WELL) & ~possible))
-    if false >= FALSE_CELLS:
-        return f"coverage: {false} cells seen well that its cameras cannot show so"
-    if looks and np.count_nonzero(states) < FALSE_CELLS:
-        return f"coverage: {np.count_nonzero(states)} cells seen by a drone that looks"
+    return _coverage_doubt(count_cells([d], blur_m, [cameras])[0], looks)
+
+
+def _coverage_doubt(cells: Cells, looks: bool) -> str:
+    if cells.impossible >= FALSE_CELLS:
+        return f"coverage: {cells.impossible} cells seen well that its cameras cannot show so"
+    if looks and cells.seen < FALSE_CELLS:
+        return f"coverage: {cells.seen} cells seen by a drone that looks"
     return ""
+
+
+class Cells(NamedTuple):
+    """What a coverage grid claims, in cells."""
+
+    impossible: int
+    """Seen well, where the drone's cameras cannot show it so from its pose."""
+    seen: int
+
+
+_COUNTED: dict[tuple[object, ...], Cells] = {}
+_MOST_COUNTED = 4096
+
+
+def count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[Cameras]) -> list[Cells]:
+    """The cells that claims see, and those that they cannot; claims that are judged by several drones are counted once.
+
+    Args:
+        claims: the claims.
+        blur_m: how far a cell may be off by the descriptors' form.
+        cameras: of the drone of each claim.
+    """
+    keys = [
+        (d.coverage_grid, d.position_m, d.orientation_xyzw, d.velocity_mps, blur_m, its)
+        for d, its in zip(claims, cameras, strict=True)
+    ]
+    new = {key: d for key, d in zip(keys, claims, strict=True) if key not in _COUNTED}
+    if len(_COUNTED) + len(new) > _MOST_COUNTED:
+        _COUNTED.clear()
+        new = dict(zip(keys, claims, strict=True))
+    for kind in dict.fromkeys([key[-1] for key in new]):
+        several = [key for key in new if key[-1] == kind]
+        _COUNTED.update(zip(several, _count([new[key] for key in several], blur_m, kind), strict=True))
+    return [_COUNTED[key] for key in keys]
+
+
+def _count(claims: Sequence[Descriptor], blur_m: float, cameras: Cameras) -> list[Cells]:
+    states = np.stack([unpack_grid(d.coverage_grid) for d in claims])
+    half, position_m = COVERAGE_CELLS // 2, np.array([d.position_m for d in claims])
+    corner = np.array([d.coverage_corner for d in claims], np.float64)
+    away_x = position_m[:, 0] - (corner[:, 1] + half) * COVERAGE_CELL_M
+    away_y = position_m[:, 1] - (corner[:, 0] + half) * COVERAGE_CELL_M
+    body = attitude(np.array([d.orientation_xyzw for d in claims]))
+    could = camera_states(away_x, away_y, position_m[:, 2], body, cameras) >= Coverage.WELL
+    well, found = states >= Coverage.WELL, []
+    for d, claimed, possible, seen in zip(claims, well, could, np.count_nonzero(states, axis=(1, 2)), strict=True):
+        impossible = int(np.count_nonzero(claimed & ~possible))
+        if impossible >= FALSE_CELLS:  # else no leave that is given can matter
+            flown_m = math.hypot(*d.velocity_mps) * LOOK_STANDS_S + blur_m
+            reach = 1 + math.ceil(
+                flown_m / COVERAGE_CELL_M
+            )  # and a cell, since the drone may have turned since it looked
+            near = binary_dilation(possible, np.ones((3, 3)), iterations=reach)
+            impossible = int(np.count_nonzero(claimed & ~near))
+        found.append(Cells(impossible, int(seen)))
+    return found
 
 
 def goodput_doubt(claimed_mbps: float, arrivals: Sequence[Arrival], step_mbps: float = 0.0) -> str:

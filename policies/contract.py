@@ -30,6 +30,7 @@ from sortie.scenarios.link_state import LinkState as LinkState
 from sortie.scenarios.link_state import state_of
 from sortie.scenarios.representation import Representation as Representation
 
+AnyValue = TypeVar("AnyValue")
 PERSON_FLAG = 4
 """Of a descriptor's `novelty_flags`: the publisher's thermal camera found a person in its region of responsibility."""
 COVERAGE_CELLS = 16
@@ -165,6 +166,12 @@ def goodput_in(known: tuple[float, ...], me: int, roster: Roster | None, peer: i
     return known[slot] if slot < len(known) else 0.0
 
 
+def _copied(mapping: Mapping[int, AnyValue]) -> dict[int, AnyValue]:
+    """A copy that can be changed. That of a view in flight is one of a plain dictionary, in a tenth of the time."""
+    copied: dict[int, AnyValue] = mapping.copy() if isinstance(mapping, MappingProxyType) else dict(mapping)
+    return copied
+
+
 class FleetView(NamedTuple):
     """A policy's input: the latest descriptor of every drone heard so far, of whatever age.
 
@@ -226,11 +233,14 @@ class FleetView(NamedTuple):
             [0, 1]
         """
         limit_s = (self.detached_after_periods + ROUNDING_PERIODS) * self.period_s
-        near = [i for i, age_s in self.age_s.items() if i == self.ego or age_s <= limit_s]
-        if len(near) == len(self.age_s):
+        ego = self.ego
+        far = [i for i, age_s in self.age_s.items() if not age_s <= limit_s and i != ego]
+        if not far:
             return self
-        descriptors, ages_s = self.descriptors, self.age_s
-        return self._replace(descriptors={i: descriptors[i] for i in near}, age_s={i: ages_s[i] for i in near})
+        descriptors, ages_s = _copied(self.descriptors), _copied(self.age_s)
+        for i in far:
+            del descriptors[i], ages_s[i]
+        return FleetView(ego, self.period_s, descriptors, ages_s, self.detached_after_periods)
 
     @property
     def members(self) -> tuple[int, ...]:
@@ -419,6 +429,33 @@ def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
         if fault is not None:
             raise PolicyError(fault)
         seen.add(d.destination)
+
+
+def differing(
+    before: Mapping[int, Directive], directives: Sequence[Directive], view: FleetView
+) -> list[Directive] | None:
+    """Those of a policy's directives that are other objects than in its answer before; most of the time it repeats itself.
+
+    Args:
+        before: the answer before, by destination, which was checked by a view of the same peers.
+        directives: the answer now.
+        view: that it was given to.
+
+    Returns:
+        The directives that are new, checked against the contract; None where the whole answer must be checked.
+    """
+    if (type(directives) is not tuple and type(directives) is not list) or len(before) != len(directives):
+        return None
+    if all(map(operator.is_, directives, before.values())):
+        return []
+    try:
+        changed = [d for d in directives if before.get(d[1]) is not d]
+        if len({d[1] for d in directives}) != len(before):
+            return None
+    except Exception:  # no directive
+        return None
+    known = all(type(d) is Directive and d.destination in before for d in changed)
+    return changed if known and _is_plainly_valid(changed, view) else None
 
 
 def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:

@@ -30,5 +30,6 @@ def peers_by_overlap(view: FleetView, receiver: int | None = None) -> list[int]:
     for p, peer in view.descriptors.items():  # written out: a policy spends most of its time here
         if p != of:
             px_m, py_m, _ = peer.position_m
-            overlap[p] = disc_overlap(hypot(x_m - px_m, y_m - py_m), radius_m, peer.footprint_radius_m)
+            away_m, other_m = hypot(x_m - px_m, y_m - py_m), peer.footprint_radius_m
+            overlap[p] = disc_overlap(away_m, radius_m, other_m) if away_m < radius_m + other_m else 0.0
     return rank_by_overlap(of, overlap)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from math import acos, copysign, pi, sqrt
 from typing import NamedTuple
@@ -59,4 +60,12 @@ def rank_by_overlap(ego: int, overlap: Mapping[int, float]) -> list[int]:
         ego: the id of the drone that receives.
         overlap: by peer, the share of the ego's footprint that the peer's footprint covers, 0 … 1.
     """
-    return [p for _, _, p in sorted([(-round(o / OVERLAP_STEP), (p - ego) % AGENT_IDS, p) for p, o in overlap.items()])]
+    steps = [(-round(o / OVERLAP_STEP), (p - ego) % AGENT_IDS, p) for p, o in overlap.items() if o]
+    near = sorted([each for each in steps if each[0]])
+    far = sorted([p for p, o in overlap.items() if not o] + [p for step, _, p in steps if not step])
+    if far and (far[0] < 0 or far[-1] >= AGENT_IDS or not 0 <= ego < AGENT_IDS):
+        far.sort(key=lambda p: ((p - ego) % AGENT_IDS, p))
+    else:  # ids ascend from the ego's on and begin anew
+        at = bisect_left(far, ego)
+        far = far[at:] + far[:at]
+    return [p for _, _, p in near] + far

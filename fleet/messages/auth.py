@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import hmac
 import struct
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -149,7 +148,7 @@ def unseal(data: bytes, keys: Mapping[int, bytes]) -> Unsealed | Dropped:
 def open_datagram(data: bytes, keys: Mapping[int, bytes] | None) -> Opened | Dropped:
     """Check everything about a datagram that is the same for every receiver; changes nothing.
 
-    A broadcast is the same bytes for all, so one result serves every `Inbox` whose drone holds the same keys.
+    A broadcast is the same bytes for all, so one result serves every drone that holds the same keys (`sortie.fleet.memory.hear`).
 
     Args:
         data: as received.
@@ -172,28 +171,3 @@ def open_datagram(data: bytes, keys: Mapping[int, bytes] | None) -> Opened | Dro
         return Opened(decode_descriptor(payload), key_id, counter)
     except MalformedDatagram as error:
         return Dropped(DropReason.MALFORMED, error.reason)
-
-
-class Inbox:
-    """A receiver's side: what it has taken from whom, and what it dropped and why."""
-
-    def __init__(self) -> None:
-        self._highest: dict[tuple[int, int], int] = {}  # (key id, sender) → counter
-        self.dropped: Counter[DropReason] = Counter()
-
-    def accept(self, opened: Opened | Dropped) -> Descriptor | DropReason:
-        """The descriptor, if it may be believed; else the reason, counted, and nothing else changes."""
-        if isinstance(opened, Dropped):
-            self.dropped[opened.reason] += 1
-            return opened.reason
-        if opened.key_id is not None:
-            sender = (opened.key_id, opened.descriptor.agent_id)
-            if opened.counter <= self._highest.get(sender, 0):
-                self.dropped[DropReason.REPLAYED] += 1
-                return DropReason.REPLAYED
-            self._highest[sender] = opened.counter
-        return opened.descriptor
-
-    def highest(self, sender: int, key_id: int) -> int:
-        """The highest counter taken from a sender, 0 for none."""
-        return self._highest.get((key_id, sender), 0)

@@ -27,7 +27,7 @@ def among_attached(policy: Decide) -> Decide:
         if attached is view or attached.me is None:
             return directives
         duty = directives[0].duty_percent if directives else 100
-        gone = (nothing(view.ego, p, DETACHED) for p in view.peers if p not in attached.descriptors)
+        gone = (nothing(view.ego, p, DETACHED) for p in sorted(view.descriptors.keys() - attached.descriptors.keys()))
         return [*directives, *(d if duty == 100 else d._replace(duty_percent=duty) for d in gone)]
 
     decide.__signature__ = inspect.signature(policy)  # type: ignore[attr-defined]

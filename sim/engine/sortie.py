@@ -19,7 +19,9 @@ from sortie.fleet.gate import Gate
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import Form
+from sortie.fleet.peers import PeerTable
 from sortie.fleet.plane import DroneStatus, PlaneRules, equipment_of
+from sortie.fleet.probes import window_of
 from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, LooksByAnother, make_detector
@@ -175,7 +177,8 @@ def build(
         DroneStatus(space, looks=not blind)
         for space, blind in zip(scenario.feature_spaces, scenario.context_only, strict=True)
     ]
-    memories = [PeerMemory(i, rules, statuses[i]) for i in drones]
+    table = PeerTable(len(drones), window_of(rules.detached_after_periods))
+    memories = [PeerMemory(i, rules, statuses[i], table) for i in drones]
 
     motion, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
     charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}

@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
 import simpy
 
 from sortie.fleet.gate import Payload
-from sortie.fleet.memory import PeerMemory, Received
+from sortie.fleet.memory import PeerMemory, Received, hear
 from sortie.fleet.messages.auth import Dropped, Opened, open_datagram
 from sortie.fleet.tiles import cells_of
 from sortie.perception.types import Capture
@@ -78,12 +79,10 @@ class Transport:
 
     def hand_over(self, opened: Opened | Dropped, heard: Sequence[int]) -> None:
         """Give an opened datagram to those that heard it; a refused one is counted and changes nothing."""
-        for receiver in heard:
-            memory = self._receivers[receiver]
-            if memory.status.airborne:
-                refused = memory.hear(opened, self._env.now)
-                if refused is not None:
-                    self._recorder.rows["drops"].append((self._env.now, receiver, refused.value))
+        listed = heard.tolist() if isinstance(heard, np.ndarray) else heard
+        now_s, memories = self._env.now, [self._receivers[receiver] for receiver in listed]
+        for receiver, reason in hear([m for m in memories if m.status.airborne], opened, now_s):
+            self._recorder.rows["drops"].append((now_s, receiver, reason.value))
 
     def send(self, drone: int, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:
         """Hand a payload to the radio."""

@@ -13,13 +13,13 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import chain
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from sortie.fleet.agent import Ages
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.fleet.staleness import LinkHealth
 from sortie.fleet.trust import Standing
@@ -282,7 +282,7 @@ def _unfold_ages(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     """A decision's ages stand in one row."""
     t_s, drones, ages_s = zip(*rows, strict=True)
     counts = [len(ages) for ages in ages_s]
-    return [np.repeat(t_s, counts), np.repeat(drones, counts), list(chain.from_iterable(ages_s))]
+    return [np.repeat(t_s, counts), np.repeat(drones, counts), np.concatenate(ages_s)]
 
 
 class AgentNotes:
@@ -320,7 +320,7 @@ class AgentNotes:
         """A drone thinks otherwise of a peer than before."""
         self._rows["trust"].append((t_s, drone, peer, standing.trust, standing.reason))
 
-    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None:
+    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Ages) -> None:
         """A policy decided, reading peers' descriptors of these ages."""
         self._eval_steps[elapsed_ns // _EVAL_STEP_NS] += 1
         self._decisions += 1

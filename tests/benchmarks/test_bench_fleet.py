@@ -9,8 +9,11 @@ from fleet_examples import DESCRIPTOR, DIRECTIVE
 
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.motion import fly
-from sortie.fleet.messages.auth import Inbox, Sealer, open_datagram
+from sortie.fleet.memory import PeerMemory, hear
+from sortie.fleet.messages.auth import Sealer, open_datagram
 from sortie.fleet.messages.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
+from sortie.fleet.peers import PeerTable
+from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.scenarios.schema import Battery, Fleet, Route
 
 KEY = bytes(range(32))
@@ -42,9 +45,13 @@ def test_open_sealed_once_a_broadcast(benchmark: Any) -> None:
     assert benchmark(open_datagram, data, {1: KEY}).descriptor == DESCRIPTOR
 
 
-def test_accept_once_a_receiver(benchmark: Any) -> None:
-    opened = open_datagram(Sealer(KEY, 1).seal(encode_descriptor(DESCRIPTOR)), {1: KEY})
-    benchmark(Inbox().accept, opened)
+@pytest.mark.parametrize("receivers", [4, 99])
+def test_a_descriptor_at_all_that_hear_it(benchmark: Any, receivers: int) -> None:
+    rules = PlaneRules(0.1, 1000, 3.0, 10.0, 0.3, 0.2, 0.04)
+    table = PeerTable(receivers, 10)
+    memories = [PeerMemory(i, rules, DroneStatus(), table) for i in range(receivers)]
+    opened = open_datagram(encode_descriptor(DESCRIPTOR._replace(agent_id=receivers)), None)
+    assert benchmark(hear, memories, opened, 0.01) == []
 
 
 @pytest.mark.parametrize("drones", [5, 100])

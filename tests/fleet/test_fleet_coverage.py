@@ -10,23 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.coverage import (
-    CELL_M,
-    RANGE_M,
-    Chart,
-    Poses,
-    View,
-    marked,
-    placed,
-    unpack_grid,
-    views,
-)
+from sortie.fleet.chart import Chart
+from sortie.fleet.coverage import CELL_M, RANGE_M, Poses, View, pack_grid, placed, unpack_grid, views
 from sortie.perception.benchmark.visibility import in_a_camera, past_houses, past_trees
 from sortie.perception.geometry import FOCAL_PX, FULL
 from sortie.perception.scene.height_field import CAR_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
-from sortie.policies.catalogue.coverage_cells import seen_well, well_cells
+from sortie.policies.catalogue.coverage_cells import Cells, seen_well, well_cells
 from sortie.policies.contract import Coverage, Descriptor, TaskPhase
 from sortie.scenarios.schema import Scene
 
@@ -142,28 +133,52 @@ def claim(grid: bytes, x_m: float, y_m: float) -> Descriptor:
     )  # fmt: skip
 
 
+def moved(cells: Cells, columns: int) -> Cells:
+    return frozenset((row, column + columns) for row, column in cells)
+
+
 def test_new_is_what_neither_the_drone_nor_a_peer_saw() -> None:
     ((view,),) = views(poses(np.array([5.0, 3.0, 60.0])), PLAIN.height_field)
     cells = well_cells(view.grid, view.row, view.column)
-    chart, nobody = Chart(), list
-    assert chart.new(cells, nobody, told=False) == cells, "not told, so that it stays new"
-    assert chart.new(cells, nobody, told=True) == cells
-    assert chart.new(cells, nobody, told=True) == set()
-    moved = frozenset((row, column + 3) for row, column in cells)
-    assert chart.new(moved, nobody, told=False) == moved - cells
-    assert chart.new(moved, lambda: [claim(view.grid, 5.0 + 3 * CELL_M, 3.0)], told=False) == set()
+    chart = Chart()
+
+    def new(column: int, *heard: Descriptor, told: bool) -> Cells:
+        grid, is_new = chart.mark(view.grid, view.row, column, lambda: heard, told)
+        rows, columns = np.nonzero(unpack_grid(grid) == Coverage.NOVEL)
+        found = frozenset(zip((rows + view.row).tolist(), (columns + column).tolist(), strict=True))
+        assert is_new == bool(found)
+        assert (unpack_grid(grid) >= Coverage.WELL).sum() == len(cells), "marks are on cells that are seen well"
+        return found
+
+    assert new(view.column, told=False) == cells, "not told, so that it stays new"
+    assert new(view.column, told=True) == cells
+    assert new(view.column, told=True) == set()
+    assert new(view.column + 3, told=False) == moved(cells, 3) - cells
+    assert new(view.column + 3, claim(view.grid, 5.0 + 3 * CELL_M, 3.0), told=False) == set()
+    assert new(view.column + 3, claim(view.grid, 5.0 + 4 * CELL_M, 3.0), told=False) == moved(cells, 3) - cells - moved(
+        cells, 4
+    )
 
 
 def test_what_a_peer_saw_once_stays_known() -> None:
     ((view,),) = views(poses(np.array([5.0, 3.0, 60.0])), PLAIN.height_field)
-    heard, chart = claim(view.grid, 5.0, 3.0), Chart()
-    chart.fold([heard])
-    assert chart.new(seen_well(heard), list, told=True) == set()
+    chart = Chart()
+    chart.fold([claim(view.grid, 5.0, 3.0)])
+    assert chart.mark(view.grid, view.row, view.column, list, told=True) == (view.grid, False)
 
 
-def test_marks_are_on_the_new_cells_alone() -> None:
-    ((view,),) = views(poses(np.array([5.0, 3.0, 60.0])), PLAIN.height_field)
-    cells = sorted(well_cells(view.grid, view.row, view.column))[:7]
-    new = unpack_grid(marked(view.grid, view.row, view.column, frozenset(cells))) == Coverage.NOVEL
-    rows, columns = np.nonzero(new)
-    assert list(zip((rows + view.row).tolist(), (columns + view.column).tolist(), strict=True)) == cells
+def test_a_chart_holds_whatever_is_claimed() -> None:
+    """As a set of cells would: over several sizes of its table, south and west of the origin, and beyond all bounds."""
+    rng, chart, known = np.random.default_rng(1), Chart(), set[tuple[int, int]]()
+    for _ in range(60):
+        states = rng.integers(0, 4, (16, 16)).astype(np.uint8)
+        heard = claim(pack_grid(states), *np.float32(rng.normal(0, 400, 2)).tolist())
+        row, column = heard.coverage_corner
+        grid, _ = chart.mark(heard.coverage_grid, row, column, list, told=False)
+        new = {(row + r, column + c) for r, c in np.argwhere(unpack_grid(grid) != states).tolist()}
+        fresh = seen_well(heard) - known
+        there = {(row + r, column + c) for r, c in np.argwhere(states == Coverage.WELL).tolist()}
+        assert new == fresh & there, "cells that were marked already keep their mark"
+        chart.fold([heard])
+        known |= seen_well(heard)
+    chart.fold([claim(bytes([255]) * 64, 3e38, -3e38)])

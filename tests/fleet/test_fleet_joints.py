@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agent_rig import Rig, capture, descriptor, memory, payload
+from agent_rig import Rig, capture, descriptor, hear, memory, payload
 from fleet_examples import DESCRIPTOR
 from scipy.spatial.transform import Rotation
 
@@ -46,7 +46,6 @@ from sortie.fleet.lies import falsified
 from sortie.fleet.memory import Received
 from sortie.fleet.messages.wire import decode_descriptor
 from sortie.fleet.plane import Equipment, equipment_of
-from sortie.fleet.probes import Probes
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.staleness import DEGRADED_RATE_HZ, LinkHealth, cap_by_age
@@ -441,14 +440,14 @@ def test_how_long_a_payload_took_leaves_out_its_sender_s_compute_delay() -> None
 def test_a_slot_is_of_the_peer_that_it_is_of(me: int) -> None:
     """Whoever one is: heard peers are probed, measured ones stay, and the rest is unknown."""
     for heard in set(range(4)) - {me}:
-        probes = Probes(0.1, 10)
+        mine = memory(me)
         for k in range(10):
-            probes.heard(heard, 0.1 * k)
+            hear(mine, heard, 0.1 * k)
         peers = [i for i in range(4) if i != me]
         measured = [0.0, 0.0, 0.0]
         other = next(i for i in peers if i != heard)
         measured[peers.index(other)] = 55.0
-        filled = dict(zip(peers, probes.fill(me, measured, 0.9), strict=True))
+        filled = dict(zip(peers, mine.probes.fill(me, measured, 0.9, mine.ids), strict=True))
         assert heard_share(filled[heard]) == 1.0
         assert filled[other] == 55.0
         assert [v for i, v in filled.items() if i not in (heard, other)] == [0.0]

@@ -3,38 +3,43 @@
 from __future__ import annotations
 
 import pytest
+from agent_rig import hear, memory
 
-from sortie.fleet.probes import Probes
+from sortie.fleet.memory import PeerMemory
 from sortie.radio.goodput import Goodput
 from sortie.scenarios.link_state import MEASURED_FOR_S, SILENT_MBPS, LinkState, heard_share, state_of
 
 
+def filled(mine: PeerMemory, goodput_mbps: tuple[float, ...], now_s: float) -> tuple[float, ...]:
+    return mine.probes.fill(mine.drone, goodput_mbps, now_s, mine.ids)
+
+
 def test_probes_count_the_descriptors_heard_and_missed() -> None:
-    probes = Probes(0.1, 10)
+    mine = memory()
     for k in range(30):
         if k % 5:  # every fifth is missed
-            probes.heard(1, 0.003 * (k % 2) + 0.1 * k)
+            hear(mine, 1, 0.003 * (k % 2) + 0.1 * k)
 
     def share(now_s: float) -> float | None:
-        return heard_share(probes.fill(0, (0.0, 0.0), now_s)[0])
+        return heard_share(filled(mine, (0.0, 0.0), now_s)[0])
 
     assert share(2.93) == pytest.approx(0.8)
     assert share(3.42) == pytest.approx(0.5)  # 3.0 and four more are missed by now
-    assert probes.fill(0, (0.0, 0.0), 3.98) == (SILENT_MBPS, 0.0) == probes.fill(0, (0.0, 0.0), 1e6)
+    assert filled(mine, (0.0, 0.0), 3.98) == (SILENT_MBPS, 0.0) == filled(mine, (0.0, 0.0), 1e6)
 
 
 def test_probes_stand_where_nothing_was_measured_and_have_no_rate() -> None:
-    probes = Probes(0.1, 10)
+    mine = memory(1)
     for k in range(10):
-        probes.heard(0, 0.1 * k)
+        hear(mine, 0, 0.1 * k)
         if k < 5:
-            probes.heard(3, 0.1 * k)
-    known = probes.fill(1, (0.0, 40.0, 0.0, 0.0), 0.95)  # to drones 0, 2, 3 and 4
+            hear(mine, 3, 0.1 * k)
+    known = filled(mine, (0.0, 40.0, 0.0, 0.0), 0.95)  # to drones 0, 2, 3 and 4
     assert [state_of(mbps) for mbps in known] == [
         LinkState.PROBED, LinkState.MEASURED, LinkState.PROBED, LinkState.UNKNOWN,
     ]  # fmt: skip
     assert [heard_share(mbps) for mbps in known] == [pytest.approx(1.0), None, pytest.approx(0.5), None]
-    later = probes.fill(1, (0.0, 40.0, 0.0, 0.0), 3.0)
+    later = filled(mine, (0.0, 40.0, 0.0, 0.0), 3.0)
     assert later == (SILENT_MBPS, 40.0, SILENT_MBPS, 0.0)
 
 

@@ -12,6 +12,7 @@ from sortie.fleet.agent import Agent, Platform, Task
 from sortie.fleet.coverage import View
 from sortie.fleet.gate import Gate, Payload
 from sortie.fleet.memory import PeerMemory
+from sortie.fleet.messages.auth import DropReason, Opened
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.senses import Sensed
 from sortie.perception.types import Boxes, Capture
@@ -27,6 +28,11 @@ def memory(drone: int = 0, **changes: Any) -> PeerMemory:
 
 def descriptor(agent_id: int, t_s: float = 0.0, **changes: Any) -> Descriptor:
     return DESCRIPTOR._replace(agent_id=agent_id, stamp_ns=round(t_s * 1e9), **changes)
+
+
+def hear(mine: PeerMemory, peer: int, t_s: float, *, counter: int = 0, key_id: int | None = None) -> DropReason | None:
+    """A descriptor of this time arrives at once."""
+    return mine.hear(Opened(descriptor(peer, t_s), key_id, counter), t_s)
 
 
 def capture(drone: int, t_s: float) -> Capture:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 
 import pytest
+from agent_rig import memory
 from fleet_examples import DESCRIPTOR
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.fleet.messages.auth import MAX_COUNTER, Dropped, DropReason, Inbox, Opened, Sealer, open_datagram, tag
+from sortie.fleet.memory import PeerMemory
+from sortie.fleet.messages.auth import MAX_COUNTER, Dropped, DropReason, Opened, Sealer, open_datagram, tag
 from sortie.fleet.messages.wire import encode_descriptor
-from sortie.policies.contract import Descriptor
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
 KEYS = {7: KEY}
@@ -99,36 +100,48 @@ def test_the_parser_sees_no_unauthenticated_byte(monkeypatch: pytest.MonkeyPatch
     assert seen == [PAYLOAD]
 
 
+def take(mine: PeerMemory, data: bytes, keys: dict[int, bytes] | None = KEYS) -> DropReason | None:
+    return mine.hear(open_datagram(data, keys), 0.0)
+
+
+def highest(mine: PeerMemory, sender: int, key_id: int = 7) -> int:
+    return int(mine.table.counters(key_id)[mine.row, sender])
+
+
 def test_each_receiver_takes_a_datagram_once() -> None:
-    opened = open_datagram(sealed(counter=5), KEYS)
-    one, two = Inbox(), Inbox()
-    assert one.accept(opened) == DESCRIPTOR
-    assert one.accept(opened) is DropReason.REPLAYED
-    assert two.accept(opened) == DESCRIPTOR
-    assert one.dropped == {DropReason.REPLAYED: 1}
-    assert two.dropped == {}
+    one, two = memory(), memory(1)
+    assert take(one, sealed(counter=5)) is None
+    assert take(one, sealed(counter=5)) is DropReason.REPLAYED
+    assert take(two, sealed(counter=5)) is None
+    assert one.view(0.0).descriptors == two.view(0.0).descriptors == {DESCRIPTOR.agent_id: DESCRIPTOR}
 
 
 def test_older_than_the_newest_is_a_replay_and_every_sender_counts_alone() -> None:
-    inbox = Inbox()
-    assert isinstance(inbox.accept(open_datagram(sealed(counter=9), KEYS)), Descriptor)
-    assert inbox.accept(open_datagram(sealed(counter=8), KEYS)) is DropReason.REPLAYED
-    other = encode_descriptor(DESCRIPTOR._replace(agent_id=4))
-    assert isinstance(inbox.accept(open_datagram(sealed(other, counter=1), KEYS)), Descriptor)
-    assert (inbox.highest(3, 7), inbox.highest(4, 7), inbox.highest(5, 7)) == (9, 1, 0)
+    mine = memory()
+    assert take(mine, sealed(counter=9)) is None
+    assert take(mine, sealed(counter=8)) is DropReason.REPLAYED
+    assert take(mine, sealed(encode_descriptor(DESCRIPTOR._replace(agent_id=4)), counter=1)) is None
+    assert (highest(mine, 3), highest(mine, 4), highest(mine, 5)) == (9, 1, 0)
+
+
+def test_a_counter_may_take_all_its_bits() -> None:
+    mine = memory()
+    assert take(mine, sealed(counter=MAX_COUNTER - 1)) is None
+    assert take(mine, sealed(counter=MAX_COUNTER)) is None
+    assert take(mine, sealed(counter=MAX_COUNTER)) is DropReason.REPLAYED
 
 
 def test_a_new_key_starts_its_own_count() -> None:
-    inbox, keys = Inbox(), {7: KEY, 8: OTHER}
-    assert isinstance(inbox.accept(open_datagram(sealed(counter=1000), keys)), Descriptor)
-    assert isinstance(inbox.accept(open_datagram(sealed(key=OTHER, key_id=8, counter=1), keys)), Descriptor)
-    assert inbox.accept(open_datagram(sealed(counter=1000), keys)) is DropReason.REPLAYED
+    mine, keys = memory(), {7: KEY, 8: OTHER}
+    assert take(mine, sealed(counter=1000), keys) is None
+    assert take(mine, sealed(key=OTHER, key_id=8, counter=1), keys) is None
+    assert take(mine, sealed(counter=1000), keys) is DropReason.REPLAYED
 
 
-def test_what_is_dropped_changes_nothing_but_its_count() -> None:
+def test_what_is_dropped_changes_nothing() -> None:
     """Above all: a forged datagram with a huge counter does not lock the honest sender out."""
-    inbox = Inbox()
-    inbox.accept(open_datagram(sealed(counter=1), KEYS))
+    mine = memory()
+    take(mine, sealed(counter=1))
     attacks = {
         DropReason.FORGED: sealed(key=OTHER, counter=MAX_COUNTER),
         DropReason.UNKNOWN_KEY: sealed(key_id=9, counter=MAX_COUNTER),
@@ -139,20 +152,19 @@ def test_what_is_dropped_changes_nothing_but_its_count() -> None:
     }
     assert set(attacks) == set(DropReason)
     for expected, data in attacks.items():
-        assert inbox.accept(open_datagram(data, KEYS)) is expected
-        assert inbox.highest(DESCRIPTOR.agent_id, 7) == 1
-    assert inbox.dropped == dict.fromkeys(DropReason, 1)
-    assert inbox.accept(open_datagram(sealed(counter=2), KEYS)) == DESCRIPTOR
+        assert take(mine, data) is expected
+        assert highest(mine, DESCRIPTOR.agent_id) == 1
+    assert take(mine, sealed(counter=2)) is None
 
 
 def test_without_authentication_descriptors_come_bare() -> None:
-    inbox = Inbox()
-    assert inbox.accept(open_datagram(PAYLOAD, None)) == DESCRIPTOR
-    assert inbox.accept(open_datagram(PAYLOAD, None)) == DESCRIPTOR  # nothing tells a replay from an original
-    assert inbox.accept(open_datagram(b"\x01" + PAYLOAD[1:], None)) is DropReason.MALFORMED
-    assert inbox.accept(open_datagram(bytes(1025), None)) is DropReason.OVERSIZED
-    assert inbox.accept(open_datagram(PAYLOAD[:100], None)) is DropReason.TRUNCATED
-    assert inbox.accept(open_datagram(sealed(), None)) is DropReason.MALFORMED  # a sealed one is no bare one
+    mine = memory()
+    assert take(mine, PAYLOAD, None) is None
+    assert take(mine, PAYLOAD, None) is None  # nothing tells a replay from an original
+    assert take(mine, b"\x01" + PAYLOAD[1:], None) is DropReason.MALFORMED
+    assert take(mine, bytes(1025), None) is DropReason.OVERSIZED
+    assert take(mine, PAYLOAD[:100], None) is DropReason.TRUNCATED
+    assert take(mine, sealed(), None) is DropReason.MALFORMED  # a sealed one is no bare one
 
 
 def test_sealer_refuses_bad_keys() -> None:

@@ -21,7 +21,7 @@ from policies_examples import fleet_of
 
 import sortie
 from sortie.fleet.gate import Gate
-from sortie.fleet.messages.auth import Dropped, Inbox, Sealer, open_datagram
+from sortie.fleet.messages.auth import Dropped, Sealer, open_datagram
 from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES
 from sortie.fleet.messages.wire import decode_directive, encode_descriptor, encode_directive
 from sortie.fleet.staleness import cap_by_age, health
@@ -419,13 +419,6 @@ def test_what_is_not_the_fleets_is_dropped(spoil: Callable[[bytes], bytes], reas
     opened = open_datagram(spoil(Sealer(KEYS[1], 1).seal(encode_descriptor(MINE))), KEYS)
     assert isinstance(opened, Dropped)
     assert opened.reason.value == reason
-
-
-def test_a_replayed_descriptor_is_refused() -> None:
-    datagram = Sealer(KEYS[1], 1).seal(encode_descriptor(MINE))
-    inbox = Inbox()
-    assert isinstance(inbox.accept(open_datagram(datagram, KEYS)), Descriptor)
-    assert inbox.accept(open_datagram(datagram, KEYS)) == "replayed"
 
 
 def test_a_policy_may_use_the_types_of_the_public_api() -> None:

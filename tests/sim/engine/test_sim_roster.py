@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from sim_examples import example
 
 from sortie.fleet.messages.wire import encode_descriptor
@@ -41,8 +42,10 @@ def flown(measured: dict[tuple[float, int], tuple[float, ...]]) -> SortieRecord:
     """Flown without a hysteresis band, so that drones publish what they measure."""
     fill = Probes.fill
 
-    def kept(self: Probes, me: int, goodput_mbps: Sequence[float], now_s: float) -> tuple[float, ...]:
-        measured[now_s, me] = found = fill(self, me, goodput_mbps, now_s)
+    def kept(
+        self: Probes, me: int, goodput_mbps: Sequence[float], now_s: float, ids: NDArray[np.int64]
+    ) -> tuple[float, ...]:
+        measured[now_s, me] = found = fill(self, me, goodput_mbps, now_s, ids)
         return found
 
     with pytest.MonkeyPatch.context() as patch:

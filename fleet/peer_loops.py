@@ -1,0 +1,119 @@
+"""Compiled loops over what drones heard of each other (`sortie.fleet.peers`); each rounds as Python does."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sortie.scenarios.compiled import compiled, part
+
+# constants of the file itself: kept machine code does not see that another file has changed
+REFUSED, TAKEN, UNUSUAL, OWN = range(4)
+"""What a datagram is to one receiver: a replay; usual; from a new peer or one with another clock; its own."""
+WORD = 64
+_ROUNDING_PERIODS = 1e-6
+_ONE = np.uint64(1)
+
+
+@part
+def _arrived(words, window, since):
+    """Move a series of periods on by `since`, and set the latest one's bit, the lowest of the first word."""
+    by, bits, last = since // WORD, since % WORD, len(words) - 1
+    for k in range(last, -1, -1):
+        moved = np.uint64(0)
+        if k >= by:
+            moved = words[k - by] << np.uint64(bits)
+        if k > by and bits > 0:
+            moved |= words[k - by - 1] >> np.uint64(WORD - bits)
+        words[k] = moved
+    words[0] |= _ONE
+    rest = window - last * WORD
+    if rest < WORD:
+        words[last] &= (_ONE << np.uint64(rest)) - _ONE
+
+
+@part
+def _count(words, window):
+    """How many of the latest `window` bits are set."""
+    found = 0
+    for k in range(len(words)):
+        word, left = words[k], window - k * WORD
+        if left <= 0:
+            break
+        if left < WORD:
+            word &= (_ONE << np.uint64(left)) - _ONE
+        while word:
+            word &= word - _ONE
+            found += 1
+    return found
+
+
+@compiled
+def hear(
+    rows, first, skews_s, sender, stamp_s, now_s, is_counted, counter, delay_s, period_s, window, counters, heard_s,
+    stamps_s, watched, bits,
+):  # fmt: skip
+    """Take a datagram in at several receivers, drones `first` + `rows` [K]; returns what it is to each, [K]."""
+    found = np.empty(len(rows), np.uint8)
+    for k in range(len(rows)):
+        row = rows[k]
+        if is_counted:
+            if counter <= counters[row, sender]:
+                found[k] = REFUSED
+                continue
+            counters[row, sender] = counter
+        if row + first == sender:
+            found[k] = OWN
+            continue
+        lag_s = now_s + skews_s[k] - stamp_s
+        words = bits[row, sender]
+        if words[0] == 0:
+            found[k] = UNUSUAL
+            words[0] = _ONE
+        else:
+            found[k] = TAKEN if watched[row, sender] == 0 and 0.0 <= lag_s <= delay_s else UNUSUAL
+            _arrived(words, window, min(int((now_s - heard_s[row, sender]) / period_s + 0.5), window))
+        heard_s[row, sender] = now_s
+        stamps_s[row, sender] = stamp_s
+    return found
+
+
+@compiled
+def fill(me, now_s, period_s, window, ids, heard_s, bits, mbps, known):
+    """Let probes stand where nothing was measured: changes `known`, [N − 1] goodputs of drone `me` by ascending id."""
+    for peer in ids:
+        words, slot = bits[peer], peer - (peer > me)
+        if words[0] == 0 or slot >= len(known) or known[slot] > 0.0:
+            continue
+        missed = int((now_s - heard_s[peer]) / period_s - 0.5)
+        known[slot] = mbps[_count(words, window - max(0, min(missed, window)))]
+
+
+@compiled
+def ages(clock_s, now_s, ids, heard_s, stamps_s, ahead_s):
+    """Age of every descriptor, [K] s: by its stamp and the offset of the peer's clock, and at least the time since it came."""
+    found = np.empty(len(ids))
+    for k in range(len(ids)):
+        i = ids[k]
+        found[k] = max(clock_s - stamps_s[i] - ahead_s[i], now_s - heard_s[i])
+    return found
+
+
+@compiled
+def overdue(me, now_s, fresh_s, period_s, degraded, delay_s, ids, ages_s, heard_s, busy, at_rest, blamed):
+    """Places in `ids` of links whose directives must be looked at although nothing new was asked of them.
+
+    Those that are busy, those that are aged and not at rest, and those where a clock begins or ceases to be to blame.
+    """
+    found = np.empty(len(ids), np.int64)
+    count = 0
+    for k in range(len(ids)):
+        i = ids[k]
+        if i == me:
+            continue
+        age_s = ages_s[k]
+        is_stale = age_s / period_s - _ROUNDING_PERIODS > degraded
+        is_blamed = is_stale and age_s - (now_s - heard_s[i]) > delay_s
+        if busy[i] or (age_s > fresh_s and not at_rest[i]) or is_blamed != (blamed[i] > 0):
+            found[count] = k
+            count += 1
+    return found[:count]

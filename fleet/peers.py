@@ -1,0 +1,59 @@
+"""When drones heard each other, in arrays: a row for each receiver, a column for each sender.
+
+A broadcast reaches many drones at once, and each of them looks at all its peers in every frame. Both are one compiled loop
+over these arrays (`sortie.fleet.peer_loops`). Pages of the arrays that no drone has written to take no memory.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sortie.scenarios.disc import AGENT_IDS
+
+_MODULE: list[Any] = []
+
+
+def loops() -> Any:
+    """The compiled loops, imported at their first use: numba takes half a second."""
+    if not _MODULE:
+        from sortie.fleet import peer_loops
+
+        _MODULE.append(peer_loops)
+    return _MODULE[0]
+
+
+class PeerTable:
+    """What some receivers know about the arrival of every sender's descriptors.
+
+    Args:
+        receivers: how many; each has a row.
+        first: the drone of the first row; the others follow by id.
+        window: how many descriptors of a peer are looked back on.
+    """
+
+    def __init__(self, receivers: int, window: int, first: int = 0) -> None:
+        self.first, self.window = first, window
+        shape = (receivers, max(AGENT_IDS, first + receivers))
+        self.heard_s = np.zeros(shape)
+        """When the latest descriptor arrived."""
+        self.stamps_s = np.zeros(shape)
+        """Its stamp, by the sender's clock."""
+        self.ahead_s = np.zeros(shape)
+        """How far the receiver's clock is ahead of the sender's, as far as that shows."""
+        self.watched = np.zeros(shape, np.uint8)
+        """Whether the sender's clock showed an offset lately, so that each of its lags counts (`sortie.fleet.clock`)."""
+        self.bits = np.zeros((*shape, -(-window // loops().WORD)), np.uint64)
+        """The latest descriptors as bits, the latest in the lowest: 1 arrived, 0 missed."""
+        self.busy, self.at_rest, self.blamed = (np.zeros(shape, np.uint8) for _ in range(3))
+        """Of the link from the receiver to the sender: whether an upgrade waits or its age was too high; whether it carries
+        nothing and nothing is asked of it; whether a wrong clock is to blame for its age."""
+        self._counters: dict[int, NDArray[np.uint64]] = {}
+
+    def counters(self, key_id: int) -> NDArray[np.uint64]:
+        """The highest counter taken with a key, 0 for none."""
+        if key_id not in self._counters:
+            self._counters[key_id] = np.zeros(self.heard_s.shape, np.uint64)
+        return self._counters[key_id]

@@ -1,0 +1,101 @@
+"""The arrays of what drones heard of each other: as the words say, bit by bit, and untouched where nothing was heard."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from agent_rig import descriptor
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sortie.fleet.memory import PeerMemory, hear
+from sortie.fleet.messages.auth import Opened
+from sortie.fleet.peers import PeerTable, loops
+from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.staleness import LinkHealth, health
+from sortie.scenarios.link_state import probed_mbps
+
+PERIOD_S = 0.1
+
+
+def fleet(drones: int, periods: float = 10.0) -> list[PeerMemory]:
+    rules = PlaneRules(PERIOD_S, 1000, 3.0, periods, 0.3, 0.2, 0.04)
+    table = PeerTable(drones, max(1, round(periods)))
+    return [PeerMemory(i, rules, DroneStatus(), table) for i in range(drones)]
+
+
+@settings(max_examples=40)
+@given(
+    st.sampled_from([1, 2, 10, 63, 64, 65, 130]),
+    st.lists(st.integers(1, 90), min_size=1, max_size=40),
+    st.integers(0, 140),
+)
+def test_probes_are_a_row_of_bits_however_far_they_look_back(periods: int, gaps: list[int], later: int) -> None:
+    """Held against whole numbers of any size, as the words of `sortie.fleet.probes` have it."""
+    (mine,), bits, frame = fleet(1, periods), 0, 0
+    for gap in gaps:
+        frame += gap
+        hear([mine], Opened(descriptor(1, frame * PERIOD_S), None, 0), frame * PERIOD_S)
+        bits = (bits << min(gap, periods) | 1) & ((1 << periods) - 1)
+    now_s = (frame + later + 0.6) * PERIOD_S
+    arrived = (bits << min(later, periods) & ((1 << periods) - 1)).bit_count()
+    assert mine.probes.fill(0, (0.0,), now_s, mine.ids) == (probed_mbps(arrived / periods),)
+
+
+def test_one_datagram_is_one_object_at_all_that_hear_it() -> None:
+    memories = fleet(40)
+    opened = Opened(descriptor(7, 0.5), 1, 1)
+    assert hear(memories, opened, 0.55) == []
+    assert all(m.view(0.6).descriptors[7] is opened.descriptor for m in memories if m.drone != 7)
+    assert 7 not in memories[7].view(0.6).descriptors, "nobody hears itself"
+
+
+def test_replays_and_ages_are_each_receiver_s_own() -> None:
+    """Also where one heard the datagram later than another, by another clock."""
+    one, two, three = fleet(4)[:3]
+    two.status.clock_skew_s = 0.02
+    first, second = (Opened(descriptor(3, 0.1 * k), 1, k) for k in (1, 2))
+    assert hear([one, two], second, 0.25) == []
+    assert [drone for drone, _ in hear([one, two, three], first, 0.3)] == [0, 1]
+    assert hear([three], second, 0.35) == []
+    ages = [m.ages_s(0.5)[3] for m in (one, two, three)]
+    assert ages == [0.5 - 0.2, 0.5 + 0.02 - 0.2, 0.5 - 0.2]
+    assert [m.heard_ago_s(3, 0.5) for m in (one, two, three)] == pytest.approx([0.25, 0.25, 0.15])
+
+
+def test_who_hears_nothing_of_a_drone_has_nothing_to_do_with_it() -> None:
+    memories = fleet(6)
+    for k in range(1, 20):
+        hear(memories[:3], Opened(descriptor(0, 0.1 * k), 1, k), 0.1 * k + 0.01)
+        hear(memories[3:], Opened(descriptor(5, 0.1 * k), 1, k), 0.1 * k + 0.01)
+    table = memories[0].table
+    assert [m.ids.tolist() for m in memories] == [[], [0], [0], [5], [5], []]
+    heard = np.zeros(table.heard_s.shape, bool)
+    heard[1:3, 0] = heard[3:5, 5] = True
+    for array in (table.heard_s, table.stamps_s, table.bits[..., 0]):
+        assert (array != 0).tolist() == heard.tolist()
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_links_are_looked_at_where_age_or_a_clock_can_change_them(data: st.DataObject) -> None:
+    n, now_s, delay_s, me = 8, 20.0, 0.1, 3
+    flags = st.lists(st.booleans(), min_size=n, max_size=n)
+    busy, at_rest, blamed = (np.array(data.draw(flags), np.uint8) for _ in range(3))
+    stamp_ages = np.array(data.draw(st.lists(st.floats(0.0, 2.0) | st.just(0.3), min_size=n, max_size=n)))
+    heard_s = now_s - np.array(data.draw(st.lists(st.floats(0.0, 2.0), min_size=n, max_size=n)))
+    ids = np.arange(n)
+    ages = loops().ages(now_s, now_s, ids, heard_s, now_s - stamp_ages, np.zeros(n))
+    expected = []
+    for i in range(n):
+        age_s = max(now_s - (now_s - stamp_ages[i]), now_s - heard_s[i])
+        assert ages[i] == age_s
+        is_aged = age_s > PERIOD_S * 3.0
+        is_stale = health(age_s, PERIOD_S, 3.0, 10.0) != LinkHealth.FRESH
+        is_blamed = is_stale and age_s - (now_s - heard_s[i]) > delay_s
+        if i != me and (busy[i] or (is_aged and not at_rest[i]) or is_blamed != bool(blamed[i])):
+            expected.append(i)
+    found = loops().overdue(
+        me, now_s, PERIOD_S * 3.0, PERIOD_S, 3.0, delay_s, ids, ages, heard_s, busy, at_rest, blamed
+    )
+    assert found.tolist() == expected
