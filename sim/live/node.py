@@ -15,11 +15,12 @@ import math
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from enum import Flag, auto
 
 import numpy as np
 
+from sortie.fleet.agent import Ages
 from sortie.fleet.gate import HEADER_BYTES, Gate, Payload
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Dropped, DropReason, Opened
@@ -230,7 +231,7 @@ class LiveNode:
         why = f": {standing.reason}" if standing.trust < 1.0 else ""
         self._new.notices.append(Notice(t_s, drone, f"trust in drone {peer} is now {standing.trust:g}{why}"))
 
-    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Sequence[float]) -> None:
+    def decision(self, t_s: float, drone: int, elapsed_ns: int, peer_ages_s: Ages) -> None:
         self.gate.republish()
 
     def event(self, t_s: float, drone: int, kind: str, text: str) -> None:
