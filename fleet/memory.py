@@ -184,8 +184,9 @@ class PeerMemory:
         self._standings = after = judge(
             before, self.drone, heard, arrivals, self._rules.form, looking, lambda i: self._rules.equipment(i).cameras
         )
-        self._doubted = frozenset([i for i, s in after.items() if s.trust < 1.0])
-        return [(peer, after[peer]) for peer in heard if after[peer].trust != before.get(peer, UNJUDGED).trust]
+        self._doubted = frozenset([i for i, s in after.items() if s.strikes and s.trust < 1.0])
+        moved = [i for i in heard if after[i].strikes != before.get(i, UNJUDGED).strikes]
+        return [(peer, after[peer]) for peer in moved if after[peer].trust != before.get(peer, UNJUDGED).trust]
 
 
 def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float) -> list[tuple[int, DropReason]]:

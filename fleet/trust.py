@@ -107,6 +107,11 @@ class Standing(NamedTuple):
             return 1.0
         return 0.0 if self.strikes >= MOST_STRIKES else 0.5 ** (self.strikes - STRIKES_TO_DOUBT + 1)
 
+    def unheard_of(self) -> Standing:
+        """The standing a second later, in which nothing was heard of the drone."""
+        strikes, reason, seconds, first_soc, least_soc, fine, unheard = self
+        return Standing(strikes, reason, seconds + 1, first_soc, least_soc, fine, unheard + 1)
+
 
 UNJUDGED = Standing()
 
@@ -138,13 +143,12 @@ def judge(
     fell_per_s = {i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items()}
     by_fall = sorted(fell_per_s.values())
     # who was not heard drained on: its fall, once it is heard again, is over this second too
-    after = {
-        i: s if i in known else s._replace(seconds=s.seconds + 1, unheard=s.unheard + 1) for i, s in standings.items()
-    }
+    after = {i: s if i in known else s.unheard_of() for i, s in standings.items()}
     peers = [i for i in known if i != ego] if math.isfinite(form.blur_m) else []
     cells = dict(
         zip(peers, count_cells([known[i] for i in peers], form.blur_m, [cameras(i) for i in peers]), strict=True)
     )
+    goodput_step_mbps, soc_step = form.goodput_step_mbps, form.soc_step
     for peer, claim in known.items():
         standing = before[peer]
         doubt = ""
@@ -153,18 +157,19 @@ def judge(
             others_fell = _median_without(by_fall, fell_per_s[peer]) * standing.elapsed
             doubt = (
                 (_coverage_doubt(cells[peer], peer in looking) if cells else "")
-                or goodput_doubt(claim.goodput_to(ego), came, form.goodput_step_mbps)
+                or goodput_doubt(claim.goodput_to(ego), came, goodput_step_mbps)
                 or battery_doubt(
                     claim.battery_soc,
                     standing.least_soc,
                     standing.first_soc,
                     others_fell,
-                    max(3 * form.soc_step, 0.0 if standing.fine else PERCENT),
+                    max(3 * soc_step, 0.0 if standing.fine else PERCENT),
                 )
             )
         strikes = min(standing.strikes + 1, MOST_STRIKES) if doubt else max(standing.strikes - 1, 0)
         least_soc = min(standing.least_soc, claim.battery_soc)
-        after[peer] = standing._replace(strikes=strikes, reason=doubt or standing.reason, least_soc=least_soc)
+        _, reason, seconds, first_soc, _, fine, unheard = standing  # built anew, in a third of the time of `_replace`
+        after[peer] = Standing(strikes, doubt or reason, seconds, first_soc, least_soc, fine, unheard)
     return after
 
 

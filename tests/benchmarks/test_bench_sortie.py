@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
+from contextlib import nullcontext
 
+import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from sortie.scenarios.reading.load import load
-from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.engine.pilot import plan_for
+from sortie.sim.engine.sortie import build, fly, run_sortie
 
 JAMMED = "events=[{kind: jam, at_s: 0, position_m: [0, 0, 2000], power_dbm: 0}]"
 
@@ -37,6 +41,48 @@ def test_what_a_fleet_costs(benchmark: BenchmarkFixture, drones: int, extra: tup
     sets = ["perception.detector=none", f"fleet.drones={drones}", "duration_s=12", search, *extra]
     record = benchmark.pedantic(run_sortie, (load("track_target", sets),), rounds=3, warmup_rounds=1)
     assert record.tables["descriptors"].num_rows == 120 * drones
+
+
+NEAR, FAR = "{shape: grid, spacing_m: 20, altitude_m: 60}", "{shape: grid, spacing_m: 60, altitude_m: 60}"
+
+
+@pytest.mark.benchmark(group="sortie of 2 s, no detector, at several sizes of the fleet")
+@pytest.mark.parametrize(("formation", "tx_dbm"), [(NEAR, 20), (FAR, 5)], ids=["all in earshot", "some in earshot"])
+def test_cost_over_the_number_of_drones(
+    benchmark: BenchmarkFixture,
+    formation: str,
+    tx_dbm: float,
+    request: pytest.FixtureRequest,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """All sizes in one run, so that they can be compared; prints the processor time of a simulated second and its exponent."""
+    is_on = request.config.getoption("--benchmark-enable")  # a benchmark that is off is a smoke test
+    sizes, seconds = ([5, 10, 25, 50, 100, 200], 2.0) if is_on else ([2, 4], 0.3)
+    each = {
+        n: load(
+            "track_target",
+            ["perception.detector=none", "mission.phases=[{at_s: 0, phase: search}]", f"fleet.drones={n}",
+             f"fleet.formation={formation}", f"radio.tx_power_dbm={tx_dbm}", f"duration_s={seconds}"],
+        )
+        for n in sizes
+    }  # fmt: skip
+    costs, known = dict.fromkeys(sizes, 0.0), dict.fromkeys(sizes, 0.0)
+
+    def all_sizes() -> None:
+        for n, scenario in each.items():
+            parts = build(scenario, plan_for(scenario), 1)  # the town and the formation are no part of a tick
+            begin_s = time.process_time()
+            fly(parts)
+            costs[n] = (time.process_time() - begin_s) / seconds
+            known[n] = float(np.mean([len(agent.memory.ids) - 1 for agent in parts.agents]))
+
+    benchmark.pedantic(all_sizes, rounds=1, warmup_rounds=1)
+    exponent = np.polyfit(np.log(sizes), np.log([costs[n] for n in sizes]), 1)[0]
+    lines = [f"{n} drones, {known[n]:.0f} peers known: {costs[n]:.3f} s for a simulated second" for n in sizes]
+    with capsys.disabled() if is_on else nullcontext():
+        sys.stdout.write("\n".join(["", *lines, f"cost grows with drones to the power of {exponent:.2f}", ""]))
+    benchmark.extra_info |= {"exponent": round(float(exponent), 2), "peers_known": known, "cost_s": costs}
+    assert all(known[n] < n for n in sizes)
 
 
 @pytest.mark.benchmark(group="starting Python")
