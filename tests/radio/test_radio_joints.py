@@ -168,6 +168,28 @@ def test_a_field_of_shadows_has_the_time_of_the_flight_in_every_block(n: int) ->
             np.testing.assert_allclose(np.nan_to_num(channel.shadow_db), wanted, atol=1e-3)
 
 
+@pytest.mark.parametrize("n", [4, SQUARE + 3])
+@pytest.mark.parametrize("at_frame", [5, 32])
+def test_a_fleet_that_takes_another_way_has_the_links_of_one_that_flew_it_all_along(n: int, at_frame: int) -> None:
+    """Places and attitudes, for the links between drones and for a jammer; large fleets follow from their next block on."""
+    frames, config = 70, AirSettings(shadowing_sigma_db=0.0, antenna="dipole")
+    at, up = moving(frames, n), tilting(frames, n)
+    other, turned = at.copy(), up.copy()
+    other[at_frame:] += np.array([0.0, 0.5, 3.0]) * np.arange(n)[:, None]
+    turned[at_frame:] = tilting(frames, n + 1)[at_frame:, 1:]
+    jammers = [((20.0, 10.0, 5.0), 5.0)]
+    changed, planned = Channel(config, at, 1, 0, 0.1, up), Channel(config, other, 1, 0, 0.1, turned)
+    follows_from = at_frame if n <= SQUARE else -(-at_frame // 32) * 32
+    for frame in range(frames):
+        if frame == at_frame:
+            changed.reroute(other, turned)
+        changed.advance(None, jammers)
+        planned.advance(None, jammers)
+        np.testing.assert_allclose(changed.noise_rise_db(jammers), planned.noise_rise_db(jammers), atol=1e-9)
+        if frame < at_frame or frame >= follows_from:
+            np.testing.assert_allclose(changed.snr_db, planned.snr_db, atol=1e-6)
+
+
 def test_a_sender_knows_the_frame_before_whatever_has_changed_since() -> None:
     """Jammer, loss and motion show in what it knows one frame later, and then as they were."""
     at = still(CROSS_M[:3], 10).copy()
