@@ -264,6 +264,24 @@ def test_losses_and_jammers_act_on_a_traced_link_as_on_a_modelled_one(tmp_path: 
         assert over.snr_of(i, j, 0.0, 0.0)[0] == snr_db
 
 
+def test_losses_and_jammers_that_the_air_is_told_of_reach_traced_links(tmp_path: Path) -> None:
+    """The same through the air as for the links alone, beside modelled ones, and only while they last."""
+    links = trace(tmp_path, "0,0,1,30,,", "0,1,0,25,,")
+    flight = Hover(AirSettings(shadowing_sigma_db=0.0, trace=links), n=3)
+    jammers, extra = [((0.0, 30.0, 60.0), 10.0)], np.arange(9.0).reshape(3, 3)
+    flight.air.advance()
+    plain = flight.air.snr_db
+    assert (plain[0, 1], plain[1, 0]) == (30.0, 25.0)
+    for loss, by in ((extra, ()), (None, jammers), (extra, jammers), (None, ())):
+        flight.air.advance(loss, by)
+        rise = flight.air.channel.noise_rise_db(by)
+        assert (rise > 1.0).all() == bool(by)
+        lost = plain - flight.air.snr_db
+        wanted = rise[None] + (0.0 if loss is None else loss)
+        off = ~np.eye(3, dtype=bool)
+        np.testing.assert_allclose(lost[off], np.broadcast_to(wanted, (3, 3))[off], atol=1e-9)
+
+
 def test_a_traced_loss_takes_from_the_rate_of_its_own_direction(tmp_path: Path) -> None:
     """Whatever is lost is sent again, so that a link carries 1 − loss of what it does without; others are as modelled."""
     flight = Hover(
@@ -493,6 +511,23 @@ def test_receivers_lose_a_descriptor_each_by_a_draw_of_its_own() -> None:
         assert heard.mean() == pytest.approx(0.5, abs=0.06)
         off = np.corrcoef(heard.T)[~np.eye(4, dtype=bool)]
         assert np.abs(off).max() < 0.25
+
+
+def test_a_burst_takes_its_share_of_the_descriptors_that_the_signal_lets_through() -> None:
+    """Two causes, a draw each: of descriptors that half come by their signal, a burst of a half leaves a quarter, not none."""
+
+    def heard(loss: float) -> float:
+        config = AirSettings(
+            shadowing_sigma_db=0.0, tx_power_dbm=-11.5, rician_k_db=30.0, group_rate_mbps=24.0,
+            preamble_detection_dbm=-120.0, bursts=BurstSettings(loss_good=loss),
+        )  # fmt: skip
+        flight = Hover(config, n=5)
+        flight.fly(12.0, lambda k: flight.publish(0))
+        return sum(len(ids) for _, _, ids in flight.heard) / (4 * len(flight.heard))
+
+    alone = heard(0.0)
+    assert 0.35 < alone < 0.65
+    assert heard(0.5) == pytest.approx(0.5 * alone, abs=0.06)
 
 
 def columns(n: int, seed: int = 1, replication: int = 0) -> Iterator[tuple[str, Array]]:
