@@ -282,6 +282,19 @@ def test_losses_and_jammers_that_the_air_is_told_of_reach_traced_links(tmp_path:
         np.testing.assert_allclose(lost[off], np.broadcast_to(wanted, (3, 3))[off], atol=1e-9)
 
 
+@pytest.mark.parametrize("loss", [0.3, 0.9])
+def test_a_traced_loss_takes_tries_as_a_burst_of_that_loss_does(loss: float, tmp_path: Path) -> None:
+    """Of fragments and of requests for a block ack: on a good link the two are the same, draw by draw."""
+    rows = [f"0,{i},{j},,{loss}," for i, j in ((0, 1), (1, 0))]
+    flown = []
+    for given in (dict(trace=trace(tmp_path, *rows)), dict(bursts=BurstSettings(loss_good=loss))):
+        flight = Hover(AirSettings(shadowing_sigma_db=0.0, rician_k_db=30.0, **given))  # type: ignore[arg-type]
+        flight.fly(6.0, lambda k, flight=flight: flight.send(0, 1, 2_600))  # type: ignore[misc]
+        flown.append([(r.number, r.status, r.t_start_s, r.t_done_s, r.airtime_s, r.fragments_lost) for r in flight.rows])
+    assert len(flown[0]) == 60
+    assert flown[0] == flown[1]
+
+
 def test_a_traced_loss_takes_from_the_rate_of_its_own_direction(tmp_path: Path) -> None:
     """Whatever is lost is sent again, so that a link carries 1 − loss of what it does without; others are as modelled."""
     flight = Hover(
