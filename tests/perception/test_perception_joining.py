@@ -86,6 +86,8 @@ def test_who_could_not_see_a_place_or_left_weak_boxes_out_does_not_vote_it_down(
     aside = SourceBoxes(boxes(), 1.0, HERE, roi=(0.0, 0.0, 50.0))
     assert joined(HERE, own, False, [aside], "average").score[0] == pytest.approx(0.6)
     assert joined(HERE, own, False, [replace(aside, roi=(60.0, 0.0, 50.0))], "average").score[0] == pytest.approx(0.3)
+    asked_too_far = replace(behind, roi=(100.0, 0.0, 50.0))  # of a region that its square does not hold
+    assert joined(HERE, own, False, [asked_too_far], "average").score[0] == pytest.approx(0.6)
     many = boxes(*[(-90 + 8 * k, 40, 0.9 - 0.01 * k) for k in range(13)])
     share = Share(cross(10.0, 20.0, 0.3)[0], "tracks", 1.0, None, 1.0)
     cut, whole = source_of(share, many), source_of(share, many.take(np.arange(12)))

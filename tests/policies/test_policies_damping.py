@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sortie.policies.contract import Descriptor, Directive, Disc, LinkState, Representation, TaskPhase
-from sortie.policies.damping import DampedLink, apply_hysteresis, damp
+from sortie.policies.damping import DampedLink, apply_hysteresis, damp, is_climb, is_switch
 from sortie.scenarios.link_state import SILENT_MBPS, state_of
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
@@ -253,6 +253,22 @@ def test_a_disc_that_hardly_moved_is_the_same_directive() -> None:
 
 
 # --- the band on what is read ---------------------------------------------------------------------
+
+IN_A_DISC = FULL._replace(roi=Disc(10.0, 20.0, 30.0), fusion_weight=0.5, duty_percent=50, rho=0.5)
+OTHERS = {
+    "representation": Representation.DETECTIONS, "rho": 0.25, "roi": Disc(60.0, 20.0, 30.0), "rate_hz": 5.0,
+    "deadline_s": 0.4, "fusion_weight": 0.25, "duty_percent": 25,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fields", [*itertools.combinations(OTHERS, 1), *itertools.combinations(OTHERS, 2)])
+def test_a_change_that_is_no_climb_reaches_the_gate_at_once_whatever_it_is_of(fields: tuple[str, ...]) -> None:
+    """Every field alone and every two together; a deadline that grows asks for no more of the link."""
+    asked = IN_A_DISC._replace(**{name: OTHERS[name] for name in fields})
+    assert is_switch(IN_A_DISC, asked)
+    assert not is_climb(IN_A_DISC, asked)
+    assert damp(DampedLink(IN_A_DISC), asked, 0.0, DWELL_S).enforced == asked
+
 
 BAND = 0.25
 HEARD = Descriptor(

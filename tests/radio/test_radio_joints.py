@@ -168,6 +168,28 @@ def test_a_field_of_shadows_has_the_time_of_the_flight_in_every_block(n: int) ->
             np.testing.assert_allclose(np.nan_to_num(channel.shadow_db), wanted, atol=1e-3)
 
 
+@pytest.mark.parametrize("n", [4, SQUARE + 3])
+@pytest.mark.parametrize("at_frame", [5, 32])
+def test_a_fleet_that_takes_another_way_has_the_links_of_one_that_flew_it_all_along(n: int, at_frame: int) -> None:
+    """Places and attitudes, for the links between drones and for a jammer; large fleets follow from their next block on."""
+    frames, config = 70, AirSettings(shadowing_sigma_db=0.0, antenna="dipole")
+    at, up = moving(frames, n), tilting(frames, n)
+    other, turned = at.copy(), up.copy()
+    other[at_frame:] += np.array([0.0, 0.5, 3.0]) * np.arange(n)[:, None]
+    turned[at_frame:] = tilting(frames, n + 1)[at_frame:, 1:]
+    jammers = [((20.0, 10.0, 5.0), 5.0)]
+    changed, planned = Channel(config, at, 1, 0, 0.1, up), Channel(config, other, 1, 0, 0.1, turned)
+    follows_from = at_frame if n <= SQUARE else -(-at_frame // 32) * 32
+    for frame in range(frames):
+        if frame == at_frame:
+            changed.reroute(other, turned)
+        changed.advance(None, jammers)
+        planned.advance(None, jammers)
+        np.testing.assert_allclose(changed.noise_rise_db(jammers), planned.noise_rise_db(jammers), atol=1e-9)
+        if frame < at_frame or frame >= follows_from:
+            np.testing.assert_allclose(changed.snr_db, planned.snr_db, atol=1e-6)
+
+
 def test_a_sender_knows_the_frame_before_whatever_has_changed_since() -> None:
     """Jammer, loss and motion show in what it knows one frame later, and then as they were."""
     at = still(CROSS_M[:3], 10).copy()
@@ -240,6 +262,37 @@ def test_losses_and_jammers_act_on_a_traced_link_as_on_a_modelled_one(tmp_path: 
     for (i, j), snr_db in wanted.items():
         assert over.known_snr_db(model)[i, j] == snr_db
         assert over.snr_of(i, j, 0.0, 0.0)[0] == snr_db
+
+
+def test_losses_and_jammers_that_the_air_is_told_of_reach_traced_links(tmp_path: Path) -> None:
+    """The same through the air as for the links alone, beside modelled ones, and only while they last."""
+    links = trace(tmp_path, "0,0,1,30,,", "0,1,0,25,,")
+    flight = Hover(AirSettings(shadowing_sigma_db=0.0, trace=links), n=3)
+    jammers, extra = [((0.0, 30.0, 60.0), 10.0)], np.arange(9.0).reshape(3, 3)
+    flight.air.advance()
+    plain = flight.air.snr_db
+    assert (plain[0, 1], plain[1, 0]) == (30.0, 25.0)
+    for loss, by in ((extra, ()), (None, jammers), (extra, jammers), (None, ())):
+        flight.air.advance(loss, by)
+        rise = flight.air.channel.noise_rise_db(by)
+        assert (rise > 1.0).all() == bool(by)
+        lost = plain - flight.air.snr_db
+        wanted = rise[None] + (0.0 if loss is None else loss)
+        off = ~np.eye(3, dtype=bool)
+        np.testing.assert_allclose(lost[off], np.broadcast_to(wanted, (3, 3))[off], atol=1e-9)
+
+
+@pytest.mark.parametrize("loss", [0.3, 0.9])
+def test_a_traced_loss_takes_tries_as_a_burst_of_that_loss_does(loss: float, tmp_path: Path) -> None:
+    """Of fragments and of requests for a block ack: on a good link the two are the same, draw by draw."""
+    rows = [f"0,{i},{j},,{loss}," for i, j in ((0, 1), (1, 0))]
+    flown = []
+    for given in (dict(trace=trace(tmp_path, *rows)), dict(bursts=BurstSettings(loss_good=loss))):
+        flight = Hover(AirSettings(shadowing_sigma_db=0.0, rician_k_db=30.0, **given))  # type: ignore[arg-type]
+        flight.fly(6.0, lambda k, flight=flight: flight.send(0, 1, 2_600))  # type: ignore[misc]
+        flown.append([(r.number, r.status, r.t_start_s, r.t_done_s, r.airtime_s, r.fragments_lost) for r in flight.rows])
+    assert len(flown[0]) == 60
+    assert flown[0] == flown[1]
 
 
 def test_a_traced_loss_takes_from_the_rate_of_its_own_direction(tmp_path: Path) -> None:
@@ -471,6 +524,23 @@ def test_receivers_lose_a_descriptor_each_by_a_draw_of_its_own() -> None:
         assert heard.mean() == pytest.approx(0.5, abs=0.06)
         off = np.corrcoef(heard.T)[~np.eye(4, dtype=bool)]
         assert np.abs(off).max() < 0.25
+
+
+def test_a_burst_takes_its_share_of_the_descriptors_that_the_signal_lets_through() -> None:
+    """Two causes, a draw each: of descriptors that half come by their signal, a burst of a half leaves a quarter, not none."""
+
+    def heard(loss: float) -> float:
+        config = AirSettings(
+            shadowing_sigma_db=0.0, tx_power_dbm=-11.5, rician_k_db=30.0, group_rate_mbps=24.0,
+            preamble_detection_dbm=-120.0, bursts=BurstSettings(loss_good=loss),
+        )  # fmt: skip
+        flight = Hover(config, n=5)
+        flight.fly(12.0, lambda k: flight.publish(0))
+        return sum(len(ids) for _, _, ids in flight.heard) / (4 * len(flight.heard))
+
+    alone = heard(0.0)
+    assert 0.35 < alone < 0.65
+    assert heard(0.5) == pytest.approx(0.5 * alone, abs=0.06)
 
 
 def columns(n: int, seed: int = 1, replication: int = 0) -> Iterator[tuple[str, Array]]:

@@ -26,6 +26,24 @@ def test_an_interval_without_a_range_is_students() -> None:
     assert math.isnan(mean_interval([]).mean)
 
 
+@pytest.mark.parametrize("level", [0.5, 0.8, 0.95, 0.999])
+def test_every_kind_of_interval_has_the_level_that_is_asked_for(level: float) -> None:
+    """Student's by scipy, carried over to the logarithm and to the logit; the binomial's exact one by scipy."""
+    values = [0.2, 0.5, 0.3, 0.4, 0.7]
+    mean, error = np.mean(values), stats.sem(values)
+    low, high = stats.t.interval(level, 4, loc=mean, scale=error)
+    plain = mean_interval(values, ANY, level)
+    assert (plain.low, plain.high) == pytest.approx((low, high))
+    amount = mean_interval(values, AMOUNT, level)
+    off = (high - mean) / mean
+    assert (math.log(amount.low / mean), math.log(amount.high / mean)) == pytest.approx((-off, off))
+    share, off = mean_interval(values, SHARE, level), (high - mean) / (mean * (1 - mean))
+    odds = [math.log(v / (1 - v)) for v in (share.low, mean, share.high)]
+    assert np.diff(odds) == pytest.approx([off, off])
+    flag, exact = mean_interval([1, 0, 0, 0, 1], FLAG, level), stats.binomtest(2, 5).proportion_ci(level, "exact")
+    assert (flag.low, flag.high) == pytest.approx((exact.low, exact.high))
+
+
 def test_far_from_its_ends_a_range_changes_nothing() -> None:
     values = np.random.default_rng(1).normal(0.01, 0.005, 8)
     plain = mean_interval(values)

@@ -7,6 +7,7 @@ import pytest
 from perception_examples import capture, cross
 from surrogate_examples import detector_runs
 
+from sortie.perception.benchmark.scenes import model_of
 from sortie.perception.surrogate.correlation import fit_shared_false_positives
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import CaptureColumns
@@ -14,7 +15,7 @@ from sortie.perception.surrogate.model import SHIPPED, load
 from sortie.perception.surrogate.plan import scene_model
 from sortie.perception.surrogate.shared_false_positives import SharedFalsePositives, estimate_shared
 from sortie.perception.types import Capture
-from sortie.scenarios.schema import Perception
+from sortie.scenarios.schema import Perception, Scene
 
 
 def fleet(*at: tuple[float, float]) -> CaptureColumns:
@@ -81,3 +82,21 @@ def test_alarms_come_as_often_whether_they_are_shared_or_not() -> None:
             count += sum(len(b) for b in detector.detect_many([jobs]))
         seen[part] = count / len(towns)
     assert seen[0.9] == pytest.approx(seen[0.0], rel=0.08)
+
+
+def test_a_shared_false_positive_lies_alike_in_the_world_for_drones_of_every_heading() -> None:
+    """All drones have each of them, and put them where they are: place and heading agree over an empty town."""
+    everywhere = replace(load(SHIPPED), shared_false_positives=np.array([1.0, 1.0, 0.0, 0.0], np.float32))
+    shared = 0
+    for town in range(4):
+        scene = model_of(Scene(seed=town, parked_density=0.0, moving_cars_per_km=0.0))
+        detector = SurrogateDetector.of(scene, Perception(score_threshold=0.02), everywhere, 0)
+        views = [capture(4.0 * k, -3.0 * k, yaw=yaw, drone=k) for k, yaw in enumerate((0.3, 1.2, -2.5))]
+        first, *others = list(detector.detect_many([[(v, ()) for v in views]]))
+        for other in others:
+            away = np.hypot(*(first.xy_m[:, None] - other.xy_m[None]).transpose(2, 0, 1))
+            i, j = np.nonzero(away < 0.01)
+            shared += len(i)
+            turned = (first.yaw_rad[i] - other.yaw_rad[j]) / np.pi
+            np.testing.assert_allclose(turned, 2.0 * np.round(turned / 2.0), atol=1e-3)
+    assert shared > 20

@@ -128,16 +128,18 @@ def rows() -> dict[str, list[dict[str, Any]]]:
     }  # fmt: skip
 
 
-def record(**changes: Any) -> SortieRecord:
-    """The rows as a record; cells that no row names are zeros."""
-    given = rows()
+def tables_of(given: dict[str, list[dict[str, Any]]]) -> dict[str, pa.Table]:
+    """All tables of these rows; cells that no row names are zeros."""
     zero = {pa.string(): "", pa.bool_(): False, pa.binary(): b""}
-    tables = {}
-    for name, columns in TABLES.items():
-        values = given.get(name, [])
-        tables[name] = pa.table(
-            {c: pa.array([r.get(c, zero.get(t, 0)) for r in values], t) for c, t in columns.items()}
-        )
+    return {
+        name: pa.table({c: pa.array([r.get(c, zero.get(t, 0)) for r in given.get(name, [])], t) for c, t in columns.items()})
+        for name, columns in TABLES.items()
+    }  # fmt: skip
+
+
+def record(**changes: Any) -> SortieRecord:
+    """The rows as a record."""
+    tables = tables_of(rows())
     totals = {
         "context_descriptor_bytes": 700, "context_directive_bytes": 108, "medium_busy_fraction": 0.125,
         "policy_changes": 0, "shield_interventions": 0, "invariant_violations": 0, "violated_ticks": 0,
@@ -233,6 +235,55 @@ def test_the_mission_is_observed_while_somebody_flies_over_it_and_looks(result: 
     assert mission["region_observed_share"] == pytest.approx(1 / 2)
     assert mission["target_in_view_share"] is None
     assert mission["target_detected_share"] is None
+
+
+@pytest.mark.parametrize(
+    ("places_m", "found"), [((5.0, 15.0, 25.0, 35.0), 4), ((0.0, 10.0, 20.0, 30.0), 0), ((5.0, 16.0, 55.0), 2)]
+)
+def test_a_target_is_detected_where_it_is_at_the_fusion(places_m: tuple[float, ...], found: int) -> None:
+    """It drives 10 m/s, and fusions come half a second after their frames: its place in the frame is 5 m behind."""
+    target = (
+        "mission:\n  target: {waypoints_m: [[0, 0], [100, 0]], speed_mps: 10}\n  phases: [{at_s: 0, phase: track}]\n"
+    )
+    scenario = (
+        SCENARIO.split("mission:")[0]
+        + target
+        + "perception: {detector: surrogate, sample_rate_hz: 1, fusion_delay_s: 0.5}\n"
+    )
+    given = rows()
+    given["mission"] = [
+        {**r, "phase": "track", "target": 0, "target_x_m": 10.0 * r["t_s"], "target_y_m": 0.0} for r in given["mission"]
+    ]
+    given["detections"] = [
+        {"t_s": k + 0.5, "drone": k % 2, "x_m": x_m, "y_m": 0.0, **CAR, "yaw_rad": 0.0, "score": 0.5}
+        for k, x_m in enumerate(places_m)
+    ]
+    mission = outcome(record(scenario=loads(scenario), tables=tables_of(given)))["mission"]
+    assert mission["target_detected_share"] == pytest.approx(found / 4)
+    assert mission["target_longest_undetected_s"] == pytest.approx(4 - found)
+
+
+@pytest.mark.parametrize("x_m", [2.0, 60.0])
+def test_a_person_in_the_region_is_known_from_the_decision_of_a_frame_on(x_m: float) -> None:
+    """The region is there in the last two frames, and drone 1 flies in the first of them: three drone seconds.
+
+    Drone 0 knows of somebody from 2.3 s to 3.2 s: from its decision in the first of these frames until that in the second. A
+    drone that is gone counts nowhere, though it knew of somebody when it left. With the person 60 m off, what was known was
+    wrong.
+    """
+    given = rows()
+    given["people"] = [{"t_s": float(k), "person": 0, "x_m": x_m, "y_m": 0.0} for k in range(4)]
+    given["alerts"] = [
+        {"t_s": t_s, "drone": drone, "known": known}
+        for t_s, drone, known in ((2.3, 0, True), (2.9, 1, True), (3.2, 0, False))
+    ]
+    scenario = SCENARIO.replace("sample_rate_hz: 1}", f"sample_rate_hz: 1, people: [{{waypoints_m: [[{x_m}, 0]]}}]}}")
+    people = outcome(record(scenario=loads(scenario), tables=tables_of(given)))["people"]
+    is_there = x_m < 10
+    assert people["in_region_drone_s"] == (3.0 if is_there else 0.0)
+    assert people["unknown_share"] == (pytest.approx(1 / 3) if is_there else None)
+    assert people["unknown_longest_s"] == (1.0 if is_there else None)
+    assert people["false_alert_share"] == (None if is_there else pytest.approx(2 / 3))
 
 
 def test_counts_and_ratios(result: dict[str, Any]) -> None:
