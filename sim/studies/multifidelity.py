@@ -11,14 +11,18 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sortie.perception.detectors import Detector, KeepsCaptures, make_detector
 from sortie.perception.metrics.ap import average_precision
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.control_variates import Controlled, controlled_mean, plan_units, widened
-from sortie.sim.engine.sortie import run_sortie
+from sortie.scenarios.intervals import mean_interval
+from sortie.scenarios.schema import Perception
+from sortie.sim.engine.sortie import DetectorMaker, run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.results.accuracy import Both, both_matched
 from sortie.sim.results.outcome import outcome
@@ -40,6 +44,9 @@ WORTH = 0.9
 """The surrogate is used where it is predicted to save a tenth or more."""
 FURTHER = 1_000_000
 """Further seeds begin so far above the first paired one."""
+
+SHARED_CAPTURES = 400
+"""Captures that stay encoded for the other policies of a seed."""
 
 Gains = Mapping[str, Mapping[str, float | None]]
 """By policy and metric, over the first policy; None where it is not defined."""
@@ -109,15 +116,24 @@ class Flown:
         return len(self.plans) > 1 and self.plans[-1].control
 
     def estimate(self, policy: str, metric: str, *, control: bool) -> Controlled:
-        """A policy's gain from all rows; seeds without a car to be found count nowhere."""
+        """A policy's gain; seeds without a car to be found count nowhere.
+
+        Args:
+            control: with the surrogate's rows as control variates, over paired seeds. False takes all of torch's rows alone;
+                the correlation is still that of the paired seeds.
+        """
         torch, cheap = (
             {row.seed: _number(row.gains[policy][metric]) for row in rows} for rows in (self.torch, self.surrogate)
         )
-        paired = [seed for seed in torch if seed in cheap or not control]
+        paired = [seed for seed in torch if seed in cheap]
         further = [value for seed, value in cheap.items() if seed not in torch]
-        return controlled_mean(
-            [torch[s] for s in paired], [cheap.get(s, 0.0) for s in paired], further, control=control
-        )
+        found = controlled_mean([torch[s] for s in paired], [cheap[s] for s in paired], further, control=control)
+        if control:
+            return found
+        alone = mean_interval(list(torch.values()))
+        spread = [value for value in torch.values() if not math.isnan(value)]
+        variance = float(np.var(spread, ddof=1)) if len(spread) > 1 else math.nan
+        return replace(found, estimate=alone, variance=variance)
 
     def seconds(self) -> tuple[float, float]:
         """Median processor seconds of a seed by torch and by the surrogate."""
@@ -149,7 +165,7 @@ def next_batch(flown: Flown, policies: Sequence[str], settings: Settings) -> Bat
         return None
     if n >= settings.most and not (pilot and last.control):
         return None
-    looked = [flown.estimate(p, settings.metric, control=True) for p in policies]
+    looked = [flown.estimate(p, settings.metric, control=last.control) for p in policies]
     if any(math.isnan(found.variance) for found in looked):
         raise RunError(f"{settings.metric}: fewer than two of {n} seeds have a gain, so no interval can be planned")
     plan = plan_units(looked, settings.half_width, *flown.seconds(), measured=n, control=last.control)
@@ -215,10 +231,33 @@ def with_detector(contender: Contender, detector: str) -> Contender:
     return contender._replace(scenario=contender.scenario.model_copy(update={"perception": changed}))
 
 
+def shared_detector() -> DetectorMaker:
+    """Makes detectors so that sorties of one seed, flown one after the other, share the torch detector.
+
+    Policies do not change where drones fly, so the sorties of a seed mostly encode the same captures. The numbers do not
+    depend on it.
+    """
+    last: list[tuple[object, Detector | None]] = []
+
+    def make(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector | None:
+        if config.detector != "torch":
+            return make_detector(scene, config, seed, replication)
+        key = scene.made_of, config, seed, replication
+        if not last or last[0][0] != key:
+            detector = make_detector(scene, config, seed, replication)
+            last[:] = [(key, detector)]
+            if isinstance(detector, KeepsCaptures):
+                detector.kept_captures = SHARED_CAPTURES
+        return last[0][1]
+
+    return make
+
+
 def fly_torch(contenders: Sequence[Contender], seed: int) -> Row:
     """One seed under every policy by the detector of the contenders' scenarios."""
     begin_s = time.process_time()
-    records = [run_sortie(in_town_of(c.scenario, seed), c.function, seed) for c in contenders]
+    make = shared_detector()
+    records = [run_sortie(in_town_of(c.scenario, seed), c.function, seed, detector_of=make) for c in contenders]
     labels = [c.label for c in contenders]
     gains = gains_between(labels, [both_matched(r) for r in records])
     outcomes = dict(zip(labels, map(outcome, records), strict=True))
