@@ -19,7 +19,8 @@ The plan, written before anything of it was flown:
 - **Costs** are processor seconds a seed (three policies), medians.
 - **Price**: the cost at which both gains have a 95 % interval of ±1 AP point, with the cheapest ratio of cheap to expensive
   sorties, relative to the cost of torch alone (`control_variates.plan_units`, `Plan.cost_ratio`; 1 where torch alone is as
-  cheap). Its interval is a percentile bootstrap over seeds with 2,000 draws.
+  cheap). Its interval is a jackknife over seeds (Student's over the pseudo-values): a bootstrap draws seeds twice, and so cannot
+  leave them out.
 - **Hypothesis 1**: the surrogate's gain is correlated with the torch detector's in the full scene, with both 95 % intervals
   above 0. In the mission disc, with a few cars, both correlations are lower than in the full scene.
 - **Hypothesis 2**: the price is above 0.3 in both areas, far above the tenth that is wished for. The ratio of the costs alone,
@@ -33,11 +34,19 @@ and by torch with 900 and 901, to learn what a sortie costs and how far gains va
 from __future__ import annotations
 
 import csv
+import itertools
+import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+from scipy import stats
+from stored import Cell, Column, Table
+
 import sortie
+from sortie.scenarios.control_variates import Controlled, Plan, controlled_mean, plan_units
+from sortie.scenarios.intervals import mean_interval
 from sortie.sim.studies.compare import AREAS, Contender
 from sortie.sim.studies.multifidelity import METRICS, Row, fly_surrogate, fly_torch
 
@@ -47,6 +56,8 @@ SHORT = {
     "mission.phases": [{"at_s": 0, "phase": "search"}, {"at_s": 3, "phase": "track", "region": {"radius_m": 32}}],
     "perception.sample_rate_hz": 1,
 }
+POINT = 0.01
+"""One AP point."""
 POLICIES = ("worked", "adaptive", "all-4")
 CONTRASTS = tuple(f"{policy} {area}" for policy in POLICIES[1:] for area in AREAS)
 TORCH_SEEDS = range(5_000_001, 5_000_033)
@@ -78,6 +89,98 @@ def rows() -> list[dict[str, str]]:
     """The table."""
     with TABLE.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+Seeds = dict[int, tuple[list[float], float]]
+"""By seed: the gains, contrast by contrast, and the processor seconds."""
+
+
+def measured(by: str, seeds: range) -> Seeds:
+    """Rows of a detector."""
+    return {
+        int(row["seed"]): ([float(row[c] or "nan") for c in CONTRASTS], float(row["processor_s"]))
+        for row in rows()
+        if row["by"] == by and int(row["seed"]) in seeds
+    }
+
+
+def without_gap(flown: Seeds) -> Seeds:
+    """The torch seeds from the first one on, up to the first that is missing."""
+    kept = itertools.takewhile(flown.__contains__, TORCH_SEEDS)
+    return {seed: flown[seed] for seed in kept}
+
+
+def estimates(torch: Seeds, cheap: Seeds, further: Seeds, area: str, *, control: bool = True) -> list[Controlled]:
+    """Both gains in an area."""
+    return [
+        controlled_mean(
+            [gains[k] for gains, _ in torch.values()],
+            [cheap[seed][0][k] for seed in torch],
+            [gains[k] for gains, _ in further.values()],
+            control=control,
+        )
+        for k, contrast in enumerate(CONTRASTS)
+        if contrast.endswith(area)
+    ]
+
+
+def seconds(flown: Seeds) -> float:
+    """The median of a seed."""
+    return float(np.median([s for _, s in flown.values()]))
+
+
+def price(torch: Seeds, cheap: Seeds, further: Seeds, area: str) -> Plan:
+    """What is planned for ±1 AP point."""
+    return plan_units(estimates(torch, cheap, further, area), POINT, seconds(torch), seconds(further))
+
+
+def jackknifed(whole: float, left_out: Sequence[float]) -> tuple[float, float, float]:
+    """A figure with Student's interval over the pseudo-values of leaving each seed out."""
+    n = len(left_out)
+    found = mean_interval([n * whole - (n - 1) * value for value in left_out])
+    return whole, whole - found.half_width, whole + found.half_width
+
+
+def tables() -> dict[str, Table]:
+    """`price`: what ±1 AP point costs, by area; `price_gains`: the gains that were measured on the way, both ways."""
+    torch, paired = without_gap(measured("torch", TORCH_SEEDS)), measured("surrogate", TORCH_SEEDS)
+    further = measured("surrogate", MORE_SEEDS)
+    costs, gains = list[list[Cell]](), list[list[Cell]]()
+    for area, told in (("full_scene", "full scene"), ("mission", "mission disc")):
+        plan = price(torch, paired, further, area)
+        ratios = [
+            price({s: row for s, row in torch.items() if s != left}, paired, further, area).cost_ratio for left in torch
+        ]
+        alone = plan_units(estimates(torch, paired, further, area), POINT, 1.0, 1.0, control=False)
+        ratio = jackknifed(plan.cost_ratio, ratios)
+        costs.append([told, alone.expensive, plan.expensive, plan.cheap, ratio, seconds(torch), seconds(further)])
+        both = (estimates(torch, paired, further, area, control=control) for control in (False, True))
+        for policy, plain, used in zip(POLICIES[1:], *both, strict=True):
+            k = CONTRASTS.index(f"{policy} {area}")
+            x, y = ([of[seed][0][k] for seed in torch] for of in (paired, torch))
+            found = stats.pearsonr(x, y)
+            low, high = found.confidence_interval()
+            intervals = [(e.mean, e.low, e.high) for e in (plain.estimate, used.estimate)]
+            gains.append(
+                [f"{policy}, {told}", (float(found.statistic), float(low), float(high)), used.explained,
+                 math.sqrt(plain.variance), *intervals]
+            )  # fmt: skip
+    points = {"form": "+.1f", "factor": 100}
+    about = f"{len(torch)} seeds by both detectors, {len(further)} further seeds by the surrogate; 95 % intervals."
+    return {
+        "price": Table(
+            [Column("accuracy"), Column("torch alone: seeds"), Column("with the surrogate: paired seeds"),
+             Column("further seeds"), Column("cost ratio", ".2f"), Column("a seed by torch", ".1f", " s"),
+             Column("by the surrogate", ".2f", " s")],
+            costs, "Planned for ±1 AP point in both gains. Processor time; a seed is three sorties.",
+        ),
+        "price_gains": Table(
+            [Column("gain over `worked`"), Column("correlation", ".2f"), Column("predicted variance", ".0f", " %", 100),
+             Column("deviation between seeds", ".1f", factor=100), Column("by torch alone", **points),  # type: ignore[arg-type]
+             Column("with the surrogate", **points)],  # type: ignore[arg-type]
+            gains, about,
+        ),
+    }  # fmt: skip
 
 
 if __name__ == "__main__":

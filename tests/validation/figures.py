@@ -311,6 +311,13 @@ def _half_width() -> Tables:
     return half_width_coverage.tables()
 
 
+def _price() -> Tables:
+    """From the flown seeds of compare_price.csv; `compare_price.py` flies what it lacks."""
+    import compare_price
+
+    return compare_price.tables()
+
+
 def _arms() -> Tables:
     """As `sortie learn --by-torch`."""
     from sortie.policies.catalogue.adaptive import ARMS
@@ -608,6 +615,7 @@ FIGURES: dict[str, Figure] = {
     "disagreement": Figure(2, _disagreement),
     "compare": Figure(2, _compare),
     "coverage": Figure(0.5, _coverage),
+    "price": Figure(0.2, _price, timed=True),
     "half_width": Figure(4, _half_width),
     "worked_over_silence": Figure(1, _worked_over_silence),
     "viewpoints": Figure(2, _viewpoints),
