@@ -16,7 +16,7 @@ from sortie.sim.cli.conditions import compare_conditions, refuse
 from sortie.sim.cli.console import bars, out, stages
 from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded, split_policies
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
-from sortie.sim.studies.compare import Flown, chosen_seeds
+from sortie.sim.studies.compare import Flown, chosen_seeds, in_town_of
 from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
 from sortie.sim.studies.multifidelity import METRICS
 
@@ -101,9 +101,12 @@ def compare(
     if half_width is not None:
         if seeds is not None or recording is not None:
             raise RunError(f"--{'recording' if seeds is None else 'seeds'} does not go with --half-width")
+        first = []
+        if seed is not None:  # in the town that a comparison of several seeds gives it
+            first = [f"seed={seed}", f"perception.scene.seed={in_town_of(base, seed).perception.scene.seed}"]
         with stages() as report:
             compared = sortie.compare(
-                scenario, labels, [*(set_ or []), *([] if seed is None else [f"seed={seed}"])], own_fusion=own_fusion,
+                scenario, labels, [*(set_ or []), *first], own_fusion=own_fusion,
                 progress=lambda stage, done, of: report(stage, done, round(of)), half_width=half_width, metric=metric or METRICS[0], pilot=pilot, most_seeds=most_seeds,
                 kept=kept or True,
             )  # fmt: skip

@@ -270,6 +270,11 @@ def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.Monkey
         monkeypatch.setattr(multifidelity, "fly_torch", None)
     (kept,) = (tmp_path / "runs").iterdir()
     assert kept.match("compare-track_target-????????.sqlite")
+    monkeypatch.setattr(multifidelity, "fly_torch", stand_in)
+    assert CliRunner().invoke(app, [*command, "--seed", "3", "--out", "d.json"]).exit_code == 0
+    sorties = json.loads((tmp_path / "d.json").read_text())["sorties"]
+    assert [(s["seed"], s["town_seed"]) for s in sorties[::2]] == [(seed, seed + 6) for seed in range(3, 7)]
+    assert sorties[0]["outcome"]["fingerprint"] == plain.sorties[4].outcome["fingerprint"]
 
 
 def test_each_of_several_seeds_has_a_town_of_its_own_and_flies_as_when_it_is_flown_alone() -> None:

@@ -615,7 +615,6 @@ FIGURES: dict[str, Figure] = {
     "disagreement": Figure(2, _disagreement),
     "compare": Figure(2, _compare),
     "coverage": Figure(0.5, _coverage),
-    "price": Figure(0.2, _price, timed=True),
     "half_width": Figure(4, _half_width),
     "worked_over_silence": Figure(1, _worked_over_silence),
     "viewpoints": Figure(2, _viewpoints),
