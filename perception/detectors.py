@@ -71,6 +71,14 @@ class LooksByAnother(Protocol):
     """Detects for the trackers."""
 
 
+@runtime_checkable
+class KeepsCaptures(Protocol):
+    """A detector that keeps what it encoded of the latest captures."""
+
+    kept_captures: int
+    """How many."""
+
+
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 Constructor = Callable[[SceneModel, Perception, int, int], Detector]
 """From the scene, the scenario's `perception` section, the sortie's seed and its replication."""

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from sortie.sim.env import SortieEnv
     from sortie.sim.results.summary import Summary
     from sortie.sim.studies.compare import Compared, Gain
+    from sortie.sim.studies.multifidelity import Precision, Settings
     from sortie.sim.studies.replayed import Replay
 
 ScenarioLike = str | Path | Mapping[str, object] | Scenario
@@ -153,6 +154,9 @@ class Comparison:
     """AP@0.5 (average precision) of every policy minus that of the first, with a paired 95 % interval. With several
     seeds a gain is the mean of the sorties' differences, and the interval covers sorties (`Gain.over`). Empty if
     `perception.detector` is none, because nothing is scored then; `table` still has bytes, energy and delays."""
+    precision: Precision | None = None
+    """With `half_width`: how many seeds each detector flew, their correlation, and what it cost relative to the torch
+    detector alone."""
 
     @cached_property
     def table(self) -> pa.Table:
@@ -176,21 +180,25 @@ class Comparison:
         """
         from sortie.sim.results.summary import Summary
         from sortie.sim.studies.compare import Flown
-        from sortie.sim.studies.comparison_text import comparison_table, explanations
+        from sortie.sim.studies.comparison_text import comparison_table, explanations, precision_lines
 
         flown = Flown(self.sorties, self.gains)
-        return Summary(comparison_table(flown), *explanations(flown))
+        more = [] if self.precision is None else precision_lines(self.precision)
+        return Summary(comparison_table(flown), *explanations(flown), *more)
 
     @user_errors()
     def save_recording(self, path: str | Path) -> Path:
         """Save the policies' sorties of the first seed side by side as one Rerun recording.
 
         Raises:
-            RunError: the file cannot be written, or Rerun is missing (extra `view`).
+            RunError: the file cannot be written, Rerun is missing (extra `view`), or the comparison was to a half-width,
+                which keeps no records.
         """
         from sortie.sim.playback.recording import save_comparison
 
         place = as_path("path", path)
+        if self.precision is not None:
+            raise RunError(f"{place}: a comparison to a half-width keeps no records; compare with seeds instead")
         save_comparison([(s.policy, s.record) for s in self.sorties if s.record is not None], place)
         return place
 
@@ -203,8 +211,16 @@ def compare(
     seeds: int | Iterable[int] | None = None,
     own_fusion: bool = False,
     progress: Callable[[str, int, float], None] | None = None,
+    half_width: float | None = None,
+    metric: str = "ap50.full_scene",
+    pilot: int | None = None,
+    most_seeds: int | None = None,
+    kept: str | Path | bool = False,
 ) -> Comparison:
     """Fly a scenario under several policies, with the same seeds and draws.
+
+    With `half_width`, it flies as many seeds as the answer needs, by the torch detector. Many sorties by the surrogate then
+    serve as control variates, which saves torch sorties without a bias. How this works, and what it saves: *Statistics*.
 
     Args:
         scenario, overrides: as for `sortie.load`.
@@ -214,10 +230,20 @@ def compare(
             random draws, the same for all policies; intervals then cover sorties. With one seed, the flight is over
             the scenario's own town, and intervals cover the instants of that flight alone.
         own_fusion: fly published methods with the fusion that they were published with, not `perception.fusion`.
-        progress: called with the policy's label, the seed and the simulated time (s).
+        progress: called with the policy's label, the seed and the simulated time (s). With `half_width`: with the stage, the
+            seeds flown in it, and its number of seeds.
+        half_width: fly until the 95 % interval of every gain in `metric` is at most this far to each side, in AP: 0.01 is
+            one AP point. The scenario's detector answers, or torch where that is the surrogate. Not with `seeds`.
+        metric: `ap50.full_scene` or `ap50.mission`.
+        pilot: the seeds that both detectors fly before the rest is planned; None is 12.
+        most_seeds: the seeds that the torch detector flies at most; None is 200. `precision.reached` says whether that
+            was enough.
+        kept: a file that keeps what was flown. After an interruption the same call goes on from there, and a later call
+            can go on to a narrower half-width. True names the file by what is compared, in `runs`; False keeps nothing.
 
     Raises:
         ScenarioError, PolicyError: the scenario or a policy is wrong; raised before anything flies.
+        RunError: `half_width` where torch is missing or the surrogate cannot fly the scenario, or a file that cannot be used.
 
     Example:
         >>> short = {"duration_s": 2, "perception.detector": "surrogate"}
@@ -227,6 +253,7 @@ def compare(
     """
     from sortie.sim.studies.compare import Contender, chosen_seeds
     from sortie.sim.studies.compare import compare as compare_policies
+    from sortie.sim.studies.kept_comparison import compare_to, default_path
 
     base = load(scenario, overrides)
     if isinstance(policies, str) or not isinstance(policies, Iterable):
@@ -238,6 +265,14 @@ def compare(
     if not flown or len(set(labels)) < len(labels):
         how = "; give functions of one name, such as lambdas, a __name__ of their own"
         raise PolicyError(f"policies: {', '.join(labels) or 'none'}, must be one or more, each named once{how}")
+    if half_width is not None:
+        settings = _precision_settings(half_width, seeds, metric, pilot, most_seeds)
+        _ensure_callable("progress", progress)
+        path = default_path(flown, settings.pilot) if kept is True else as_path("kept", kept) if kept else None
+        return Comparison(*compare_to(flown, settings, path, progress))
+    for name, value in (("pilot", pilot), ("most_seeds", most_seeds), ("kept", kept or None)):
+        if value is not None:
+            raise RunError(f"{name}: goes with half_width, which is missing")
     if (
         not isinstance(seeds, int | Iterable | None)
         or isinstance(seeds, bool)
@@ -519,6 +554,19 @@ def _with_policy(scenario: Scenario, policy: PolicyLike | None) -> tuple[Scenari
 
 def _label(policy: PolicyLike) -> str:
     return policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
+
+
+def _precision_settings(half_width: Any, seeds: object, metric: Any, pilot: Any, most_seeds: Any) -> Settings:
+    """The arguments of a comparison to a half-width, checked."""
+    from sortie.sim.studies.multifidelity import MOST, PILOT, Settings
+
+    if seeds is not None:
+        raise RunError("seeds and half_width: name one of them; a half-width chooses its number of seeds")
+    if isinstance(half_width, bool) or not isinstance(half_width, int | float):
+        raise RunError(f"half_width: {half_width!r}, must be a number above 0 and below 1; 0.01 is one AP point")
+    first, most = _whole("pilot", pilot), _whole("most_seeds", most_seeds)
+    most = MOST if most is None else most
+    return Settings(float(half_width), metric, min(PILOT, most) if first is None else first, most)
 
 
 def _whole(name: str, value: Any) -> int | None:

@@ -116,6 +116,8 @@ class TorchDetector:
         self._net = folded(net)
         self._renderer = Renderer(scene, seed, replication)
         self._kept: OrderedDict[Capture, _Encoded] = OrderedDict()
+        self.kept_captures = KEPT_CAPTURES
+        """Encoded captures that are kept, 1.5 MB each or so."""
         self._pool = ThreadPoolExecutor(
             torch.get_num_threads(), "detector", initializer=torch.set_num_threads, initargs=(1,)
         )
@@ -209,7 +211,7 @@ class TorchDetector:
         self._kept.update(encoded)
         for capture in wanted:
             self._kept.move_to_end(capture)
-        while len(self._kept) > max(KEPT_CAPTURES, len(wanted)):
+        while len(self._kept) > max(self.kept_captures, len(wanted)):
             self._kept.popitem(last=False)
         return {capture: self._kept[capture] for capture in wanted}
 

@@ -13,11 +13,12 @@ import sortie
 from sortie.policies.registry import POLICIES
 from sortie.scenarios.reading.load import load_conditions
 from sortie.sim.cli.conditions import compare_conditions, refuse
-from sortie.sim.cli.console import bars, out
+from sortie.sim.cli.console import bars, out, stages
 from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded, split_policies
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
-from sortie.sim.studies.compare import Flown, chosen_seeds
+from sortie.sim.studies.compare import Flown, chosen_seeds, in_town_of
 from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
+from sortie.sim.studies.multifidelity import METRICS
 
 
 def compare(
@@ -48,6 +49,34 @@ def compare(
     readme: Annotated[
         Path | None, typer.Option(help="Write the comparison between the markers of this Markdown file.")
     ] = None,
+    half_width: Annotated[
+        float | None,
+        typer.Option(
+            help="Fly by the torch detector until all 95 % intervals of --metric are this narrow to each side: 0.01 is one AP "
+            "point. The surrogate's sorties are control variates. The same command goes on after an interruption.",
+            min=0.0,
+            max=1.0,
+        ),
+    ] = None,
+    metric: Annotated[
+        str | None, typer.Option(help="With --half-width: ap50.full_scene (the default) or ap50.mission.")
+    ] = None,
+    pilot: Annotated[
+        int | None,
+        typer.Option(
+            help="With --half-width: seeds flown by both detectors before the rest is planned. Default: 12.", min=4
+        ),
+    ] = None,
+    most_seeds: Annotated[
+        int | None,
+        typer.Option(help="With --half-width: seeds flown by the torch detector at most. Default: 200.", min=4),
+    ] = None,
+    kept: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --half-width: the file that keeps what was flown. Default: runs/compare-NAME-….sqlite."
+        ),
+    ] = None,
     by_torch: Annotated[
         bool, typer.Option("--by-torch", help="With conditions: fly with the surrogate, score with the torch detector.")
     ] = False,
@@ -56,30 +85,51 @@ def compare(
     conditions = load_conditions(scenario)
     if conditions is not None:
         refuse(
-            {"seed": seed, "seeds": seeds, "own-fusion": own_fusion or None, "recording": recording, "readme": readme}
-        )
+            {
+                "seed": seed, "seeds": seeds, "own-fusion": own_fusion or None, "recording": recording, "readme": readme,
+                "half-width": half_width, "metric": metric, "pilot": pilot, "most-seeds": most_seeds, "kept": kept,
+            }
+        )  # fmt: skip
         named = list(POLICIES) if policies == "all" else split_policies(policies)
         return compare_conditions(conditions, named, set_ or [], out_file, by_torch=by_torch)
     if by_torch:
         raise RunError(f"--by-torch goes with a set of conditions; for {scenario}: --set perception.detector=torch")
     labels = split_policies(policies)
     base = [loaded(scenario, set_, label) for label in labels][0]  # noqa: RUF015  every policy's notes are printed
-    chosen = chosen_seeds(base, seed, seeds)
-    ensure_files(out_file, recording)
+    ensure_files(out_file, recording, kept)
     ensure_between(readme, BEGIN, END)
-    with bars() as bar:
-        each = {label: bar(label, len(chosen) * base.duration_s) for label in labels}
-        compared = sortie.compare(
-            scenario, labels, set_ or [], seeds=chosen, own_fusion=own_fusion,
-            progress=lambda label, at, t_s: each[label](chosen.index(at) * base.duration_s + t_s),
-        )  # fmt: skip
+    if half_width is not None:
+        if seeds is not None or recording is not None:
+            raise RunError(f"--{'recording' if seeds is None else 'seeds'} does not go with --half-width")
+        first = []
+        if seed is not None:  # in the town that a comparison of several seeds gives it
+            first = [f"seed={seed}", f"perception.scene.seed={in_town_of(base, seed).perception.scene.seed}"]
+        with stages() as report:
+            compared = sortie.compare(
+                scenario, labels, [*(set_ or []), *first], own_fusion=own_fusion,
+                progress=lambda stage, done, of: report(stage, done, round(of)), half_width=half_width, metric=metric or METRICS[0], pilot=pilot, most_seeds=most_seeds,
+                kept=kept or True,
+            )  # fmt: skip
+    else:
+        alone = {"metric": metric, "pilot": pilot, "most-seeds": most_seeds, "kept": kept}
+        if given := [name for name, value in alone.items() if value is not None]:
+            raise RunError(f"--{given[0]} goes with --half-width")
+        chosen = chosen_seeds(base, seed, seeds)
+        with bars() as bar:
+            each = {label: bar(label, len(chosen) * base.duration_s) for label in labels}
+            compared = sortie.compare(
+                scenario, labels, set_ or [], seeds=chosen, own_fusion=own_fusion,
+                progress=lambda label, at, t_s: each[label](chosen.index(at) * base.duration_s + t_s),
+            )  # fmt: skip
     out.print(compared.summary())
     if out_file is not None:
         write_text(out_file, json.dumps(_plain(compared), indent=2, allow_nan=False) + "\n")
         out.print(f"kept in [bold]{out_file}[/bold]")
     if readme is not None:
-        command = compare_command(scenario, policies, seed, seeds, set_ or [], own_fusion=own_fusion)
-        section = comparison_markdown(Flown(compared.sorties, compared.gains), command)
+        command = compare_command(
+            scenario, policies, seed, seeds, set_ or [], own_fusion=own_fusion, half_width=half_width, metric=metric
+        )
+        section = comparison_markdown(Flown(compared.sorties, compared.gains), command, compared.precision)
         put_between(readme, section, BEGIN, END)
         out.print(f"the comparison in [bold]{readme}[/bold] written")
     if recording is not None:
@@ -93,5 +143,15 @@ def _plain(compared: sortie.Comparison) -> dict[str, Any]:
         {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, "gain_over_first": s.gain, "outcome": s.outcome}
         for s in compared.sorties
     ]
-    gains = [{k: None if v != v else v for k, v in asdict(gain).items()} for gain in compared.gains]  # NaN: no interval
-    return {"gains": gains, "sorties": sorties}
+    gains = _without_nan([asdict(gain) for gain in compared.gains])  # NaN: no interval
+    plain: dict[str, Any] = {"gains": gains, "sorties": sorties}
+    return plain if compared.precision is None else {**plain, "precision": _without_nan(asdict(compared.precision))}
+
+
+def _without_nan(value: Any) -> Any:
+    """As JSON has it, which has no NaN."""
+    if isinstance(value, dict):
+        return {key: _without_nan(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(v) for v in value]
+    return None if value != value else value

@@ -111,7 +111,7 @@ class Scorer:
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
         recorder.unfold |= {
-            "detections": partial(_unfold_detections, classes=recorder.classes),
+            "detections": partial(unfold_detections, classes=recorder.classes),
             "truths": partial(_unfold_truths, classes=recorder.classes),
         }
 
@@ -217,7 +217,7 @@ class Scorer:
         return Boxes.join([truth, people]) if len(people) else truth
 
 
-def _unfold_detections(rows: Sequence[tuple[Any, ...]], *, classes: bool) -> Sequence[Any]:
+def unfold_detections(rows: Sequence[tuple[Any, ...]], *, classes: bool) -> Sequence[Any]:
     """Columns of the table; each row gathered holds all boxes of a fusion."""
     columns, boxes = _unfold_boxes(rows)
     return [*columns, boxes.score.astype(np.float64), *([boxes.kind] if classes else [])]

@@ -23,6 +23,8 @@ SEEDS = 8
 TOWNS = 2**63
 AREAS = {"full_scene": False, "mission": True}
 """Where AP is scored: its name in the outcome, and whether it is the mission's disc."""
+BY_BOTH = "sorties by both detectors"
+"""`Gain.over` where the surrogate's sorties were control variates (`sortie.sim.studies.multifidelity`)."""
 
 
 class Contender(NamedTuple):
@@ -77,7 +79,8 @@ class Gain:
     """The paired 95 % interval over what `over` names."""
     over: str
     """What the interval covers: `sorties` (Student's over the sorties' differences, which have towns and draws of their
-    own), or `instants of one sortie` (a bootstrap within this town and this flight)."""
+    own), `sorties by both detectors` (the same, with the surrogate's sorties as control variates), or `instants of one
+    sortie` (a bootstrap within this town and this flight)."""
     count: int
     """How many of these: sorties or instants in which both policies have an AP."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -11,7 +12,8 @@ from rich.table import Table
 
 from sortie.scenarios.report_text import number, percent, points, size, table
 from sortie.sim.results.summary import PLURAL
-from sortie.sim.studies.compare import Compared, Flown, Gain
+from sortie.sim.studies.compare import BY_BOTH, Compared, Flown, Gain
+from sortie.sim.studies.multifidelity import Precision
 
 BEGIN, END = "<!-- compare:begin -->", "<!-- compare:end -->"
 
@@ -28,7 +30,7 @@ def comparison_table(flown: Flown) -> Table:
     return table
 
 
-def comparison_markdown(flown: Flown, command: str) -> str:
+def comparison_markdown(flown: Flown, command: str, precision: Precision | None = None) -> str:
     """The same for a Markdown file, between its markers, with why the figures differ."""
     first = flown.sorties[0].outcome
     head = f"`{command}`: {first['duration_s']:g} s, {len(first['battery'])} drones, {_seeds(flown)}"
@@ -36,19 +38,30 @@ def comparison_markdown(flown: Flown, command: str) -> str:
         head += f", accuracy scored at {first['ap50']['sample_rate_hz']:g} Hz by `{first['ap50']['detector']}`"
     what = " ".join(filter(None, [f"{head}.", _what_gains_are(flown)]))
     cells = ((name.strip(), *values) for name, values in _side_by_side(flown).items())
-    why = [line.replace("[bold]", "**").replace("[/bold]", "**") for line in explanations(flown)]
+    told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
+    why = [line.replace("[bold]", "**").replace("[/bold]", "**") for line in told]
     lines = [BEGIN, "", what, "", *table(("", *_by_policy(flown)), cells), "", *(f"- {line}" for line in why), "", END]
     return "\n".join(lines)
 
 
 def compare_command(
-    scenario: str, policies: str, seed: int | None, seeds: int | None, overrides: Sequence[str], *, own_fusion: bool
+    scenario: str,
+    policies: str,
+    seed: int | None,
+    seeds: int | None,
+    overrides: Sequence[str],
+    *,
+    own_fusion: bool,
+    half_width: float | None = None,
+    metric: str | None = None,
 ) -> str:
     """The command that gives the same comparison again."""
     said = ["sortie", "compare", scenario, "--policies", policies]
     said += [] if seed is None else ["--seed", str(seed)]
     said += [] if seeds is None else ["--seeds", str(seeds)]
     said += [x for override in overrides for x in ("--set", override)]
+    said += [] if half_width is None else ["--half-width", f"{half_width:g}"]
+    said += [] if metric is None else ["--metric", metric]
     return shlex.join(said + ["--own-fusion"] * own_fusion)
 
 
@@ -67,6 +80,31 @@ def explanations(flown: Flown) -> Iterator[str]:
         age = _mean(s.outcome["data_age_s"]["p50"] for s in sorties)
         fused = "nothing fused" if age is None else f"fused data {age:.2f} s old at the median"
         yield f"[bold]{policy}[/bold]: {total} payloads{in_all}, {parts}; {fused}"
+
+
+def precision_lines(found: Precision) -> Iterator[str]:
+    """What a comparison to a half-width flew, and what it cost."""
+    name = found.detector
+    widest = max((c.half_width for c in found.contrasts if c.metric == found.metric), default=math.nan)
+    verdict = "reached" if found.reached else "not reached, as the seeds were used up: --most-seeds allows more"
+    yield (
+        f"[bold]half-width[/bold] of {found.metric}: {100 * widest:.2f} AP points, {100 * found.asked:g} asked, {verdict}; "
+        "intervals are widened for stopping there"
+    )
+    further = f", and {found.further} further seeds by the surrogate" if found.further else ""
+    yield f"[bold]flown[/bold]: {found.paired} seeds by {name}{further}; gains in the surrogate's scores correlate with those in {name}'s:"
+    for c in found.contrasts:
+        used = f"coefficient {c.coefficient:.2f}" if found.control else "not used"
+        yield f"  {c.policy}, {c.metric}: correlation {number(c.correlation)}, predicted variance {percent(c.explained)}, {used}"
+    if not found.control:
+        yield (
+            f"[bold]{name} alone[/bold]: the surrogate was not used, because {name} alone reaches the half-width about as "
+            "cheaply. Gains are plain means over the seeds"
+        )
+    yield (
+        f"[bold]cost[/bold]: {found.seconds[0]:.1f} s of processor time for a seed by {name}, {found.seconds[1]:.1f} s by the surrogate; in all "
+        f"{number(found.cost_ratio, '.2f')} of what {name} alone is predicted to take"
+    )
 
 
 def _by_policy(flown: Flown) -> dict[str, list[Compared]]:
@@ -92,6 +130,7 @@ def _what_gains_are(flown: Flown) -> str:
         return ""
     covers = {
         "sorties": "the mean over sorties of each sortie's difference in AP, over the fusions that both policies made, with Student's 95 % interval over sorties",
+        BY_BOTH: "the mean over sorties of each sortie's difference in AP, over the fusions that both policies made, corrected by the surrogate's sorties as control variates, with a 95 % interval over sorties",
         "instants of one sortie": "with a 95 % interval over the instants of this one flight, which says nothing of others",
     }[flown.gains[0].over]
     return f"Gains are in AP points over {flown.sorties[0].policy}, paired: {covers}."
@@ -170,7 +209,7 @@ def _kilojoules(value: float) -> str:
 def _gain(gain: Gain | None, sorties: int) -> str:
     if gain is None:
         return ""
-    some = _some(gain.count, sorties) if gain.over == "sorties" else ""
+    some = _some(gain.count, sorties) if gain.over in ("sorties", BY_BOTH) else ""
     return points((gain.gain, gain.low, gain.high), "+.1f") + some
 
 

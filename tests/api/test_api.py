@@ -9,7 +9,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,8 @@ from sortie import _api, _run
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
-from sortie.sim.studies.compare import chosen_seeds
+from sortie.sim.studies import multifidelity
+from sortie.sim.studies.compare import Contender, chosen_seeds
 
 SHORT = {"duration_s": 2, "perception.detector": "none", "expect": [], "expect_decisions": []}
 SURROGATE = SHORT | {"perception.detector": "surrogate"}
@@ -227,6 +228,55 @@ def test_a_gain_over_sorties_is_the_mean_of_the_sorties_own_with_students_interv
     assert (gain.low, gain.high) == pytest.approx(student, abs=1e-4)  # the ends of AP, -1 and 1, are far away
 
 
+def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The surrogate stands for torch; the command prints and writes the same."""
+    fly = multifidelity.fly_torch
+
+    def stand_in(contenders: Sequence[Contender], seed: int) -> multifidelity.Row:
+        return fly([multifidelity.with_detector(c, "surrogate") for c in contenders], seed)._replace(processor_s=10.0)
+
+    monkeypatch.setattr(multifidelity, "fly_torch", stand_in)
+    monkeypatch.chdir(tmp_path)
+    compared = sortie.compare("track_target", ["worked", "silence"], SURROGATE, half_width=0.9, pilot=4)
+    plain = sortie.compare("track_target", ["worked", "silence"], SURROGATE, seeds=4)
+    assert [s.outcome["fingerprint"] for s in compared.sorties] == [s.outcome["fingerprint"] for s in plain.sorties]
+    assert [s.gain for s in compared.sorties] == [s.gain for s in plain.sorties]
+    assert (found := compared.precision) is not None
+    assert (found.paired, found.further, found.control, found.reached) == (4, 0, False, True)
+    (gain,), (other,) = compared.gains, plain.gains
+    assert gain.gain == pytest.approx(other.gain)
+    assert gain.high - gain.gain == pytest.approx((other.high - other.gain) * np.sqrt(1 + 3 / 4), rel=1e-3)
+    assert "half-width of ap50.full_scene" in _line(compared)
+    with pytest.raises(sortie.RunError, match="a comparison to a half-width keeps no records"):
+        compared.save_recording(tmp_path / "a.rrd")
+    settings = [arg for key, value in SURROGATE.items() for arg in ("--set", f"{key}={value}")]
+    command = [
+        "compare",
+        "track_target",
+        "--policies",
+        "worked,silence",
+        *settings,
+        "--half-width",
+        "0.9",
+        "--pilot",
+        "4",
+    ]
+    for _ in range(2):  # the second reads what the first kept
+        done = CliRunner().invoke(app, [*command, "--out", "c.json"])
+        assert done.exit_code == 0, done.output
+        written = json.loads((tmp_path / "c.json").read_text())
+        assert written["gains"] == [dataclasses.asdict(gain)]
+        assert written["precision"]["paired"] == 4
+        monkeypatch.setattr(multifidelity, "fly_torch", None)
+    (kept,) = (tmp_path / "runs").iterdir()
+    assert kept.match("compare-track_target-????????.sqlite")
+    monkeypatch.setattr(multifidelity, "fly_torch", stand_in)
+    assert CliRunner().invoke(app, [*command, "--seed", "3", "--out", "d.json"]).exit_code == 0
+    sorties = json.loads((tmp_path / "d.json").read_text())["sorties"]
+    assert [(s["seed"], s["town_seed"]) for s in sorties[::2]] == [(seed, seed + 6) for seed in range(3, 7)]
+    assert sorties[0]["outcome"]["fingerprint"] == plain.sorties[4].outcome["fingerprint"]
+
+
 def test_each_of_several_seeds_has_a_town_of_its_own_and_flies_as_when_it_is_flown_alone() -> None:
     two = sortie.compare("track_target", ["silence"], SURROGATE, seeds=[1, 5])
     own, other = (s.outcome["fingerprint"] for s in two.sorties)
@@ -358,6 +408,10 @@ WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "an observer that is none": (lambda: sortie.fly("track_target", SHORT, observer=print), sortie.ScenarioError, "must have the methods begin and second"),  # type: ignore[arg-type]
     "a run saved nowhere": (lambda: sortie.fly("track_target", SHORT).save(None), sortie.RunError, "path: None, must be a path"),  # type: ignore[arg-type]
     "two policies of one name": (lambda: sortie.compare("track_target", [lambda view: [], lambda view: []]), sortie.PolicyError, "give functions of one name, such as lambdas, a __name__ of their own"),
+    "seeds and a half-width": (lambda: sortie.compare("track_target", ["worked"], seeds=3, half_width=0.1), sortie.RunError, "seeds and half_width: name one of them"),
+    "a half-width as text": (lambda: sortie.compare("track_target", ["worked"], half_width="1"), sortie.RunError, "half_width: '1', must be a number above 0 and below 1; 0.01 is one AP point"),  # type: ignore[arg-type]
+    "a pilot alone": (lambda: sortie.compare("track_target", ["worked"], pilot=8), sortie.RunError, "pilot: goes with half_width, which is missing"),
+    "a metric of a half-width": (lambda: sortie.compare("track_target", ["worked"], half_width=0.1, metric="ap"), sortie.RunError, "metric: ap, must be one of ap50.full_scene, ap50.mission"),
     "no seeds": (lambda: sortie.compare("track_target", ["worked"], seeds=0), sortie.ScenarioError, "seeds: 0, must be a list of seeds or how many, 1 or more"),
     "seeds and a half": (lambda: sortie.compare("track_target", ["worked"], seeds=1.5), sortie.ScenarioError, "seeds: 1.5, must be a list of seeds or how many"),  # type: ignore[arg-type]
     "no run": (lambda: sortie.open_run("nowhere"), sortie.RunError, "nowhere: no run there (outcome.json is missing)"),

@@ -305,6 +305,19 @@ def _where_boxes_average() -> Tables:
     return {"where_boxes_average": _over_conditions("conditions_third", policies, "perception.join=average")}
 
 
+def _half_width() -> Tables:
+    import half_width_coverage
+
+    return half_width_coverage.tables()
+
+
+def _price() -> Tables:
+    """From the flown seeds of compare_price.csv; `compare_price.py` flies what it lacks."""
+    import compare_price
+
+    return compare_price.tables()
+
+
 def _arms() -> Tables:
     """As `sortie learn --by-torch`."""
     from sortie.policies.catalogue.adaptive import ARMS
@@ -602,6 +615,7 @@ FIGURES: dict[str, Figure] = {
     "disagreement": Figure(2, _disagreement),
     "compare": Figure(2, _compare),
     "coverage": Figure(0.5, _coverage),
+    "half_width": Figure(4, _half_width),
     "worked_over_silence": Figure(1, _worked_over_silence),
     "viewpoints": Figure(2, _viewpoints),
     "where_boxes_average": Figure(3, _where_boxes_average),

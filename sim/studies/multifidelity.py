@@ -1,0 +1,413 @@
+"""Policies compared by the torch detector to a given half-width, with the surrogate's sorties as control variates.
+
+A *paired* seed is flown by both detectors under every policy, a *further* seed by the surrogate alone. Seeds are flown in
+batches. After each batch the gains are estimated (`sortie.scenarios.control_variates`); the comparison stops when all
+intervals of one metric are narrow enough, or else plans the next batch. `next_batch` is a function of the rows alone, and
+each row and each plan is kept in a file. So a comparison that was killed goes on as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sortie.perception.detectors import Detector, KeepsCaptures, make_detector
+from sortie.perception.metrics.ap import average_precision
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.scenarios.control_variates import Controlled, controlled_mean, plan_units, widened
+from sortie.scenarios.intervals import mean_interval
+from sortie.scenarios.schema import Perception
+from sortie.sim.engine.sortie import DetectorMaker, run_sortie
+from sortie.sim.folders import RunError
+from sortie.sim.results.accuracy import Both, both_matched
+from sortie.sim.results.outcome import outcome
+from sortie.sim.studies.compare import AREAS, BY_BOTH, Compared, Contender, Gain, in_town_of
+from sortie.sim.studies.surrogate_draws import fly_with_draws
+
+METRICS = tuple(f"ap50.{area}" for area in AREAS)
+PILOT = 12
+"""Paired seeds that are flown before anything is planned."""
+MOST = 200
+"""Paired seeds at most."""
+DRAWS = 8
+"""Draws of the surrogate's boxes on each of its flights."""
+BATCH = 4
+"""Numbers of paired seeds are multiples of it, so that few looks are taken."""
+GROWTH = 2
+"""A batch at most doubles the paired seeds: the first plans stand on few of them."""
+WORTH = 0.9
+"""The surrogate is used where it is predicted to save a tenth or more."""
+FURTHER = 1_000_000
+"""Further seeds begin so far above the first paired one."""
+
+SHARED_CAPTURES = 400
+"""Captures that stay encoded for the other policies of a seed."""
+
+Gains = Mapping[str, Mapping[str, float | None]]
+"""By policy and metric, over the first policy; None where it is not defined."""
+Report = Callable[[str, int, float], None]
+"""Called with a stage, the seeds flown in it and all its seeds."""
+
+
+class Row(NamedTuple):
+    """One seed by one detector, under all policies."""
+
+    by: str
+    """`torch` (or the scenario's own detector) or `surrogate`."""
+    seed: int
+    gains: Gains
+    processor_s: float
+    outcomes: Mapping[str, dict[str, Any]] = {}
+    """By policy; of the surrogate none."""
+
+
+class Batch(NamedTuple):
+    """What is to be flown in all until the next look."""
+
+    paired: int
+    further: int
+    control: bool
+    """Whether the surrogate is used; decided after the pilot."""
+    cost_ratio: float = math.nan
+    """Predicted cost relative to torch alone; NaN of the pilot."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is asked."""
+
+    half_width: float
+    """In AP: 0.01 is one point."""
+    metric: str = METRICS[0]
+    pilot: int = PILOT
+    most: int = MOST
+    """Paired seeds."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.half_width < 1:
+            raise RunError(f"half-width: {self.half_width:g}, must be above 0 and below 1; 0.01 is one AP point")
+        if self.metric not in METRICS:
+            raise RunError(f"metric: {self.metric}, must be one of {', '.join(METRICS)}")
+        if not 4 <= self.pilot <= self.most:
+            raise RunError(f"pilot: {self.pilot}, must be 4 or more and at most the seeds to fly ({self.most})")
+
+
+@dataclass(frozen=True)
+class Flown:
+    """Everything that a comparison has flown and planned so far."""
+
+    torch: list[Row] = field(default_factory=list)
+    surrogate: list[Row] = field(default_factory=list)
+    """Of paired and of further seeds."""
+    plans: list[Batch] = field(default_factory=list)
+
+    def add(self, row: Row) -> None:
+        """One more row."""
+        (self.surrogate if row.by == "surrogate" else self.torch).append(row)
+
+    @property
+    def control(self) -> bool:
+        """Whether the surrogate is used; the pilot alone does not use it."""
+        return len(self.plans) > 1 and self.plans[-1].control
+
+    def estimate(self, policy: str, metric: str, *, control: bool) -> Controlled:
+        """A policy's gain; seeds without a car to be found count nowhere.
+
+        Args:
+            control: with the surrogate's rows as control variates, over paired seeds. False takes all of torch's rows alone;
+                the correlation is still that of the paired seeds.
+        """
+        torch, cheap = (
+            {row.seed: _number(row.gains[policy][metric]) for row in rows} for rows in (self.torch, self.surrogate)
+        )
+        paired = [seed for seed in torch if seed in cheap]
+        further = [value for seed, value in cheap.items() if seed not in torch]
+        found = controlled_mean([torch[s] for s in paired], [cheap[s] for s in paired], further, control=control)
+        if control:
+            return found
+        alone = mean_interval(list(torch.values()))
+        spread = [value for value in torch.values() if not math.isnan(value)]
+        variance = float(np.var(spread, ddof=1)) if len(spread) > 1 else math.nan
+        return replace(found, estimate=alone, variance=variance)
+
+    def seconds(self) -> tuple[float, float]:
+        """Median processor seconds of a seed by torch and by the surrogate."""
+        torch, cheap = (
+            float(np.median([row.processor_s for row in rows])) if rows else math.nan
+            for rows in (self.torch, self.surrogate)
+        )
+        return torch, cheap
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def next_batch(flown: Flown, policies: Sequence[str], settings: Settings) -> Batch | None:
+    """What is to be flown next, or None at the end; called when everything that was planned is flown.
+
+    Args:
+        policies: all but the first.
+
+    Returns:
+        The batch. The first is the pilot. The second decides for good whether the surrogate is used.
+    """
+    if not flown.plans:
+        return Batch(settings.pilot, 0, control=True)
+    last, n = flown.plans[-1], len(flown.torch)
+    pilot = len(flown.plans) == 1
+    if _narrow(flown, policies, settings, control=flown.control):
+        return None
+    if n >= settings.most and not (pilot and last.control):
+        return None
+    looked = [flown.estimate(p, settings.metric, control=last.control) for p in policies]
+    if any(math.isnan(found.variance) for found in looked):
+        raise RunError(f"{settings.metric}: fewer than two of {n} seeds have a gain, so no interval can be planned")
+    plan = plan_units(looked, settings.half_width, *flown.seconds(), measured=n, control=last.control)
+    control = last.control and (not pilot or plan.cost_ratio <= WORTH)
+    if not control:
+        plan = plan_units(looked, settings.half_width, 1.0, 1.0, measured=n, control=False)
+    grow = not (pilot and control)
+    paired = max(plan.expensive, n + grow)
+    paired = max(n, min(-(-paired // BATCH) * BATCH, GROWTH * n, settings.most))
+    if not control:
+        return Batch(paired, 0, control, 1.0)
+    per_pair = plan.cheap / plan.expensive
+    return Batch(
+        paired, max(math.ceil(per_pair * paired), last.further + BATCH * grow, BATCH), control, plan.cost_ratio
+    )
+
+
+def _narrow(flown: Flown, policies: Sequence[str], settings: Settings, *, control: bool) -> bool:
+    """Whether all intervals are; NaN are not."""
+    found = (widened(flown.estimate(p, settings.metric, control=control).estimate) for p in policies)
+    return all(e.half_width <= settings.half_width for e in found)
+
+
+def gains_between(policies: Sequence[str], matched: Sequence[Both]) -> dict[str, dict[str, float | None]]:
+    """Every policy's AP@0.5 minus the first policy's, over the fusions that both made.
+
+    Args:
+        policies: labels, the first one first.
+        matched: their matched fusions.
+    """
+    first, *others = matched
+    return {
+        policy: {f"ap50.{area}": _gain(first, its, area) for area in AREAS}
+        for policy, its in zip(policies[1:], others, strict=True)
+    }
+
+
+def _gain(first: Both, other: Both, area: str) -> float | None:
+    keys = [key for key in first[area] if key in other[area]]
+    arms = [[both[area][key] for key in keys] for both in (first, other)]
+    if not all(any(m.truths for m in arm) for arm in arms):
+        return None
+    return average_precision(arms[1]) - average_precision(arms[0])
+
+
+def _mean_of(several: Sequence[Gains]) -> Gains:
+    """The mean over draws; None where one has no value."""
+    first = several[0]
+
+    def mean(values: Iterable[float | None]) -> float | None:
+        kept = [_number(v) for v in values]
+        return None if any(map(math.isnan, kept)) else math.fsum(kept) / len(kept)
+
+    return {p: {m: mean(gains[p][m] for gains in several) for m in first[p]} for p in first}
+
+
+def with_detector(contender: Contender, detector: str) -> Contender:
+    """A contender with another detector; weights are the shipped ones, as a file is of one detector."""
+    perception = contender.scenario.perception
+    if perception.detector == detector:
+        return contender
+    changed = perception.model_copy(update={"detector": detector, "weights": None, "detector_params": {}})
+    return contender._replace(scenario=contender.scenario.model_copy(update={"perception": changed}))
+
+
+def shared_detector() -> DetectorMaker:
+    """Makes detectors so that sorties of one seed, flown one after the other, share the torch detector.
+
+    Policies do not change where drones fly, so the sorties of a seed mostly encode the same captures. The numbers do not
+    depend on it.
+    """
+    last: list[tuple[object, Detector | None]] = []
+
+    def make(scene: SceneModel, config: Perception, seed: int, replication: int) -> Detector | None:
+        if config.detector != "torch":
+            return make_detector(scene, config, seed, replication)
+        key = scene.made_of, config, seed, replication
+        if not last or last[0][0] != key:
+            detector = make_detector(scene, config, seed, replication)
+            last[:] = [(key, detector)]
+            if isinstance(detector, KeepsCaptures):
+                detector.kept_captures = SHARED_CAPTURES
+        return last[0][1]
+
+    return make
+
+
+def fly_torch(contenders: Sequence[Contender], seed: int) -> Row:
+    """One seed under every policy by the detector of the contenders' scenarios."""
+    begin_s = time.process_time()
+    make = shared_detector()
+    records = [run_sortie(in_town_of(c.scenario, seed), c.function, seed, detector_of=make) for c in contenders]
+    labels = [c.label for c in contenders]
+    gains = gains_between(labels, [both_matched(r) for r in records])
+    outcomes = dict(zip(labels, map(outcome, records), strict=True))
+    return Row("torch", seed, gains, time.process_time() - begin_s, outcomes)
+
+
+def fly_surrogate(contenders: Sequence[Contender], seed: int, draws: int = DRAWS) -> Row:
+    """One seed under every policy by the surrogate; gains are means over draws of its boxes."""
+    begin_s = time.process_time()
+    of_draws = zip(
+        *(fly_with_draws(in_town_of(c.scenario, seed), c.function, seed, draws) for c in contenders), strict=True
+    )
+    gains = _mean_of([gains_between([c.label for c in contenders], draw) for draw in of_draws])
+    return Row("surrogate", seed, gains, time.process_time() - begin_s)
+
+
+def run(
+    contenders: Sequence[Contender],
+    settings: Settings,
+    flown: Flown,
+    keep: Callable[[Row | Batch], None],
+    report: Report,
+) -> Flown:
+    """Fly batches until the intervals are narrow enough or the seeds are used up.
+
+    Args:
+        contenders: two or more; their scenarios have the detector that answers.
+        flown: what an earlier call kept; it is completed in place.
+        keep: called with each row and plan as soon as there is one.
+        report: called after each seed.
+
+    Raises:
+        SortieError: the scenario cannot be flown by both detectors; the first seed shows it.
+    """
+    first = contenders[0].scenario.seed
+    cheap = [with_detector(c, "surrogate") for c in contenders]
+    policies = [c.label for c in contenders[1:]]
+    while True:
+        batch = flown.plans[-1] if flown.plans else None
+        if batch is None or _complete(flown, batch):
+            batch = next_batch(flown, policies, settings)
+            if batch is None:
+                return flown
+            flown.plans.append(batch)
+            keep(batch)
+        stage = f"batch {len(flown.plans)}: "
+        by_torch, by_surrogate = {r.seed for r in flown.torch}, {r.seed for r in flown.surrogate}
+        for k, seed in enumerate(range(first, first + batch.paired)):
+            report(f"{stage}paired seeds", k, batch.paired)
+            if batch.control and seed not in by_surrogate:  # first: it takes a second to learn that it cannot fly
+                _add(flown, keep, fly_surrogate(cheap, seed))
+            if seed not in by_torch:
+                _add(flown, keep, fly_torch(contenders, seed))
+        report(f"{stage}paired seeds", batch.paired, batch.paired)
+        for k, seed in enumerate(range(first + FURTHER, first + FURTHER + batch.further)):
+            report(f"{stage}further seeds by the surrogate", k, batch.further)
+            if seed not in by_surrogate:
+                _add(flown, keep, fly_surrogate(cheap, seed))
+        if batch.further:
+            report(f"{stage}further seeds by the surrogate", batch.further, batch.further)
+
+
+def _complete(flown: Flown, batch: Batch) -> bool:
+    """Whether everything of a plan is flown."""
+    cheap = batch.further + (batch.paired if batch.control else 0)
+    return len(flown.torch) >= batch.paired and len(flown.surrogate) >= cheap
+
+
+def _add(flown: Flown, keep: Callable[[Row | Batch], None], row: Row) -> None:
+    flown.add(row)
+    keep(row)
+
+
+@dataclass(frozen=True, slots=True)
+class Contrast:
+    """How one gain was estimated."""
+
+    policy: str
+    metric: str
+    half_width: float
+    """Of its 95 % interval, in AP."""
+    correlation: float
+    """Of the torch detector's gain and the surrogate's over paired seeds; NaN where either does not vary."""
+    explained: float
+    """Share of the variance of the torch detector's gain that the surrogate predicts for seeds that were left out; below 0
+    where it predicts worse than no prediction."""
+    coefficient: float
+    """By which the surrogate's deviation was subtracted; 0 where it was not used."""
+
+
+@dataclass(frozen=True, slots=True)
+class Precision:
+    """How a comparison to a given half-width came to its gains, and what it cost."""
+
+    detector: str
+    """The detector that answers."""
+    metric: str
+    """The metric that had to reach the half-width."""
+    asked: float
+    """The half-width that was asked for, in AP."""
+    reached: bool
+    """False where the seeds were used up first."""
+    paired: int
+    """Seeds flown by the detector that answers; in the pilot, and where `control`, by the surrogate as well."""
+    further: int
+    """Seeds flown by the surrogate alone."""
+    control: bool
+    """Whether the surrogate's gains were used."""
+    contrasts: tuple[Contrast, ...]
+    """Every policy but the first by metric, where there is something to find."""
+    seconds: tuple[float, float]
+    """Processor seconds of a seed, all policies together, by the detector that answers and by the surrogate: medians."""
+    cost_ratio: float
+    """What all seeds cost relative to the detector alone at the same half-width, predicted from the spread found."""
+
+
+def precision_of(flown: Flown, policies: Sequence[str], settings: Settings, detector: str) -> Precision:
+    """What a finished comparison says of its own precision and cost."""
+    contrasts = []
+    for policy, metric in ((p, m) for p in policies for m in METRICS):
+        used = flown.estimate(policy, metric, control=flown.control)
+        if used.estimate.count:
+            off = widened(used.estimate).half_width
+            contrasts.append(Contrast(policy, metric, off, used.correlation, used.explained, used.coefficient))
+    widest = max((c.half_width for c in contrasts if c.metric == settings.metric), default=math.nan)
+    torch_s, cheap_s = flown.seconds()
+    ratio = math.nan
+    if widest > 0:
+        found = [flown.estimate(p, settings.metric, control=False) for p in policies]
+        alone = plan_units(found, widest, torch_s, cheap_s, control=False).expensive
+        ratio = (len(flown.torch) * torch_s + len(flown.surrogate) * cheap_s) / (alone * torch_s)
+    paired = {row.seed for row in flown.torch}
+    return Precision(
+        detector, settings.metric, settings.half_width, widest <= settings.half_width, len(paired),
+        sum(row.seed not in paired for row in flown.surrogate), flown.control, tuple(contrasts), (torch_s, cheap_s), ratio,
+    )  # fmt: skip
+
+
+def results(flown: Flown, contenders: Sequence[Contender]) -> tuple[tuple[Compared, ...], tuple[Gain, ...]]:
+    """The sorties by the detector that answers, and the gains with their widened intervals."""
+    sorties = []
+    for row in sorted(flown.torch, key=lambda row: row.seed):
+        for c in contenders:
+            its = {area: row.gains[c.label][f"ap50.{area}"] if c.label in row.gains else None for area in AREAS}
+            town = in_town_of(c.scenario, row.seed).perception.scene.seed
+            sorties.append(Compared(c.label, row.seed, town, row.outcomes[c.label], its, None))
+    gains = []
+    for policy, metric in ((c.label, m) for c in contenders[1:] for m in METRICS):
+        found = widened(flown.estimate(policy, metric, control=flown.control).estimate)
+        if found.count:
+            over = BY_BOTH if flown.control else "sorties"
+            gains.append(Gain(policy, metric, found.mean, found.low, found.high, over, found.count))
+    return tuple(sorties), tuple(gains)
