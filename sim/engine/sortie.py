@@ -19,7 +19,7 @@ from sortie.fleet.gate import Gate
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import Form
-from sortie.fleet.plane import DroneStatus, PlaneRules, equipment_of
+from sortie.fleet.plane import DroneStatus, PlaneRules, codebooks, equipment_of
 from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, LooksByAnother, make_detector
@@ -172,8 +172,10 @@ def build(
     env, recorder = simpy.Environment(), Recorder(classes=len(scenario.perception.classes) > 1)
     drones, rules = range(scenario.fleet.drones), _rules(scenario)
     statuses = [
-        DroneStatus(space, looks=not blind)
-        for space, blind in zip(scenario.feature_spaces, scenario.context_only, strict=True)
+        DroneStatus(space, looks=not blind, codebook=codebook)
+        for space, codebook, blind in zip(
+            scenario.feature_spaces, codebooks(scenario), scenario.context_only, strict=True
+        )
     ]
     memories = [PeerMemory(i, rules, statuses[i]) for i in drones]
 
@@ -351,6 +353,7 @@ def _rules(scenario: Scenario) -> PlaneRules:
         trust=context.trust,
         people=scenario.perception.thermal is not None,
         classes=len(scenario.perception.classes) > 1,
+        code_bytes=scenario.perception.code_bytes,
         publish_every=context.publish_every,
         form=Form(**context.form.model_dump()),
         roster=context.roster,
