@@ -107,14 +107,14 @@ def source_of(share: Share, alone: Boxes | None, errors: BoxErrors | None = None
     if share.representation == "tracks":
         truncated = len(boxes) > budget.MAX_TRACKS
         boxes = boxes.take(np.arange(min(len(boxes), budget.MAX_TRACKS)))
-    motion = (None, None) if tracks is None else motion_of_boxes(boxes, share.capture.t_s, age_s, tracks)
+    velocity, variance = (None, None) if tracks is None else motion_of_boxes(boxes, share.capture.t_s, age_s, tracks)
     covariance = None
     if share.representation == "uncertain_boxes":
         errors = share.errors or errors
         if errors is None:
             raise InputError("this detector does not tell how uncertain its boxes are: let policies send detections")
         covariance = errors.covariances_m2(boxes, share.capture.est_pose)
-    return SourceBoxes(boxes, *where, truncated, age_s, *motion, covariance)
+    return SourceBoxes(boxes, *where, truncated, age_s, velocity, variance, covariance)
 
 
 def sendable(boxes: Boxes) -> Boxes:
@@ -288,7 +288,8 @@ def _covariances(source: SourceBoxes) -> Floats:
     if source.covariance_m2 is None:
         return np.stack([now, np.zeros_like(now), now], axis=1)
     grown = np.maximum(now - of.sigma0_m2, 0.0)
-    return source.covariance_m2.astype(np.float64) + np.stack([grown, np.zeros_like(grown), grown], axis=1)
+    sent = np.asarray(source.covariance_m2, np.float64)
+    return np.asarray(sent + np.stack([grown, np.zeros_like(grown), grown], axis=1))
 
 
 def _left(boxes: Boxes, age_s: Floats, freshest_s: Floats, known_m2: Floats) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sortie.perception.benchmark.scenes import DRONES
 from sortie.perception.surrogate import plan
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.training.box_errors import Moment, errors_of
@@ -22,7 +23,7 @@ def moments(weights: Path, split: plan.Split, towns: int) -> list[Moment]:
         split: which of a calibration's towns.
         towns: the first so many.
     """
-    out = []
+    out: list[Moment] = []
     for town in range(towns):
         scene = plan.scene_model(SEED, split, town)
         detector = SurrogateDetector(scene, Perception(detector="surrogate"), town, weights)
@@ -36,5 +37,5 @@ def moments(weights: Path, split: plan.Split, towns: int) -> list[Moment]:
 
 def _fleet(split: plan.Split, town: int, manner: int) -> list[Capture]:
     """Five drones over a town, by their ids."""
-    jobs = plan.moment(SEED, split, town, manner, condition_egos=plan.DRONES)
+    jobs = plan.moment(SEED, split, town, manner, condition_egos=DRONES)
     return sorted({j.ego for j in jobs if not j.shares}, key=lambda c: c.drone)

@@ -53,11 +53,11 @@ def errors_of(boxes: Boxes, pose: Pose, cars: NDArray[np.floating]) -> Errors:
         pose: its estimated x, y, yaw.
         cars: [m, 5] x, y, length, width, yaw of every car; rows of NaN are padding.
     """
-    cars = cars[~np.isnan(cars[:, 0])]
+    real = np.asarray(cars[~np.isnan(cars[:, 0])], np.float64)
     i, j, value = overlapping(
-        boxes.table(), cars, np.zeros(len(boxes), np.int64), np.zeros(len(cars), np.int64), "rotated"
+        boxes.table(), real, np.zeros(len(boxes), np.int64), np.zeros(len(real), np.int64), "rotated"
     )
-    free, pairs = np.ones(len(cars), bool), []
+    free, pairs = np.ones(len(real), bool), []
     for box in range(len(boxes)):
         mine = np.flatnonzero((i == box) & (value > NMS_IOU) & free[j])
         if len(mine):
@@ -73,7 +73,7 @@ def errors_of(boxes: Boxes, pose: Pose, cars: NDArray[np.floating]) -> Errors:
         boxes.score[box_of].astype(np.float64),
         distance,
         sight / np.maximum(distance, 1e-9)[:, None],
-        at - cars[car_of, :2],
+        at - real[car_of, :2],
     )
 
 

@@ -57,7 +57,7 @@ def sample(net: CarNet, parts: Iterator[Frames], seed: int) -> Floats:
     return np.concatenate(out)
 
 
-def fit(cells: Floats, recipe: CodebookRecipe, progress: Callable[[int, int], None] | None = None) -> Floats:
+def fit(cells: Floats, recipe: CodebookRecipe, progress: Callable[[str, int, int], None] | None = None) -> Floats:
     """The stages [stages, 256, 80] of a codebook: k-means of what the stages before leave of cells [n, 80].
 
     Raises:
@@ -75,7 +75,7 @@ def fit(cells: Floats, recipe: CodebookRecipe, progress: Callable[[int, int], No
         stages[k] = entries.astype(np.float16)  # as they are stored
         left -= stages[k][nearest]
         if progress is not None:
-            progress(k + 1, recipe.stages)
+            progress("stages", k + 1, recipe.stages)
     return stages
 
 
@@ -87,7 +87,7 @@ def make_codebook(
     *,
     weights: str,
     root: Path,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Fit a codebook to a network's features, and write it with its card; the facts about it.
 
