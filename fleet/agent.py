@@ -269,6 +269,7 @@ class Agent:
             region=region,
             priority_target_ids=target_ids,
             feature_space=self.status.feature_space,
+            codebook=self.status.codebook,
         )
         if roster is not None:
             descriptor = descriptor.with_roster(roster)
@@ -446,10 +447,14 @@ class Agent:
             what = (directive.representation, directive.rho, directive.roi, directive.fusion_weight)
             if what not in made:
                 payload = make_payload(
-                    directive, *pose, count_boxes, rules.tile_limit_bytes, tracks_in, people_in, classes=rules.classes
-                )
-                if payload is not None and self.status.feature_space:
-                    payload = payload._replace(feature_space=self.status.feature_space)
+                    directive, *pose, count_boxes, rules.tile_limit_bytes, tracks_in, people_in, classes=rules.classes,
+                    code_bytes=rules.code_bytes,
+                )  # fmt: skip
+                if payload is not None and (self.status.feature_space or self.status.codebook):
+                    payload = payload._replace(
+                        feature_space=self.status.feature_space,
+                        codebook=self.status.codebook if payload.code_bytes else "",
+                    )
                 made[what] = payload
             payload = made[what]
             if payload is not None:

@@ -23,8 +23,8 @@ HEADER_BYTES = 40
 _EPSILON_S = 1e-6
 # members of an enumeration are slow to look up
 _NONE, _FEATURES, _RAW = Representation.NONE, Representation.FEATURES, Representation.RAW
-_TRACKS = Representation.TRACKS
-_RELIABLE = tuple(rung in BOXES for rung in Representation)
+_TRACKS, _CODES = Representation.TRACKS, Representation.CODES
+_RELIABLE = {rung: rung in BOXES for rung in Representation}
 
 CountBoxes = Callable[[Disc | None], int]
 """Counts the boxes that the drone's own detector reports in a region; None is everywhere."""
@@ -56,6 +56,10 @@ class Payload(NamedTuple):
     people: Boxes | None = None
     """The people among its detections; None where the drone has no thermal camera, and for other payloads. People among
     its tracks are in `tracks`."""
+    codebook: str = ""
+    """Of its codes: digest of the codebook, empty for the fleet's common one."""
+    code_bytes: int = 0
+    """Of a cell of codes; 0 for other payloads."""
 
     @property
     def reliable(self) -> bool:
@@ -74,25 +78,28 @@ def make_payload(
     people_in: PeopleIn | None = None,
     *,
     classes: bool = False,
+    code_bytes: int = budget.CODE_BYTES,
 ) -> Payload | None:
     """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent.
 
     Args:
-        tile_limit_bytes: features are sent as tiles of at most this size (sortie.fleet.tiles); None: as one sample.
+        tile_limit_bytes: features are sent as tiles of at most this size (sortie.fleet.tiles); None: as one sample. Codes
+            always are one sample.
         tracks_in: gives the tracks of a region that the drone sends; without a tracker, boxes are counted in their place.
         people_in: gives the people of a region; None without a thermal camera.
         classes: whether each detection names its class.
+        code_bytes: of a cell that is sent as a code.
     """
     rung, rho, roi, weight = directive.representation, directive.rho, directive.roi, directive.fusion_weight
     cells = boxes = index_bytes = 0
     tracks = people = None
     if rung == _NONE:
         return None
-    if rung == _FEATURES:
+    if rung in (_FEATURES, _CODES):
         cells = budget.cells_sent(rho, roi, est_x_m, est_y_m, est_yaw_rad)
         if cells == 0:
             return None
-        if tile_limit_bytes is not None:
+        if tile_limit_bytes is not None and rung == _FEATURES:
             t = tiles.cut(cells, tile_limit_bytes)
             return Payload(rung, rho, roi, weight, cells, 0, t.index_bytes, t.size_bytes, t.cells_each, t.tile_bytes)
         index_bytes = budget.index_bytes(cells)
@@ -102,10 +109,14 @@ def make_payload(
         people = None if people_in is None else people_in(roi)
         boxes = budget.boxes_sent(NAME_OF[rung], count_boxes(roi) + (0 if people is None else len(people)))
     # the directive goes with the payload, so that the receiver has representation, region and fusion weight
-    size_bytes = (
-        HEADER_BYTES + DIRECTIVE_BYTES + budget.content_bytes(NAME_OF[rung], cells=cells, boxes=boxes, classes=classes)
-    )
-    return Payload(rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes, tracks=tracks, people=people)
+    content_bytes = budget.content_bytes(
+        NAME_OF[rung], cells=cells, boxes=boxes, classes=classes, code_bytes=code_bytes
+    )  # fmt: skip
+    payload = Payload(
+        rung, rho, roi, weight, cells, boxes, index_bytes, HEADER_BYTES + DIRECTIVE_BYTES + content_bytes,
+        tracks=tracks, people=people,
+    )  # fmt: skip
+    return payload._replace(code_bytes=code_bytes) if rung == _CODES else payload
 
 
 class Gate:

@@ -22,7 +22,7 @@ from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, FleetView
 from sortie.scenarios.representation import MAPS, Representation
 
-FEATURES = Representation.FEATURES  # slow to look up, each time
+_FEATURES, _CODES = Representation.FEATURES, Representation.CODES  # slow to look up, each time
 
 
 class Received(NamedTuple):
@@ -84,10 +84,16 @@ class PeerMemory:
         self._heard_s[sender], self._stamps_s[sender] = now_s, descriptor.stamp_ns * 1e-9
 
     def can_fuse(self, payload: Payload) -> bool:
-        """Whether the drone can use it. Feature cells of another network mean nothing to it; without one all maps do."""
-        if not self.status.looks and payload.representation in MAPS:
+        """Whether the drone can use it. Feature cells of another network mean nothing to it, and codes of another codebook.
+
+        Without a network no map means anything to it.
+        """
+        rung, status = payload.representation, self.status
+        if not status.looks and rung in MAPS:
             return False
-        return payload.representation != FEATURES or payload.feature_space == self.status.feature_space
+        if rung == _CODES and payload.codebook != status.codebook:
+            return False
+        return rung not in (_FEATURES, _CODES) or payload.feature_space == status.feature_space
 
     def receive(self, received: Received) -> None:
         """Keep a peer's payload, unless a newer capture of that peer arrived before it, or this drone cannot fuse it."""

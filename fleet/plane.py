@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 from sortie.fleet.computer import Work
 from sortie.fleet.coverage import cameras_of
 from sortie.fleet.messages.compact import FULL, Form
+from sortie.perception.budget import CODE_BYTES
+from sortie.perception.files import codebook_digest
 from sortie.perception.geometry import USUAL, Cameras
 from sortie.policies.contract import Descriptor
 from sortie.scenarios.schema import Scenario
@@ -26,6 +29,19 @@ def equipment_of(scenario: Scenario) -> dict[int, Equipment]:
     """Each drone's equipment."""
     each = zip(scenario.compute_delays_s, cameras_of(scenario.fleet), strict=True)
     return {i: Equipment(delay_s, cameras) for i, (delay_s, cameras) in enumerate(each)}
+
+
+def codebooks(scenario: Scenario) -> tuple[str, ...]:
+    """Each drone's codebook as its descriptors name it: by its digest, empty for the fleet's common one.
+
+    Raises:
+        InputError: a make's codebook that is missing, naming the file.
+    """
+    common = scenario.perception.codebook
+    return tuple(
+        "" if n.codebook is None or n.codebook == common else codebook_digest(Path(n.codebook))
+        for n in scenario.networks
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +67,8 @@ class PlaneRules:
     """Frames from one descriptor to the next. Staleness counts in periods of that length."""
     form: Form = FULL
     """The resolution of descriptors on the wire."""
+    code_bytes: int = CODE_BYTES
+    """Of a cell that is sent as a code."""
     roster: bool = False
     """Whether drones publish which members of the fleet they know (`sortie.policies.contract.Roster`)."""
     makes: Mapping[int, Equipment] = field(default_factory=dict)
@@ -79,6 +97,8 @@ class DroneStatus:
     """
 
     feature_space: str = ""
+    codebook: str = ""
+    """Digest of its codebook; empty for the fleet's common one."""
     """The network of the drone: only maps of one feature space can be fused. Empty: the fleet's common one."""
     looks: bool = True
     """Whether it has a detector. Without one it sends context alone, and uses the boxes that it is sent."""

@@ -45,10 +45,10 @@ def cap_by_age(directive: Directive, link: LinkHealth, age_s: float | None) -> D
         )
     if directive.representation <= Representation.DETECTIONS and directive.rate_hz <= DEGRADED_RATE_HZ:
         return directive
-    features = directive.representation > Representation.DETECTIONS
+    more = directive.representation > Representation.DETECTIONS  # also boxes with uncertainty: they lose it
     return directive._replace(
         representation=min(directive.representation, Representation.DETECTIONS),
-        rho=0.0 if features else directive.rho,
+        rho=0.0 if more else directive.rho,
         rate_hz=min(directive.rate_hz, DEGRADED_RATE_HZ),
         reason=f"degraded: {age}",
     )

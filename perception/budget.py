@@ -25,6 +25,8 @@ CELL_M = FULL.cell_m
 """Side of a cell in UAV3D's geometry, which sorties fly; only the benchmark has a smaller one."""
 DETECTION_BYTES = 24
 """One detection: x, y, length, width, yaw, score as float32."""
+COVARIANCE_BYTES = 12
+"""What a box with uncertainty has beside a detection: east, east–north and north variance of its place, as float32."""
 CLASS_BYTES = 1
 """The class of a detection, where the scenario has targets of several classes (`perception.classes`)."""
 TRACK_BYTES = 20
@@ -32,6 +34,12 @@ TRACK_BYTES = 20
 MAX_TRACKS = 12
 INDEX_BITS = 12
 """One cell index: 4096 cells."""
+CODE_BYTES = 10
+"""One cell of codes, where `perception.code_bytes` says nothing else."""
+MAX_CODE_BYTES = 20
+"""The longest code of a cell, an eighth of its features."""
+CODEBOOK_BYTES = 8
+"""What a payload of codes names its codebook by: seven bytes of its digest, and the bytes of a cell."""
 RAW_BYTES = 5 * 800 * 450 * 3
 """Five cameras of 800 × 450 pixels, 3 B each: 5.4 MB (FACTS §1)."""
 
@@ -56,11 +64,14 @@ def boxes_sent(representation: str, boxes: int) -> int:
     return min(boxes, MAX_TRACKS) if representation == "tracks" else boxes
 
 
-def content_bytes(representation: str, *, cells: int = 0, boxes: int = 0, classes: bool = False) -> int:
-    """Bytes of a payload without its header: features with their index, detections, tracks, or raw images.
+def content_bytes(
+    representation: str, *, cells: int = 0, boxes: int = 0, classes: bool = False, code_bytes: int = CODE_BYTES
+) -> int:
+    """Bytes of a payload without its header: features or codes with their index, boxes, tracks, or raw images.
 
     Args:
-        classes: whether each detection names its class. A track always does.
+        classes: whether each box names its class. A track always does.
+        code_bytes: of a cell, where it is sent as a code.
 
     Raises:
         ValueError: another representation, naming it.
@@ -68,13 +79,19 @@ def content_bytes(representation: str, *, cells: int = 0, boxes: int = 0, classe
     match representation:
         case "features":
             return payload_bytes(cells) + index_bytes(cells)
+        case "codes":
+            return CODEBOOK_BYTES + cells * code_bytes + index_bytes(cells)
         case "detections":
             return boxes * (DETECTION_BYTES + CLASS_BYTES * classes)
+        case "uncertain_boxes":
+            return boxes * (DETECTION_BYTES + COVARIANCE_BYTES + CLASS_BYTES * classes)
         case "tracks":
             return boxes * TRACK_BYTES
         case "raw":
             return RAW_BYTES
-    raise ValueError(f"representation is {representation!r}, must be features, detections, tracks or raw")
+    raise ValueError(
+        f"representation is {representation!r}, must be features, codes, detections, uncertain_boxes, tracks or raw"
+    )
 
 
 @lru_cache(maxsize=4)

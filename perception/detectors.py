@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sortie.perception.errors import InputError
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.perception.uncertainty import BoxErrors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call, resolve
 from sortie.scenarios.schema import Perception
@@ -61,6 +62,27 @@ class DetectsMany(Protocol):
 
     def truth_many(self, t_s: Sequence[float], egos: Sequence[Capture]) -> Iterable[Boxes]:
         """As `truth`, ego by ego."""
+
+
+@runtime_checkable
+class HasBoxErrors(Protocol):
+    """A detector that tells how uncertain its boxes are, so that drones can send boxes with covariances."""
+
+    @property
+    def box_errors(self) -> BoxErrors:
+        """How uncertain the boxes of a drone alone are; InputError where nobody fitted it."""
+
+
+def box_errors_of(detector: Detector) -> BoxErrors:
+    """How uncertain a detector's boxes are.
+
+    Raises:
+        InputError: a detector that does not tell.
+    """
+    if not isinstance(detector, HasBoxErrors):
+        name = str(getattr(detector, "name", type(detector).__name__))
+        raise InputError(f"detector {name} does not tell how uncertain its boxes are: let policies send detections")
+    return detector.box_errors
 
 
 @runtime_checkable

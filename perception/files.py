@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import zipfile
@@ -12,6 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sortie.perception.budget import CODEBOOK_BYTES
+from sortie.perception.errors import InputError
 
 _MOST_DEFLATED = 1040
 """Deflate makes at most so many bytes of one, and a little more at a stream's begin and end."""
@@ -56,3 +60,15 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         stream.seek(0)
         with np.load(stream, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
+
+
+def codebook_digest(path: Path) -> str:
+    """What a codebook's file is named by on the wire: 14 digits of a hash of its bytes.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        return hashlib.blake2b(path.read_bytes(), digest_size=CODEBOOK_BYTES - 1).hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read as a codebook ({error.strerror})") from None

@@ -5,6 +5,10 @@ stays, and the false positives of all drones add up. Averaging puts a car at the
 score. Its score is the mean over all drones that looked there, also those that saw nothing (weighted boxes fusion: R.
 Solovyev, W. Wang, T. Gabruseva, Image and Vision Computing 107, 2021).
 
+Boxes with uncertainty are joined by covariance intersection, whichever rule is chosen (`sortie.perception.intersection`):
+a car's place follows from the places and covariances of its boxes, all else as in averaging. A covariance grows with the
+age of its box, by what cars may have moved.
+
 Boxes of one class are joined, never those of two. Boxes of people are one person's where they lie within `NEAR_M` and come
 from different drones.
 
@@ -23,7 +27,9 @@ from numpy.typing import NDArray
 
 from sortie.perception import budget
 from sortie.perception.classes import PERSON
+from sortie.perception.errors import InputError
 from sortie.perception.geometry import in_square
+from sortie.perception.intersection import intersect, inverse
 from sortie.perception.lateness import (
     movement,
     moving_m2,
@@ -39,6 +45,7 @@ from sortie.perception.metrics.ap import best_first, rivals, standing
 from sortie.perception.metrics.overlap import close_people
 from sortie.perception.tracking.following import boxes_of, motion_of, motion_of_boxes
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.perception.uncertainty import BoxErrors
 from sortie.scenarios.disc import Disc
 
 NMS_IOU = 0.15
@@ -74,12 +81,19 @@ class SourceBoxes:
     """[n, 2] velocity of each box, ENU: it is moved by velocity × age before it is joined. NaN or None: it stays."""
     variance_m2: NDArray[np.floating] | None = None
     """[n] variance of each place along each axis at the fusion, after that move. NaN or None: by the age."""
+    covariance_m2: NDArray[np.floating] | None = None
+    """[n, 3] covariance of each place at the capture, as it was sent: east, east–north, north. None: boxes without one."""
 
 
-def source_of(share: Share, alone: Boxes | None) -> SourceBoxes:
+def source_of(share: Share, alone: Boxes | None, errors: BoxErrors | None = None) -> SourceBoxes:
     """The boxes in a share, and how they move: tracks by their own velocity, boxes by that of the receiver's tracks of them.
 
-    Args: `alone`: the sender's own boxes, best first; None where the share brings its own (`Share.is_detected`).
+    Args:
+        alone: the sender's own boxes, best first; None where the share brings its own (`Share.is_detected`).
+        errors: how uncertain the detector's boxes are; those of a share that brings its own boxes go first.
+
+    Raises:
+        InputError: boxes with uncertainty from a detector of which nobody knows how uncertain they are.
     """
     where = share.weight, share.capture.est_pose, share.roi
     tracks, age_s = share.tracks, share.age_s
@@ -93,8 +107,14 @@ def source_of(share: Share, alone: Boxes | None) -> SourceBoxes:
     if share.representation == "tracks":
         truncated = len(boxes) > budget.MAX_TRACKS
         boxes = boxes.take(np.arange(min(len(boxes), budget.MAX_TRACKS)))
-    motion = (None, None) if tracks is None else motion_of_boxes(boxes, share.capture.t_s, age_s, tracks)
-    return SourceBoxes(boxes, *where, truncated, age_s, *motion)
+    velocity, variance = (None, None) if tracks is None else motion_of_boxes(boxes, share.capture.t_s, age_s, tracks)
+    covariance = None
+    if share.representation == "uncertain_boxes":
+        errors = share.errors or errors
+        if errors is None:
+            raise InputError("this detector does not tell how uncertain its boxes are: let policies send detections")
+        covariance = errors.covariances_m2(boxes, share.capture.est_pose)
+    return SourceBoxes(boxes, *where, truncated, age_s, velocity, variance, covariance)
 
 
 def sendable(boxes: Boxes) -> Boxes:
@@ -116,6 +136,8 @@ class EgoSources(NamedTuple):
     """From its own capture to the fusion."""
     looked: bool = True
     """False: a drone without a look of its own. Its silence means nothing."""
+    errors: BoxErrors | None = None
+    """How uncertain its own boxes are, where it joins them with covariances."""
 
     @classmethod
     def of(
@@ -127,7 +149,8 @@ class EgoSources(NamedTuple):
     def sources(self) -> list[SourceBoxes]:
         """Its own boxes, if it has any, and those of the peers that count."""
         weight = OWN_WEIGHT if self.fused else 1.0
-        own = [SourceBoxes(self.own, weight, self.pose, age_s=self.age_s)] if self.looked else []
+        known = None if self.errors is None else self.errors.covariances_m2(self.own, self.pose)
+        own = [SourceBoxes(self.own, weight, self.pose, age_s=self.age_s, covariance_m2=known)] if self.looked else []
         return own + [o for o in self.others if o.weight > 0.0]
 
     @property
@@ -141,7 +164,7 @@ def joined(pose: Pose, own: Boxes, fused: bool, others: Sequence[SourceBoxes], r
     return joined_many([EgoSources(pose, own, fused, others)], rule)[0]
 
 
-def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
+def joined_many(egos: Sequence[EgoSources], rule: Rule, common: float | None = None) -> list[Boxes]:
     """Each ego's boxes joined with its peers', in the world, best first; boxes outside the ego's square are dropped.
 
     Args:
@@ -149,7 +172,25 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
         rule: `nms`: of boxes that overlap by more than `NMS_IOU` the best stays, after scores are multiplied by weight and
             by what their age leaves of them. `average`: the mean place, size and heading of those boxes, by weight, score
             and precision. The score is the mean over all drones that looked there, and no more than weight and age leave.
+        common: the share of a variance that several drones' errors may have in common, in covariance intersection. None:
+            as fitted to the ego's detector.
     """
+    exact = [any(s.covariance_m2 is not None for s in ego.others) for ego in egos]
+    if not any(exact):
+        return _joined_many(egos, rule)
+    out = [Boxes.empty()] * len(egos)
+    for which, its_rule in ((False, rule), (True, "average")):
+        at = [k for k, is_exact in enumerate(exact) if is_exact == which]
+        several = _joined_many([egos[k] for k in at], its_rule, common, exact=which)
+        for k, boxes in zip(at, several, strict=True):
+            out[k] = boxes
+    return out
+
+
+def _joined_many(
+    egos: Sequence[EgoSources], rule: Rule, common: float | None = None, *, exact: bool = False
+) -> list[Boxes]:
+    """`joined_many` of egos all of which join by covariances (`exact`), or none."""
     out = [ego.own for ego in egos]
     receivers = [k for k, ego in enumerate(egos) if ego.others]
     if not receivers:
@@ -169,6 +210,7 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
     here = in_square(boxes.xy_m, np.array([egos[k].pose for k in receivers])[ego][:, None])[:, 0]
     boxes, source, ego, known = boxes.take(here), source[here], ego[here], known[here]
     left = _left(boxes, np.array([s.age_s for s in every])[source], freshest_s[source], known)
+    covariance = np.concatenate([_covariances(s) for s in every])[here] if exact else None
     weight = np.array([s.weight for s in every])[source]
     if rule == "nms":
         score = (boxes.score * (np.minimum(weight, 1.0) * left)).astype(np.float32)
@@ -177,6 +219,7 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
     else:
         order = best_first(boxes.score * weight * left, ego)
     boxes, source, ego, left, known = boxes.take(order), source[order], ego[order], left[order], known[order]
+    covariance = None if covariance is None else covariance[order]
     i, j = _of_one_thing(boxes, source, ego)
     kept = standing(len(ego), i, j)
     ends = np.searchsorted(ego, np.arange(len(receivers) + 1))
@@ -193,7 +236,14 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
     for n, (k, a, b) in enumerate(zip(receivers, ends, ends[1:], strict=False)):
         some = slice(a, b)
         if a < b:
-            members = _Members(group[some] - group[a], source[some] - first[n], left[some], known[some])
+            information, shared = None, 1.0
+            if covariance is not None:
+                information = weight[order][some, None] * inverse(covariance[some])
+                fitted = egos[k].errors
+                shared = common if common is not None else 1.0 if fitted is None else fitted.common
+            members = _Members(
+                group[some] - group[a], source[some] - first[n], left[some], known[some], information, shared
+            )
             out[k] = _averaged(boxes.take(some), members, sources_of[n], float(freshest_s[first[n]]))
         else:
             out[k] = Boxes.empty()
@@ -226,6 +276,22 @@ def _given(values: NDArray[np.floating] | None, count: int) -> Floats:
     return np.full(count, np.nan) if values is None else np.asarray(values, np.float64)
 
 
+def _covariances(source: SourceBoxes) -> Floats:
+    """[n, 3] the covariance of each place of a source at the fusion.
+
+    What was sent grows by what may have moved since. Boxes without a covariance have the usual one of their class.
+    """
+    boxes = source.boxes
+    of = movement(boxes.kind)
+    known = _given(source.variance_m2, len(boxes))
+    now = np.where(np.isnan(known), variance_m2(source.age_s, of), known)
+    if source.covariance_m2 is None:
+        return np.stack([now, np.zeros_like(now), now], axis=1)
+    grown = np.maximum(now - of.sigma0_m2, 0.0)
+    sent = np.asarray(source.covariance_m2, np.float64)
+    return np.asarray(sent + np.stack([grown, np.zeros_like(grown), grown], axis=1))
+
+
 def _left(boxes: Boxes, age_s: Floats, freshest_s: Floats, known_m2: Floats) -> Floats:
     """What lateness leaves of each box's score, [n]: 1 for the freshest.
 
@@ -248,6 +314,10 @@ class _Members(NamedTuple):
     """What lateness leaves of its score."""
     known_m2: Floats
     """The variance of its place where it is known, else NaN."""
+    information: Floats | None = None
+    """[n, 3] inverse covariance of its place, times its source's weight; None joins places by score and age."""
+    common: float = 1.0
+    """The share of a variance that several sources may have in common."""
 
     def precisions(self, boxes: Boxes, age_s: Floats, freshest_s: float) -> tuple[Floats, Floats]:
         """What each place counts in a mean, and each score in a vote, [n] each.
@@ -280,7 +350,11 @@ def _averaged(boxes: Boxes, of: _Members, sources: Sequence[SourceBoxes], freshe
     def mean(values: NDArray[np.floating]) -> NDArray[np.float64]:
         return np.bincount(group, weight * values, count) / total
 
-    xy = np.stack([mean(v) for v in boxes.xy_m.T], axis=1)
+    if of.information is None:
+        xy = np.stack([mean(v) for v in boxes.xy_m.T], axis=1)
+    else:
+        centre = boxes.xy_m[0].astype(np.float64)  # relative to one of them: places are far from the origin
+        xy = intersect(boxes.xy_m - centre, of.information, group, of.common).xy_m + centre
     size = np.stack([mean(v) for v in boxes.size_m.T], axis=1)
     # front and back look alike: headings are averaged as axes, and point where the best box does
     twice = 2.0 * boxes.yaw_rad.astype(np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from sortie.perception.geometry import USUAL, Cameras, to_world
 from sortie.perception.motion import Tracks
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import MAP_NAMES
+
+if TYPE_CHECKING:
+    from sortie.perception.uncertainty import BoxErrors
 
 
 class Capture(NamedTuple):
@@ -56,7 +59,7 @@ class Share(NamedTuple):
 
     capture: Capture
     representation: str
-    """features, detections, tracks or raw."""
+    """A name of `scenarios.representation`, except none."""
     rho: float
     roi: Disc | None
     """Its region of interest; None is everywhere."""
@@ -67,11 +70,13 @@ class Share(NamedTuple):
     age_s: float = 0.0
     """From the capture to the fusion, as the receiver knows it. What it leaves of a share is in `perception.lateness`."""
     tracks: Tracks | None = None
-    """Of a payload of tracks: the tracks that came. Of detections: the receiver's own tracks, which say how late boxes move."""
+    """Of a payload of tracks: the tracks that came. Of boxes: the receiver's own tracks, which say how late boxes move."""
     boxes: Boxes | None = None
     """The sender's own boxes, best first, where another network than the receiver's made them."""
     people: Boxes | None = None
     """People that the sender's thermal camera found; None where the payload has none to give."""
+    errors: BoxErrors | None = None
+    """How uncertain the places of `boxes` are, where they are sent with covariances."""
 
     @property
     def is_map(self) -> bool:

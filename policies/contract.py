@@ -123,6 +123,11 @@ class Descriptor(NamedTuple):
     """The members that this drone knows, and whom its goodputs belong to. None: it publishes no roster.
 
     An optional field, as `feature_space`."""
+    codebook: str = ""
+    """Digest of the codebook that this drone's codes are of; only codes of one codebook can be read. Empty: the fleet's
+    common one.
+
+    An optional field, as `feature_space`."""
 
     @property
     def coverage_corner(self) -> tuple[int, int]:
@@ -271,6 +276,11 @@ class FleetView(NamedTuple):
         me, other = self.me, self.descriptors.get(peer)
         return me is None or other is None or me.feature_space == other.feature_space
 
+    def shares_codes_with(self, peer: int) -> bool:
+        """Whether the ego and a peer can read each other's codes: maps of one network through one codebook."""
+        me, other = self.me, self.descriptors.get(peer)
+        return self.shares_features_with(peer) and (me is None or other is None or me.codebook == other.codebook)
+
 
 class Directive(NamedTuple):
     """One policy decision for one outgoing link (36 B on the wire).
@@ -282,7 +292,7 @@ class Directive(NamedTuple):
     destination: int
     representation: Representation = Representation.NONE
     rho: float = 0.0
-    """At most this share of the source's feature cells is sent on the link, 0 … 1."""
+    """At most this share of the source's feature cells is sent on the link, as features or as codes, 0 … 1."""
     roi: Disc | None = None
     """Only cells, boxes or tracks inside; None is everywhere."""
     rate_hz: float = 0.0
@@ -352,11 +362,12 @@ def looks_from(viewpoint: Callable[..., Reposition | None]) -> Callable[[AnyPoli
 
 
 OTHER_NETWORK = "another network: it cannot fuse this drone's maps"
-_FEATURES, _DETECTIONS = Representation.FEATURES, Representation.DETECTIONS  # slow to look up, each time
+# slow to look up, each time
+_FEATURES, _CODES, _DETECTIONS = Representation.FEATURES, Representation.CODES, Representation.DETECTIONS
 
 
 def boxes_across_networks(policy: AnyPolicy) -> AnyPolicy:
-    """Let a policy send detections where it would send features to a drone with another network.
+    """Let a policy send detections where it would send features or codes to a drone with another network or codebook.
 
     Region, rate, deadline, weight and duty stay as the policy decided. A peer of the same feature space gets what the
     policy decided.
@@ -366,7 +377,9 @@ def boxes_across_networks(policy: AnyPolicy) -> AnyPolicy:
     def decide(view: FleetView, **params: object) -> Sequence[Directive]:
         directives = policy(view, **params)
         foreign = [
-            d.representation == _FEATURES and not view.shares_features_with(d.destination) for d in directives
+            (d.representation == _FEATURES and not view.shares_features_with(d.destination))
+            or (d.representation == _CODES and not view.shares_codes_with(d.destination))
+            for d in directives
         ]  # fmt: skip
         if not any(foreign):
             return directives

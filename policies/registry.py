@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from sortie.policies.catalogue import adaptive, baselines
+from sortie.policies.catalogue import adaptive, baselines, other_representations
 from sortie.policies.catalogue.deputies import deputies
 from sortie.policies.catalogue.prior import METHODS, STAND_IN
 from sortie.policies.catalogue.vantage import vantage
@@ -33,6 +33,8 @@ POLICIES: Mapping[str, Callable[..., Sequence[Directive]]] = MappingProxyType({
     "random-2-receivers": baselines.random_k_receivers,
     "silence": baselines.silence,
     "boxes": adaptive.boxes,
+    "uncertain-boxes": other_representations.uncertain_boxes,
+    "codes": other_representations.codes,
     "deputies": deputies,
     "adaptive": adaptive.adaptive,
     "learned": adaptive.learned,

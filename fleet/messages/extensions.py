@@ -30,6 +30,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from sortie.fleet.messages.cdr import MalformedDatagram
+from sortie.perception.budget import CODEBOOK_BYTES
 from sortie.policies.contract import Descriptor, Roster, TaskPhase
 from sortie.scenarios.errors import SortieError
 
@@ -38,6 +39,9 @@ MAX_AGENT_ID = 254
 VERSION = 2
 """Of the descriptors that this code writes with a block. Descriptors without one are version 1, the paper's."""
 _HEAD = struct.Struct("<BH")
+_DIGEST_BYTES = CODEBOOK_BYTES - 1
+"""Of a codebook: what a payload of codes begins with as well."""
+_CODEBOOK = re.compile(f"[0-9a-f]{{{2 * _DIGEST_BYTES}}}", re.ASCII)
 _FEATURE_SPACE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,31}", re.ASCII)
 
 
@@ -92,6 +96,18 @@ def _encode_roster(roster: Roster) -> bytes:
     return epoch.to_bytes(4, "little") + sum(1 << i for i in members).to_bytes(members[-1] // 8 + 1, "little")
 
 
+def _encode_codebook(digest: str) -> bytes:
+    if not _CODEBOOK.fullmatch(digest):
+        raise ValueError(f"codebook is {digest!r}, must be {2 * _DIGEST_BYTES} digits of a hexadecimal number")
+    return bytes.fromhex(digest)
+
+
+def _decode_codebook(value: bytes) -> str:
+    if len(value) != _DIGEST_BYTES:
+        raise MalformedDatagram(f"codebook has {len(value)} B, must have {_DIGEST_BYTES}")
+    return value.hex()
+
+
 @lru_cache(maxsize=1024)  # it changes seldom
 def _decode_roster(value: bytes) -> Roster:
     bits = int.from_bytes(value[4:], "little")
@@ -104,6 +120,7 @@ def _decode_roster(value: bytes) -> Roster:
 FIELDS: tuple[ExtensionField, ...] = (
     ExtensionField("feature_space", 1, _encode_feature_space, _decode_feature_space),
     ExtensionField("roster", 2, _encode_roster, _decode_roster),
+    ExtensionField("codebook", 3, _encode_codebook, _decode_codebook),
 )
 """Every optional field that this version knows, by ascending type."""
 _BY_NUMBER = {field.number: field for field in FIELDS}

@@ -31,6 +31,7 @@ from sortie.policies.contract import (
     Disc,
     Representation,
 )
+from sortie.scenarios.representation import LEVELS
 
 _MSGS = files("sortie.fleet") / "sortie_msgs" / "msg"
 DESCRIPTOR_NAME, DIRECTIVE_NAME = "sortie_msgs/msg/ContextDescriptor", "sortie_msgs/msg/DataPlaneDirective"
@@ -55,6 +56,7 @@ def _descriptor_layout(peers: int, targets: int) -> struct.Struct:
 
 MIN_DESCRIPTOR_BYTES = _descriptor_layout(0, 0).size
 DIRECTIVE_BYTES = _DIRECTIVE.size
+_NUMBERS = {name: bound for name, bound in DIRECTIVE_BOUNDS.items() if name != "representation"}
 
 
 def descriptor_bytes(drones: int, targets: int = 0) -> int:
@@ -212,7 +214,9 @@ def decode_directive(data: bytes) -> Directive:
         raise MalformedDatagram("a float is not finite")
     if source > MAX_AGENT_ID or destination > MAX_AGENT_ID or source == destination:
         raise MalformedDatagram(f"link {source}→{destination} is none")
-    for (name, bound), value in zip(DIRECTIVE_BOUNDS.items(), (rung, rho, rate, deadline, weight, duty), strict=True):
+    if rung not in LEVELS:
+        raise MalformedDatagram(f"representation is {rung}, must be in [0, {max(LEVELS)}]")
+    for (name, bound), value in zip(_NUMBERS.items(), (rho, rate, deadline, weight, duty), strict=True):
         wrong = bound.breaks(name, value)
         if wrong is not None:
             raise MalformedDatagram(wrong)

@@ -15,6 +15,7 @@ from sortie.perception.evaluation.condition import CellsBy
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
 from sortie.perception.geometry import Geometry
 from sortie.perception.network.checkpoint import load_weights
+from sortie.perception.network.codebook import Codebook
 from sortie.perception.network.decode import decode
 from sortie.perception.network.fusion.base import PerCell
 from sortie.perception.network.fusion.disconet import DiscoNet
@@ -31,11 +32,24 @@ BATCH = 5
 class CarNetInstrument:
     """A network on frames that carry `images` uint8 [n, d, 4, 256, 256]."""
 
-    def __init__(self, net: CarNet, device: torch.device = CPU, fusion_params: Params | None = None) -> None:
-        """Args: `fusion_params` change how the network's fusion mixes (`Fusion.tune`)."""
+    def __init__(
+        self,
+        net: CarNet,
+        device: torch.device = CPU,
+        fusion_params: Params | None = None,
+        codebook: Codebook | None = None,
+        code_bytes: int = 0,
+    ) -> None:
+        """Args:
+        fusion_params: change how the network's fusion mixes (`Fusion.tune`).
+        codebook: peers send cells as its codes of `code_bytes` bytes; None sends features.
+        """
         params = fusion_params or {}
         net.fusion.tune(**params)
         self.fingerprint = fingerprint(net) + "".join(f" {k}={v!r}" for k, v in sorted(params.items()))
+        if codebook is not None:
+            self.fingerprint += f" codes {codebook.digest} {code_bytes}"
+        self._codebook, self._code_bytes = codebook, code_bytes
         self.geometry: Geometry = net.config.geometry
         self.fused_cells = net.config.fused_cells
         """Cells along a side of the maps that are fused."""
@@ -56,9 +70,11 @@ class CarNetInstrument:
     def look(self, frames: FleetFrames, frame: int) -> CarNetView:
         images = torch.from_numpy(np.ascontiguousarray(frames.images[frame]))  # type: ignore[attr-defined]
         est = frames.est_pose[frame] - np.array([*frames.est_pose[frame].mean(axis=0)[:2], 0.0])
-        return CarNetView(
-            self._net, self._net.encoder(images.to(self._device)), torch.from_numpy(est).float().to(self._device)
-        )
+        features = self._net.encoder(images.to(self._device))
+        read = None
+        if self._codebook is not None:
+            read = torch.stack([self._codebook.read(one.cpu(), self._code_bytes) for one in features]).to(self._device)
+        return CarNetView(self._net, features, torch.from_numpy(est).float().to(self._device), read)
 
 
 def fingerprint(net: CarNet) -> str:
@@ -77,13 +93,19 @@ class CarNetView:
     ego's own or, where silent peers count as zeros, the ego fused with that many zeros, computed once per view.
     """
 
-    def __init__(self, net: CarNet, features: torch.Tensor, est: torch.Tensor) -> None:
+    def __init__(
+        self, net: CarNet, features: torch.Tensor, est: torch.Tensor, read: torch.Tensor | None = None
+    ) -> None:
+        """Args: `read` are the features as peers read them, where they are sent otherwise than as they are."""
         self._net, self._est = net, est
         self.features = features
         """[d, 80, 64, 64]: every drone's, on its own grid."""
         self._maps: torch.Tensor = net.spread(features)
         self._n = net.config.fused_cells
         self._table = self._maps.permute(0, 2, 3, 1).reshape(-1, self._maps.shape[1])
+        self._theirs = self._table
+        if read is not None:
+            self._theirs = net.spread(read).permute(0, 2, 3, 1).reshape(self._table.shape)
         self._under: dict[int, Support] = {}
         self._silent: dict[tuple[int, tuple[int, ...]], torch.Tensor] = {}
 
@@ -165,7 +187,7 @@ class CarNetView:
         k = len(e.peers)
         first = torch.tensor(e.peers, device=at.device)[:, None, None] * self._n**2
         taps = under.cells.view(k, -1, 4)[:, at] + first
-        moved = rows(self._table, taps.view(-1, 4), weights.view(k, -1, 4)[:, at].view(-1, 4))
+        moved = rows(self._theirs, taps.view(-1, 4), weights.view(k, -1, 4)[:, at].view(-1, 4))
         said: torch.Tensor = self._net.aligned(
             moved.view(k, len(at), -1), under.offset.view(k, -1, 2)[:, at], under.turn
         )

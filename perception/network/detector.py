@@ -11,6 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,6 +29,8 @@ from sortie.perception.lateness import weighed
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.network.bev import lift
 from sortie.perception.network.checkpoint import load_weights
+from sortie.perception.network.codebook import Codebook, load_codebook
+from sortie.perception.network.codebook import beside as codebook_beside
 from sortie.perception.network.decode import decode
 from sortie.perception.network.fusion.base import Shares, takes_part
 from sortie.perception.network.fusion.own import OwnFusion
@@ -39,7 +42,10 @@ from sortie.perception.scene.render import Renderer, views_shape
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Bytes
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.perception.uncertainty import BoxErrors, load_errors
+from sortie.perception.uncertainty import beside as errors_beside
 from sortie.scenarios.disc import Disc
+from sortie.scenarios.representation import CELL_NAMES
 from sortie.scenarios.schema import Perception
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -57,6 +63,10 @@ def shipped(fusion: str) -> Path:
     return SHIPPED_WEIGHTS if own else WEIGHTS / f"{fusion}.safetensors"
 
 
+Part = tuple[float, Disc | None, tuple[int, ...], bool]
+"""Which cells a share holds: ρ, region and ranks that are missing, and whether they are codes."""
+
+
 @dataclass(slots=True)
 class _Encoded:
     """The results for one capture, computed or under way: its features [80, 64, 64], and on demand its boxes without peers."""
@@ -67,8 +77,10 @@ class _Encoded:
     out: Future[Tensor] | None = None
     """The head's output [planes, 128, 128] without peers."""
     boxes: Future[Boxes] | None = None
-    in_part: dict[tuple[float, Disc | None, tuple[int, ...]], Future[Tensor]] = field(default_factory=dict)
+    in_part: dict[Part, Future[Tensor]] = field(default_factory=dict)
     """The head's output from the cells that a budget lets through alone, for late fusion of shared maps."""
+    coded: dict[Part, Future[Tensor]] = field(default_factory=dict)
+    """The features as receivers read them from the codes of those cells."""
 
 
 Known = Mapping[Capture, _Encoded]
@@ -113,6 +125,7 @@ class TorchDetector:
                 f"{path}: made for ±{net.config.half_extent_m:g} m, a sortie flies ±{FULL.half_extent_m:g} m"
             )
         keep_freed()
+        self._weights, self._loaded = path, net
         self._net = folded(net)
         self._renderer = Renderer(scene, seed, replication)
         self._kept: OrderedDict[Capture, _Encoded] = OrderedDict()
@@ -148,6 +161,9 @@ class TorchDetector:
                 self._look_alone(capture)
             else:
                 self._head_alone(capture)
+        for share in shared:
+            if share.representation == "codes":
+                self._read_codes(share, known)
         if self._shares == "boxes":
             for share in shared:
                 if share.is_map:
@@ -229,7 +245,7 @@ class TorchDetector:
 
     def _must_rank(self, share: Share) -> bool:
         """Whether the sender's own head is needed to choose the cells it sent."""
-        if share.representation != "features" or self._config.cells_by != "confidence":
+        if share.representation not in CELL_NAMES or self._config.cells_by != "confidence":
             return False
         return _is_ranked(share)
 
@@ -294,7 +310,10 @@ class TorchDetector:
         else:
             own = self._place(self._head(known[ego].maps.result()[None]), ego.est_pose)
         late = [self._source(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
-        return joined_many([EgoSources.of(ego, shares, own, out is not None, late)], self._config.join)[0]
+        sources = EgoSources.of(ego, shares, own, out is not None, late)
+        if any(s.covariance_m2 is not None for s in late):
+            sources = sources._replace(errors=self.box_errors)
+        return joined_many([sources], self._config.join, self._config.common_share)[0]
 
     def _silent(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture]) -> list[Capture]:
         """The other drones of the moment that count as zeros because no map of theirs came."""
@@ -329,7 +348,7 @@ class TorchDetector:
         part = takes_part(arrived[None], under.inside[None], weight, self._config.unsent_cells)
         if not bool(part[:, 1:].any()):
             return None
-        theirs = [known[s.capture].maps.result() for s in maps]
+        theirs = [self._map(s, known).result() for s in maps]
         theirs += [torch.zeros(config.fused_channels, config.fused_cells, config.fused_cells)] * len(silent)
         tables = [each.permute(1, 2, 0).flatten(0, 1) for each in theirs]
         taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), strict=True))
@@ -367,6 +386,49 @@ class TorchDetector:
         fused: Tensor = self._net.fusion.fuse(own, said, there, weights)
         return fused
 
+    def _map(self, share: Share, known: Known) -> Future[Tensor]:
+        """The map of a share as it is fused."""
+        kept = known[share.capture]
+        return kept.coded[_part(share)] if share.representation == "codes" else kept.maps
+
+    def _read_codes(self, share: Share, known: Known) -> None:
+        """What receivers read from the codes of a share, computed once per capture and budget."""
+        kept, part = known[share.capture], _part(share)
+        if part in kept.coded:
+            return
+        codebook, length = self._codebook, self._config.code_bytes
+
+        def read() -> Tensor:
+            return codebook.read(kept.features.result(), length, self._sent(share, known)[0])
+
+        features = self._task(read)
+        kept.coded[part] = self._spread(features) if self._shares == "features" else features
+
+    @cached_property
+    def _codebook(self) -> Codebook:
+        """The codebook of the network's features.
+
+        Raises:
+            InputError: a codebook that is missing, or of another network, or that has no codes of this length.
+        """
+        named = self._config.codebook
+        path = codebook_beside(self._weights) if named is None else Path(named)
+        found = load_codebook(path, self._loaded)
+        if self._config.code_bytes > found.longest:
+            raise InputError(
+                f"perception.code_bytes is {self._config.code_bytes}, must be at most {found.longest}, the stages of {path}"
+            )
+        return found
+
+    @cached_property
+    def box_errors(self) -> BoxErrors:
+        """How uncertain the boxes of a drone alone are.
+
+        Raises:
+            InputError: nobody fitted it for these weights.
+        """
+        return load_errors(errors_beside(self._weights), self._weights.name)
+
     def _map_pose(self, share: Share, now: Mapping[int, Capture]) -> Pose:
         """The pose that places a share's map in the world."""
         capture = share.capture if self._config.motion_compensation else now.get(share.capture.drone, share.capture)
@@ -380,11 +442,12 @@ class TorchDetector:
             cut = share.representation != "raw" and _is_ranked(share)
             boxes = self._sendable(self._place(out, lies))
             return SourceBoxes(boxes, share.weight, lies, part[1], cut, share.age_s)
+        errors = self.box_errors if share.representation == "uncertain_boxes" else None
         if not share.is_detected:
-            return source_of(share, None)
+            return source_of(share, None, errors)
         alone = known[share.capture].boxes
         assert alone is not None  # noqa: S101 (requested with the job)
-        return source_of(share, self._sendable(alone.result()))
+        return source_of(share, self._sendable(alone.result()), errors)
 
     def _sendable(self, boxes: Boxes) -> Boxes:
         """Those of a drone's boxes that it sends: in late fusion only confident ones."""
@@ -397,10 +460,12 @@ class TorchDetector:
             return
 
         out = kept.out  # as it stands: a task waits for none behind it
+        is_coded = share.representation == "codes"
 
         def head() -> Tensor:
-            features, sent = kept.features.result(), self._sent(share, known)
-            if out is not None and bool(sent.all()):
+            features = (kept.coded[_part(share)] if is_coded else kept.features).result()
+            sent = self._sent(share, known)
+            if out is not None and bool(sent.all()) and not is_coded:
                 return out.result()
             with self._autocast():
                 maps: Tensor = self._net.spread((features * sent)[None]).float()
@@ -409,8 +474,10 @@ class TorchDetector:
         kept.in_part[_part(share)] = self._task(head)
 
 
-def _part(share: Share) -> tuple[float, Disc | None, tuple[int, ...]]:
-    return (1.0, None, ()) if share.representation == "raw" else (share.rho, share.roi, share.missing)
+def _part(share: Share) -> Part:
+    if share.representation == "raw":
+        return 1.0, None, (), False
+    return share.rho, share.roi, share.missing, share.representation == "codes"
 
 
 def _is_ranked(share: Share) -> bool:

@@ -90,6 +90,9 @@ class RecordedDetector:
         if self._fuse is not None:
             shares = weighed(ego, shares)
         weighted = [s for s in shares if s.weight > 0.0]
+        for s in weighted:
+            if s.representation == "codes":
+                raise InputError("a recording has no codebook: let policies send features")
         maps = [self._sent(s, now) for s in weighted if s.is_map]
         if self._fuse is not None and maps and ego.looked:
             local = fused(self._fuse, self._recording, at, pose, maps, config.unsent_cells)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ from sortie.perception.surrogate.hashing import mixed, uniform
 from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
 from sortie.perception.surrogate.shared_false_positives import SharedFalsePositives
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.perception.uncertainty import BoxErrors, beside, load_errors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
@@ -75,7 +77,7 @@ class SurrogateDetector:
         self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None, replication: int = 0
     ) -> None:
         path = SHIPPED if weights is None else weights
-        self._set(scene, config, load(path), seed, replication, scene.config.seed, str(path))
+        self._set(scene, config, load(path), seed, replication, scene.config.seed, path)
 
     @classmethod
     def of(
@@ -85,7 +87,7 @@ class SurrogateDetector:
         the same for all sorties over it. `eyes` are the scene's, where they are at hand."""
         made = cls.__new__(cls)
         seed, town = scene.config.seed, scene.config.seed + (draw << 40)
-        made._set(scene, config, parameters, seed, draw, town, "the calibration", eyes)
+        made._set(scene, config, parameters, seed, draw, town, SHIPPED, eyes)
         return made
 
     def _set(
@@ -96,9 +98,10 @@ class SurrogateDetector:
         seed: int,
         replication: int,
         town: int,
-        name: str,
+        path: Path,
         eyes: Eyes | None = None,
     ) -> None:
+        name = str(path)
         fitted = str(parameters.card["fusion"])
         if config.fusion not in (fitted, "none"):
             raise InputError(
@@ -112,7 +115,7 @@ class SurrogateDetector:
             raise InputError(
                 f"perception.absent_peers is {config.absent_peers!r}: {name} was calibrated without them, must be excluded"
             )
-        self.parameters, self.calibration = parameters, parameters.id
+        self.parameters, self.calibration, self._path = parameters, parameters.id, path
         self._scene, self._config = scene, config
         self._eyes = eyes or Eyes(scene)
         self._draw_source = DrawSource(seed, replication, town, self._eyes.traffic.count, parameters.alike)
@@ -121,6 +124,15 @@ class SurrogateDetector:
         at = max(config.score_threshold, float(threshold[0]))
         self._found_alone, self._alarms_alone = (float(np.interp(at, threshold, y)) for y in (found, false_positives))
         """Of a drone alone: the share of the cars that it finds, and its number of false positives."""
+
+    @cached_property
+    def box_errors(self) -> BoxErrors:
+        """How uncertain the boxes of a drone alone are.
+
+        Raises:
+            InputError: nobody fitted it for this calibration.
+        """
+        return load_errors(beside(self._path), self._path.name)
 
     def detect(self, jobs: Sequence[Job]) -> list[Boxes]:
         """Each ego's boxes from its own look and the shares it received, ENU, best first."""
@@ -177,6 +189,11 @@ class SurrogateDetector:
     # --- one batch ---------------------------------------------------------------------------------
 
     def _detect(self, jobs: Sequence[tuple[Capture, Sequence[Share], dict[int, Capture]]]) -> BoxColumns:
+        if any(s.representation == "codes" and s.weight > 0.0 for _, shares, _ in jobs for s in shares):
+            raise InputError(
+                f"the surrogate cannot estimate what codes do: {self.calibration} was calibrated without them. "
+                "Set perception.detector to torch, or let policies send features"
+            )
         late = {s.capture: None for _, shares, _ in jobs for s in shares if s.is_detected and s.weight > 0.0}
         leads = {m: lead for m, (ego, shares, _) in enumerate(jobs) if not ego.looked and (lead := lead_of(shares))}
         queries: list[Job] = [(ego, shares) for ego, shares, _ in jobs]
@@ -217,12 +234,18 @@ class SurrogateDetector:
         sources = []
         for m, (own, (ego, shares, _), f) in enumerate(zip(boxes, jobs, with_maps, strict=False)):
             others = [
-                source_of(s, alone.get(s.capture) if s.is_detected else None)
+                source_of(
+                    s,
+                    alone.get(s.capture) if s.is_detected else None,
+                    self.box_errors if s.representation == "uncertain_boxes" else None,
+                )
                 for s in shares
                 if not s.is_map and s.weight > 0.0
             ]
-            sources.append(EgoSources.of(ego, shares, own, f or m in leads, others))
-        out = joined_many(sources, self._config.join)
+            of = EgoSources.of(ego, shares, own, f or m in leads, others)
+            exact = any(s.covariance_m2 is not None for s in others)
+            sources.append(of._replace(errors=self.box_errors) if exact else of)
+        out = joined_many(sources, self._config.join, self._config.common_share)
         return BoxColumns(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
 
     def _fuse(

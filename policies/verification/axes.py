@@ -46,6 +46,7 @@ FIELDS: dict[str, Axis | None] = {
     "priority_target_ids": Axis.MISSION,
     "feature_space": None,
     "roster": None,
+    "codebook": None,
     "counts": None,
 }
 """Which axis each field of a descriptor belongs to."""

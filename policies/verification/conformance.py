@@ -333,7 +333,7 @@ def _rise(old: Directive | None, d: Directive) -> str | None:
     if old is None:
         return "there was none before" if d.representation > 0 else None
     if d.representation > old.representation:
-        return f"representation rises from {int(old.representation)} to {int(d.representation)}"
+        return f"representation rises from {old.representation:d} to {d.representation:d}"
     if d.representation == old.representation and d.rho > old.rho:
         return f"rho rises from {old.rho} to {d.rho}"
     if d.rate_hz > old.rate_hz:
@@ -346,6 +346,8 @@ def _sends_maps_where_they_are_fused(policy: Policy, view: FleetView) -> str | N
     for d in _decide(policy, view):
         if d.representation == Representation.FEATURES and not view.shares_features_with(d.destination):
             return f"directive {d.source}→{d.destination}: features, must be boxes: the peer has another network"
+        if d.representation == Representation.CODES and not view.shares_codes_with(d.destination):
+            return f"directive {d.source}→{d.destination}: codes, must be boxes: the peer has another codebook"
     return None
 
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, Representation
 from sortie.policies.verification.compiled import Claim, Compare, Context, Part, Rule
+from sortie.scenarios.representation import AT_LEVEL, LEVELS
 
 LEAST_RATE_HZ = 2.0
 """The rate of a link that a shield makes carry something, if no line names a rate: the bottom rung of the paper's table."""
@@ -29,10 +30,15 @@ _HIGHEST: dict[str, float] = {
     "roi": 1.0,
 }
 _READ: dict[str, Callable[[Directive], Any]] = {
-    **{word: operator.itemgetter(Directive._fields.index(word)) for word in _HIGHEST if word not in ("duty", "roi")},
+    **{
+        word: operator.itemgetter(Directive._fields.index(word))
+        for word in ("rho", "rate_hz", "deadline_s", "fusion_weight")
+    },
+    "representation": lambda d: LEVELS[d.representation],
     "duty": lambda d: d.duty_percent / 100,
     "roi": lambda d: float(d.roi is not None),
 }
+_FIRST_LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0)
 Holds = Callable[[Directive], bool]
 Limit = tuple[Compare, float]
 """A comparison that a field must satisfy, and its other side."""
@@ -343,8 +349,10 @@ _PLAIN = (float, int, Representation)
 
 def _near(word: str, edges: Iterable[float]) -> list[float]:
     """Values at edges and on both sides of them, ascending."""
-    if word in ("representation", "roi"):
-        return [float(v) for v in range(int(_HIGHEST[word]) + 1)]
+    if word == "representation":  # uncertain boxes and codes only where a line names them: else a policy chooses them
+        return sorted({*_FIRST_LEVELS, *(float(e) for e in edges if e in AT_LEVEL)})
+    if word == "roi":
+        return [0.0, 1.0]
     found: set[float] = set()
     for edge in edges:
         if word == "duty" and math.isfinite(edge):
@@ -361,7 +369,7 @@ def _changed(before: Directive, wanted: Mapping[str, float], region: Disc | None
     changed: dict[str, Any] = {}
     for word, value in wanted.items():
         if word == "representation":
-            changed[word] = Representation(int(value))
+            changed[word] = AT_LEVEL[value]
         elif word == "duty":
             changed["duty_percent"] = round(value * 100)
         elif word == "roi":
@@ -372,8 +380,8 @@ def _changed(before: Directive, wanted: Mapping[str, float], region: Disc | None
             changed[word] = value
     rung = changed.get("representation")
     if rung is not None and rung != before.representation:
-        if rung < Representation.FEATURES and before.rho and "rho" not in changed:
-            changed["rho"] = 0.0  # only features have cells
+        if rung < Representation.CODES and before.rho and "rho" not in changed:
+            changed["rho"] = 0.0  # only codes and features have cells
         if rung > before.representation and before.rate_hz <= 0 and "rate_hz" not in changed:
             changed["rate_hz"] = LEAST_RATE_HZ  # a link at 0 Hz carries nothing
     return before._replace(**changed) if changed else before

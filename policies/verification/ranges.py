@@ -30,6 +30,7 @@ from sortie.scenarios.link_state import state_of
 Choose = Callable[[str, float, float], float]
 """Picks a number of an axis between its bounds."""
 
+OTHER_CODEBOOK = "0" * 14
 _FOOTPRINT_M = 42.0
 _SEARCHED_UP_TO: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
 
@@ -119,6 +120,7 @@ class FleetOfRanges:
                 region=Disc(number(names[0], 0.0), number(names[1], 0.0), number(names[2], 32.0)) if region else None,
                 priority_target_ids=tuple(range(int(targets))),
                 feature_space="" if path.picks.get(space_of(i), True) else "other",
+                codebook="" if path.picks.get(space_of(i, "codebook"), True) else OTHER_CODEBOOK,
             )
         ages_s = self._example_ages(choose)
         ids = path.picks.get(ORDER_IN_VIEW, self.heard)
@@ -215,6 +217,10 @@ class DescriptorOfRanges(Descriptor):
     @property
     def feature_space(self) -> Any:
         return Space(self._origin.system, self._origin.drone)
+
+    @property
+    def codebook(self) -> Any:
+        return Space(self._origin.system, self._origin.drone, "codebook")
 
     @property
     def novelty_flags(self) -> Any:

@@ -21,7 +21,7 @@ from sortie.policies.verification.compiled import Context, Rule, compiled
 from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, Recent, just_heard
 from sortie.policies.verification.nearest import Box, Far, distance, nearest
 from sortie.policies.verification.words import CHANGES
-from sortie.scenarios.representation import NAME_OF
+from sortie.scenarios.representation import LEVELS, NAME_OF
 
 MARK = "shield: "
 Cap = Callable[[Directive], Directive]
@@ -173,7 +173,7 @@ class _Boxes:
         if key not in self._boxes:
             answers = iter(applies)
             rules = [r for r in self._lines if not (r.when is not None and r.when_of_peer) or next(answers)]
-            bounds = None if most is None else {"representation": float(most[0]), "rate_hz": most[1]}
+            bounds = None if most is None else {"representation": float(LEVELS[most[0]]), "rate_hz": most[1]}
             self._boxes[key] = Box(rules, applies, self._context, self._some, bounds)
         return self._boxes[key]
 

@@ -142,25 +142,25 @@ class TargetIds:
 
 
 class Space:
-    """A drone's feature space, known only by whether it is the ego's."""
+    """A drone's feature space or codebook, known only by whether it is the ego's."""
 
-    def __init__(self, system: Any, agent_id: int) -> None:
-        self._system, self._id = system, agent_id
+    def __init__(self, system: Any, agent_id: int, field: str = "feature_space") -> None:
+        self._system, self._id, self._field = system, agent_id, field
 
     def __eq__(self, other: object) -> bool:
         path: Path = self._system.path
         ego: int = self._system.ego
-        if not isinstance(other, Space) or ego not in (self._id, other._id):
-            path.refuse("compares feature_space with anything but the ego's")
+        if not isinstance(other, Space) or ego not in (self._id, other._id) or self._field != other._field:
+            path.refuse(f"compares {self._field} with anything but the ego's")
         peer = other._id if self._id == ego else self._id
-        return peer == ego or path.pick(space_of(peer), (True, False))
+        return peer == ego or path.pick(space_of(peer, self._field), (True, False))
 
     def __ne__(self, other: object) -> bool:
         return not self.__eq__(other)
 
     def _cannot(self, *_: object, **__: object) -> NoReturn:
         path: Path = self._system.path
-        path.refuse("reads the name of a feature_space")
+        path.refuse(f"reads the name of a {self._field}")
 
     __hash__ = _cannot
 
@@ -185,8 +185,8 @@ for _kind, _refusal in (
 Sequence.register(TargetIds)  # a pattern of a sequence meets its length
 
 
-def space_of(peer: int) -> str:
-    return f"drone {peer} has the ego's feature_space"
+def space_of(peer: int, field: str = "feature_space") -> str:
+    return f"drone {peer} has the ego's {field}"
 
 
 def orders(peers: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:

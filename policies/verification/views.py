@@ -69,6 +69,8 @@ def draw_view(seed: int, number: int, drones: int | None = None) -> FleetView:
     if rng.random() < 0.25:  # all agree who is a member, heard by the ego or not
         members = tuple(i for i in range(n) if i in descriptors or rng.random() < 0.5)
         descriptors = {i: d.with_roster(Roster(int(rng.integers(9)), members)) for i, d in descriptors.items()}
+    if rng.random() < 0.25:  # and some codes are of another codebook
+        descriptors = {i: d._replace(codebook=str(rng.choice(["", "0" * 14]))) for i, d in descriptors.items()}
     return FleetView(ego, period_s, descriptors, age_s)
 
 
@@ -120,6 +122,7 @@ _PLAIN: dict[str, Any] = {
     "priority_target_ids": (),
     "feature_space": "",
     "roster": None,
+    "codebook": "",
     "task_phase": TaskPhase.SEARCH,
     "battery_soc": 1.0,
     "footprint_radius_m": 42.0,
@@ -170,6 +173,8 @@ def to_json(view: FleetView) -> str:
             "region": None if d.region is None else list(d.region),
             "roster": None if d.roster is None else d.roster._asdict(),
         }
+        if not d.codebook:  # as in texts from before there were codes
+            del fields["codebook"]
         drones.append(json.dumps({"age_s": view.age_s[i]} | fields))
     inner = ",\n  ".join(drones)
     usual = view.detached_after_periods == DETACHED_AFTER_PERIODS
@@ -245,6 +250,7 @@ def _descriptor(entry: dict[str, Any], where: str) -> Descriptor:
         priority_target_ids=tuple(int(t) for t in _numbers(entry, "priority_target_ids", where)),
         feature_space=_text(entry, "feature_space", where),
         roster=_roster(entry, where),
+        codebook=_text(entry, "codebook", where) if "codebook" in entry else "",
     )
 
 

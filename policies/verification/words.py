@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 from sortie.policies.contract import PERSON_FLAG, Descriptor, Directive, FleetView, TaskPhase
-from sortie.scenarios.representation import NAME_OF
+from sortie.scenarios.representation import LEVELS, NAME_OF
 
 Kind = Literal["number", "truth"]
 Span = float | Literal["dwell"]
@@ -63,8 +63,8 @@ def link_of(scope: Scope) -> Directive:
 
 DECISIONS: dict[str, Word] = {
     "representation": _decided(
-        "the rung: none, tracks, detections, features or raw",
-        lambda d: d.representation,
+        "the rung: none, tracks, detections, uncertain_boxes, codes, features or raw",
+        lambda d: LEVELS.get(d.representation, d.representation),
         "representation <= features",
     ),
     "rho": _decided("share of the sender's feature cells, 0 … 1", lambda d: d.rho, "rho <= 0.5"),
@@ -160,11 +160,17 @@ WORDS: dict[str, Word] = {
         "when not same_network: representation != features",
         "truth",
     ),
+    "same_codebook": _of_peer(
+        "the peer has the ego's network and codebook, so it can read the ego's codes",
+        lambda s, p: s.view.shares_codes_with(p),
+        "when not same_codebook: representation != codes",
+        "truth",
+    ),
     **DECISIONS,
 }
 """Every name that an invariant may use."""
 
-CONSTANTS: dict[str, int] = {name: int(r) for r, name in NAME_OF.items()} | {
+CONSTANTS: dict[str, float] = {name: r.level for r, name in NAME_OF.items()} | {
     "transit": TaskPhase.TRANSIT,
     "search": TaskPhase.SEARCH,
     "track": TaskPhase.TRACK,

@@ -20,8 +20,8 @@ from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import ModelName
 from sortie.scenarios.traces import located
 
-FIELDS = ("fleet.trace", "radio.trace", "perception.weights", "perception.recording")
-"""Fields that name a file; so do the weights of a make."""
+FIELDS = ("fleet.trace", "radio.trace", "perception.weights", "perception.codebook", "perception.recording")
+"""Fields that name a file; so do the weights and the codebook of a make."""
 MODELS = {
     "radio.path_loss": "path_loss",
     "radio.link": "link",
@@ -153,7 +153,7 @@ def _places(sections: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
     """Where files are named: the section and its key."""
     yield from _given(sections, FIELDS)
     for make in sections.get("fleet", {}).get("makes", ()):
-        yield from _given(make, ("weights",))
+        yield from _given(make, ("weights", "codebook"))
     for _, holder, key in _models(sections):
         if is_file(holder[key]):
             yield holder, key

@@ -219,6 +219,9 @@ class Make(Section):
     weights: str | None = Field(
         None, description="A network of its own, as perception.weights. Its maps are of another feature space."
     )
+    codebook: str | None = Field(
+        None, description="A codebook of its own, as perception.codebook. Only drones with the same one read its codes."
+    )
     compute_delay_s: float | None = Field(None, ge=0, le=5, description="In place of perception.compute_delay_s.")
     feature_space: str | None = Field(
         None,
@@ -241,6 +244,12 @@ class Network(NamedTuple):
     """A value of `perception.detector`; `none` for a drone that sends context alone."""
     weights: str | None
     """None takes the shipped ones."""
+    codebook: str | None = None
+    """None takes the one that lies beside the weights."""
+
+    def maps_like(self, other: Network) -> bool:
+        """Whether both make the same feature maps."""
+        return self[:2] == other[:2]
 
 
 class Fleet(Section):

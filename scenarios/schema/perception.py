@@ -80,6 +80,11 @@ class Perception(Section):
         None,
         description="A safetensors file: the network's, or the surrogate's calibration; left out, the shipped one.",
     )
+    codebook: str | None = Field(
+        None,
+        description="A safetensors file by which features become codes (`sortie fit codebook`); left out, the one that lies beside the weights.",
+    )
+    code_bytes: int = Field(10, ge=1, le=20, description="Bytes of a feature cell that is sent as a code.")
     recording: str | None = Field(
         None, description="What the recorded detector saw: an npz file or a Zarr folder (perception/outside)."
     )
@@ -118,6 +123,10 @@ class Perception(Section):
         "nms",
         description="How boxes of several drones become one list: the best of those that overlap, or their weighted mean.",
     )
+    common_errors: Literal["fitted", "unknown"] = Field(
+        "fitted",
+        description="What covariance intersection assumes that the errors of several drones' boxes have in common: a fitted share, or anything, as in its first form (Julier and Uhlmann 1997).",
+    )
     score_threshold: float = Field(0.1, ge=0, le=1, description="Detections below this score are dropped.")
     cells_by: Literal["confidence", "norm"] = Field("confidence", description="What ranks the cells under a budget.")
     unsent_cells: Literal["masked", "zero"] = Field(
@@ -133,6 +142,11 @@ class Perception(Section):
         None, description="A thermal camera on every drone, which finds people; left out, nobody finds them."
     )
     scene: Scene = Scene()
+
+    @property
+    def common_share(self) -> float | None:
+        """The share of a variance that several drones' errors may have in common; None: as fitted."""
+        return None if self.common_errors == "fitted" else 1.0
 
     @property
     def classes(self) -> tuple[str, ...]:

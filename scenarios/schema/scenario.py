@@ -124,7 +124,7 @@ class Scenario(Section):
         networks, spaces = self.networks, self.feature_spaces
         for drone, (network, space) in enumerate(zip(networks, spaces, strict=True)):
             other = first.setdefault(space, drone)
-            if network != networks[other]:
+            if not network.maps_like(networks[other]):
                 which = next(d for d in (drone, other) if self.fleet.make_of(d) is not None)
                 i = next(k for k, make in enumerate(self.fleet.makes) if which in make.drones)
                 bound = f"another name than that of drone {drone + other - which}, which has another network"
@@ -139,14 +139,15 @@ class Scenario(Section):
     @property
     def networks(self) -> tuple[Network, ...]:
         """Each drone's network."""
-        common = Network(self.perception.detector, self.perception.weights)
+        common = Network(self.perception.detector, self.perception.weights, self.perception.codebook)
         return tuple(common if make is None else self._network(make) for make in self.fleet.make_of_each)
 
     def _network(self, make: Make) -> Network:
         common = self.perception
         detector = make.detector or common.detector
         weights = common.weights if make.weights is None and detector == common.detector else make.weights
-        return Network(detector, weights)
+        own = make.codebook or (common.codebook if (detector, weights) == (common.detector, common.weights) else None)
+        return Network(detector, weights, own)
 
     @property
     def feature_spaces(self) -> tuple[str, ...]:
@@ -158,7 +159,7 @@ class Scenario(Section):
                 return ""
             if make.feature_space is not None:
                 return make.feature_space
-            return "" if self._network(make) == common else make.name
+            return "" if self._network(make).maps_like(common) else make.name
 
         return tuple(space(make) for make in self.fleet.make_of_each)
 

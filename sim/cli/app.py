@@ -19,6 +19,7 @@ from sortie.sim.cli import (
     compare,
     conditions,
     export,
+    fit,
     fly,
     import_log,
     listing,
@@ -65,6 +66,7 @@ app.add_typer(recording.app, name="recording")
 campaign.app.command("worst")(worst.worst)
 app.add_typer(campaign.app, name="campaign")
 app.add_typer(study.study, name="study")
+app.add_typer(fit.app, name="fit")
 COMMANDS: dict[str, Callable[..., None]] = {
     "fly": fly.fly, "compare": compare.compare, "check": check.check, "view": view.view, "list": listing.list_, "new": new.new,
     "train": train.train, "calibrate": calibrate.calibrate, "paper": paper.paper, "learn": conditions.learn,

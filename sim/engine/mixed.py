@@ -12,10 +12,11 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from sortie.perception.detectors import Detector, DetectsMany
+from sortie.perception.detectors import Detector, DetectsMany, box_errors_of
 from sortie.perception.joining import sendable
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.perception.uncertainty import BoxErrors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception, Scenario
 
@@ -88,6 +89,13 @@ class Mixed:
                     if self._is_foreign(ego, share):
                         wanted[self._of[share.capture.drone]][share.capture] = None
         boxes: dict[Capture, Boxes] = {}
+        errors: dict[int, BoxErrors] = {}
+        for moment in moments:
+            for ego, shares in moment:
+                for share in shares:
+                    k = self._of[share.capture.drone]
+                    if share.representation == "uncertain_boxes" and k not in errors and self._is_foreign(ego, share):
+                        errors[k] = box_errors_of(self._detectors[k])
         for detector, sends, captures in zip(self._detectors, self._sends, wanted, strict=True):
             made = _run(detector, [[(c, ())] for c in captures])
             boxes |= zip(captures, made if sends is None else map(sends, made), strict=True)
@@ -95,7 +103,15 @@ class Mixed:
             return moments
         return [
             [
-                (ego, [s._replace(boxes=boxes[s.capture]) if self._is_foreign(ego, s) else s for s in shares])
+                (
+                    ego,
+                    [
+                        s._replace(boxes=boxes[s.capture], errors=errors.get(self._of[s.capture.drone]))
+                        if self._is_foreign(ego, s)
+                        else s
+                        for s in shares
+                    ],
+                )
                 for ego, shares in moment
             ]
             for moment in moments

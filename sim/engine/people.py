@@ -139,7 +139,9 @@ def _received(share: Share, camera: Thermal) -> SourceBoxes:
         assert share.tracks is not None  # noqa: S101 (`_has_tracks`)
         of_people = share.tracks.take(share.tracks.kind == PERSON)
         return replace(source_of(share._replace(tracks=of_people), None), truncated=True)
-    source = source_of(share._replace(boxes=share.people), None)
+    # of class person nobody fitted a covariance: people are joined as detections are
+    rung = "detections" if share.representation == "uncertain_boxes" else share.representation
+    source = source_of(share._replace(boxes=share.people, representation=rung), None)
     part = _common(looked_at(camera, share.capture), share.roi)
     return replace(source, roi=part, truncated=part is None)
 

@@ -16,7 +16,7 @@ from sortie.perception.classes import PERSON, vehicle_classes
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture, Share
-from sortie.scenarios.representation import NAME_OF
+from sortie.scenarios.representation import DETECTED_NAMES, NAME_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.people import People
 from sortie.sim.results.record import Recorder
@@ -189,9 +189,9 @@ class Scorer:
             received for _, received in sorted(memory.held.items()) if memory.payload_age_s(received, now_s) <= limit_s
         ]
         shares = [as_share(r, memory.trust_in(r.capture.drone), memory.payload_age_s(r, now_s)) for r in held]
-        if any(s.representation == "detections" for s in shares):
+        if any(s.representation in DETECTED_NAMES for s in shares):
             own = self._own_tracks(agent.drone)
-            shares = [s._replace(tracks=own) if s.representation == "detections" else s for s in shares]
+            shares = [s._replace(tracks=own) if s.representation in DETECTED_NAMES else s for s in shares]
         return shares
 
     def _job(self, here: Capture, look: Capture | None, shares: list[Share], now_s: float) -> Job | None:

@@ -20,7 +20,7 @@ from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import Form
 from sortie.fleet.peers import PeerTable
-from sortie.fleet.plane import DroneStatus, PlaneRules, equipment_of
+from sortie.fleet.plane import DroneStatus, PlaneRules, codebooks, equipment_of
 from sortie.fleet.probes import window_of
 from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.traces import flown_motion
@@ -174,8 +174,10 @@ def build(
     env, recorder = simpy.Environment(), Recorder(classes=len(scenario.perception.classes) > 1)
     drones, rules = range(scenario.fleet.drones), _rules(scenario)
     statuses = [
-        DroneStatus(space, looks=not blind)
-        for space, blind in zip(scenario.feature_spaces, scenario.context_only, strict=True)
+        DroneStatus(space, looks=not blind, codebook=codebook)
+        for space, codebook, blind in zip(
+            scenario.feature_spaces, codebooks(scenario), scenario.context_only, strict=True
+        )
     ]
     table = PeerTable(len(drones), window_of(rules.detached_after_periods))
     memories = [PeerMemory(i, rules, statuses[i], table) for i in drones]
@@ -354,6 +356,7 @@ def _rules(scenario: Scenario) -> PlaneRules:
         trust=context.trust,
         people=scenario.perception.thermal is not None,
         classes=len(scenario.perception.classes) > 1,
+        code_bytes=scenario.perception.code_bytes,
         publish_every=context.publish_every,
         form=Form(**context.form.model_dump()),
         roster=context.roster,

@@ -26,7 +26,7 @@ from sortie.scenarios.representation import NAME_OF
 from sortie.sim.results.record import HANDSHAKE, Recorder
 
 OTHER_SPACE = "other_feature_space"
-"""The reason of delivered feature maps that their receiver refused: another network made them."""
+"""The reason of delivered feature maps and codes that their receiver refused: they are of another network or codebook."""
 
 
 class Transport:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 
 from sortie.fleet.coverage import TARGET_FLAG, cameras_of, footprint_radius_m
+from sortie.fleet.plane import codebooks
 from sortie.policies.contract import PHASE_OF, Descriptor, Directive, Disc
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.results import rosters
@@ -19,6 +20,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
     names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "vx_mps", "vy_mps", "vz_mps")
     x, y, z, qx, qy, qz, qw, vx, vy, vz = (states[name].to_numpy() for name in names)
     rate_hz, spaces = record.scenario.context.rate_hz, record.scenario.feature_spaces
+    books = codebooks(record.scenario)
     cameras = cameras_of(record.scenario.fleet)
     mission, group_of = record.tables["mission"], record.scenario.mission.group_of
     targets = {
@@ -50,6 +52,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             task_phase=PHASE_OF[row["phase"]],
             region=region,
             feature_space=spaces[row["drone"]],
+            codebook=books[row["drone"]],
             priority_target_ids=(targets[frame, group_of(row["drone"])],) if row["novelty_flags"] & TARGET_FLAG else (),
         )  # fmt: skip
         roster = roster_at(row["drone"], row["t_s"])

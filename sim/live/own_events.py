@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 
 from sortie.fleet.clock import oscillators
-from sortie.fleet.plane import DroneStatus
+from sortie.fleet.plane import DroneStatus, codebooks
 from sortie.scenarios.schema import ClockDrift, ClockSkew, GnssLoss, Lie, Scenario
 from sortie.sim.engine.own_state import OwnEvent, OwnState, Told, whom
 from sortie.sim.engine.world import INSTANT_S, at, with_frame
@@ -21,7 +21,8 @@ from sortie.sim.live.context import Trace
 def status_of(scenario: Scenario, drone: int, zero_s: float) -> DroneStatus:
     """A live drone's status; a perfect clock shows `zero_s` at the scenario's time 0."""
     looks = not scenario.context_only[drone]
-    return DroneStatus(scenario.feature_spaces[drone], looks=looks, clock_skew_s=zero_s)
+    codebook = codebooks(scenario)[drone]
+    return DroneStatus(scenario.feature_spaces[drone], looks=looks, clock_skew_s=zero_s, codebook=codebook)
 
 
 class OwnEvents:

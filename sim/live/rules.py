@@ -31,6 +31,7 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
         dwell_s=scenario.policy.dwell_s,
         hysteresis=scenario.policy.hysteresis,
         compute_delay_s=scenario.perception.compute_delay_s,
+        code_bytes=scenario.perception.code_bytes,
         publish_every=scenario.context.publish_every,
         trust=scenario.context.trust,
         roster=scenario.context.roster,

@@ -22,6 +22,7 @@ from sortie.fleet.flight.frames import yaw_rad
 from sortie.perception.budget import CELL_M, roi_mask
 from sortie.perception.geometry import CELLS
 from sortie.scenarios.disc import Disc
+from sortie.scenarios.representation import CELL_NAMES
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import Canvas, Floats
 
@@ -109,7 +110,7 @@ class ReceivedCells:
         for done, sent, captured, sender, receiver, what, fate, size, arrived in zip(
             *(transmissions[k].to_pylist() for k in _COLUMNS), strict=True
         ):
-            if what == "features" and fate in ("delivered", "partial"):
+            if what in CELL_NAMES and fate in ("delivered", "partial"):
                 region = self._region(sender, receiver, sent)
                 share = arrived / size if fate == "partial" else 1.0
                 self._arrivals[receiver, sender].append(DrawnPayload(done, captured, region, share))

@@ -20,6 +20,7 @@ from sortie.perception.classes import CAR, TargetClass
 from sortie.policies.verification.enforced import CAUSES
 from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.scenarios.plugins.reference import is_file
+from sortie.scenarios.representation import CELL_NAMES
 from sortie.sim.results import disagreement
 from sortie.sim.results.accuracy import FULL_SCENE, MISSION, Scored, score
 from sortie.sim.results.mission_outcome import mission_outcome
@@ -227,7 +228,7 @@ def describe(row: dict[str, Any]) -> str:
     """A directive in words: `features ρ=0.25 at 10 Hz in 32 m`."""
     if row["representation"] == "none" or row["rate_hz"] <= 0:
         return "nothing"
-    budget = f" ρ={row['rho']:.3g}" if row["representation"] == "features" else ""
+    budget = f" ρ={row['rho']:.3g}" if row["representation"] in CELL_NAMES else ""
     roi = "" if np.isnan(row["roi_radius_m"]) else f" in {row['roi_radius_m']:.0f} m"
     return f"{row['representation']}{budget} at {row['rate_hz']:g} Hz{roi}"
 

@@ -28,7 +28,10 @@ Floats = NDArray[np.float64]
 
 DRONES = ("#2f6fd0", "#d9780f", "#8a4fd0", "#0f9a8b", "#d0407a", "#9a8a12", "#4f88b8", "#b5603c", "#6a9a3a", "#85756d")
 """Colours of drones, on white."""
-SENT = {"features": "#3f9a52", "detections": "#d08a1d", "tracks": "#4f7fd0", "raw": "#b04fb0", "nothing": "#d5d7db"}
+SENT = {
+    "features": "#3f9a52", "codes": "#2a8a9a", "detections": "#d08a1d", "uncertain_boxes": "#c05a2a", "tracks": "#4f7fd0",
+    "raw": "#b04fb0", "nothing": "#d5d7db",
+}  # fmt: skip
 HANDSHAKES = "#a89a3c"
 FATES = {"lost": "#d02f45", "expired": "#8a90a0"}
 MISSION, EVENT = "#d02fae", "#a8830d"

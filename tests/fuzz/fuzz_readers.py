@@ -78,7 +78,7 @@ def _descriptors() -> list[bytes]:
     from sortie.fleet.messages.wire import encode_descriptor
     from sortie.policies.contract import Roster
 
-    grown = DESCRIPTOR._replace(feature_space="fine", priority_target_ids=(1, 2, 3))
+    grown = DESCRIPTOR._replace(feature_space="fine", priority_target_ids=(1, 2, 3), codebook="0f" * 7)
     member = DESCRIPTOR._replace(peer_goodput_mbps=(3.0, 4.0)).with_roster(Roster(7, (1, 3, 9)))
     compact = [
         encode_compact(d, f) for d in (DESCRIPTOR, grown) for f in (Form(4, 1, 8), Form(8, 2, 12), Form(0, 1, 32))

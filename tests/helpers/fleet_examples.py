@@ -72,6 +72,7 @@ descriptors = st.builds(
     priority_target_ids=st.lists(st.integers(0, 65535), max_size=20).map(tuple),
     feature_space=st.just(""),
     roster=st.none(),
+    codebook=st.just(""),
 )
 rosters = st.builds(
     Roster, st.integers(0, 2**32 - 1), st.sets(st.integers(0, 60), min_size=1, max_size=12).map(sorted).map(tuple)
@@ -88,10 +89,11 @@ def with_members(d: Descriptor, roster: Roster | None) -> Descriptor:
 
 
 extended_descriptors = st.builds(
-    lambda d, space, roster: with_members(d._replace(feature_space=space), roster),
+    lambda d, space, roster, codebook: with_members(d._replace(feature_space=space, codebook=codebook), roster),
     descriptors,
     st.just("") | st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9_.+-]{0,31}\Z"),
     st.none() | rosters,
+    st.just("") | st.binary(min_size=7, max_size=7).map(bytes.hex),
 )
 """With optional fields, or without."""
 directives = (

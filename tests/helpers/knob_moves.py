@@ -166,6 +166,7 @@ FIGURES: dict[str, Callable[[SortieRecord], float]] = {
     "cells sent": lambda r: _sent(r, "cells", features=True),
     "cells sent by 1": lambda r: _sent(r, "cells", drone=1, features=True),
     "payload's bytes": lambda r: _sent(r, "payload_bytes", features=True),
+    "codes' bytes": lambda r: _sent(r, "payload_bytes"),
     "fragments": lambda r: _sent(r, "fragments"),
     "airtime": lambda r: _sent(r, "airtime_s", features=True),
     "hops": lambda r: _sent(r, "hops"),
@@ -402,6 +403,7 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "events.extra_s": ("time from look to sending of 1", ">"),
     "events.rate_hz": ("drops", ">"),
     "perception.weights": ("detections", "<"),
+    "perception.code_bytes": ("codes' bytes", "<"),
     "perception.sample_rate_hz": ("fusions", ">"),
     "perception.fusion_delay_s": ("age at fusion", ">"),
     "perception.max_age_s": ("peers fused", "<"),
@@ -469,6 +471,7 @@ UNSIGNED: dict[str, str] = {
         f"perception.{name}": _KIND
         for name in (
             "fusion", "fusion_params", "recording", "recorded_fusion", "precision", "motion_compensation", "cells_by", "join", "unsent_cells", "absent_peers",
+            "codebook", "common_errors",
         )
     },
     **{

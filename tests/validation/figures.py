@@ -124,6 +124,13 @@ def _fusion_methods() -> Tables:
     return {"fusion_methods": fusion_comparison.table(rows, "30 frames of the test split; intervals over scenes.")}
 
 
+def _representations() -> Tables:
+    """Needs the codebook and the box errors that lie beside the shipped weights (`sortie fit`)."""
+    import representations
+
+    return representations.tables(ROOT / "docs/results/representations.png", ROOT / "runs/bench")
+
+
 def _track_prediction() -> Tables:
     import track_prediction
 
@@ -626,6 +633,7 @@ FIGURES: dict[str, Figure] = {
     "context_forms": Figure(4, _context_forms),
     "fusion_age": Figure(4, _fusion_age),
     "late_shares": Figure(2, _late_shares),
+    "representations": Figure(4, _representations),
     "link": Figure(5, _link),
     "ns3": Figure(15, _ns3, timed=True),
     "transport": Figure(6, _transport),

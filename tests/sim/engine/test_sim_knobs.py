@@ -29,8 +29,8 @@ from sortie.sim.results.record import SortieRecord
 NOT_KNOBS = ("name", "description", "expect", "expect_decisions", "record", "limits", "metrics")
 """Words for people, what is asserted about the outcome or computed from the record, what is kept beside the record, and wall-clock time."""
 
-IN_MAKES = {"fleet.makes.name", "fleet.makes.weights"}
-"""Networks of makes, which the name stands for; test_sim_makes.py."""
+IN_MAKES = {"fleet.makes.name", "fleet.makes.weights", "fleet.makes.codebook"}
+"""Networks and codebooks of makes, which the name stands for; test_sim_makes.py."""
 
 JAM = "events=[{kind: jam, at_s: 1, position_m: [0, 0, 60], power_dbm: 0, until_s: 4}]"
 DROP = "events=[{kind: link_drop, at_s: 1, drone: 1, loss_db: 40, until_s: 4}]"
@@ -48,6 +48,7 @@ APART = "fleet.groups=[{drones: [1], formation: {altitude_m: 40}, route: {waypoi
 STATION = "fleet.ground=[{drone: 1, position_m: [0, 20, 3]}]"
 FAR = "fleet.formation.spacing_m=150"  # links weak enough that rates, retries and repairs matter
 HEAVY = ("policy.name=all-4", "policy.params={received_budget: 0.4}")  # fills the medium
+CODED = ("policy.name=codes", "policy.params={received_budget: 0.2}")
 QUIET_TOO = "radio.preamble_detection_dbm=-110"
 BOXES = "fleet.battery.initial_soc=0.25"  # below 30 % the worked policy sends detections, reliably
 FIXED = "mission.phases=[{at_s: 0, phase: track, region: {centre_m: [0, 0], radius_m: 32}}]"
@@ -386,6 +387,9 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.recording": ("OTHER", ("perception.detector=recorded", "perception.recording=RECORDING")),
     "perception.recorded_fusion": ("FUSION", ("perception.detector=recorded", "perception.recording=RECORDING")),
     "perception.weights": ("WEIGHTS", ()),
+    "perception.codebook": ("CODEBOOK", CODED),
+    "perception.code_bytes": ("3", CODED),
+    "perception.common_errors": ("unknown", ("policy.name=uncertain-boxes", "policy.params={}")),
     "perception.precision": ("bfloat16", ()),
     "perception.sample_rate_hz": ("5", ()),
     "perception.fusion_delay_s": ("0.2", ()),
@@ -523,6 +527,8 @@ def test_a_knob_of_perception_changes_the_record(field: str, tmp_path_factory: p
     before = flown(*SHORT, *shared)
     if value == "WEIGHTS":
         value = str(other_weights(tmp_path_factory.mktemp("weights") / "other.safetensors"))
+    if value == "CODEBOOK":
+        value = str(other_codebook(tmp_path_factory.mktemp("codebook") / "other.safetensors"))
     change = f"{place(field, tuple(shared))}={value}"
     after = run_sortie(example(*SHORT, *shared, change))
     assert after.fingerprint != before.fingerprint
@@ -541,6 +547,19 @@ def recorded(folder: Path, *texts: str) -> list[str]:
     for name, suffix in (("RECORDING", ".npz"), ("OTHER", ".npz"), ("FUSION", ".py:deaf")):
         texts = tuple(text.replace(name, f"{files[name]}{suffix}") for text in texts)
     return list(texts)
+
+
+def other_codebook(path):  # type: ignore[no-untyped-def]
+    """The shipped codebook with its entries in another order, so that a code's bytes mean coarser cells."""
+    from dataclasses import replace
+
+    from sortie.perception.network.checkpoint import load_weights
+    from sortie.perception.network.codebook import beside, load_codebook, save_codebook
+    from sortie.perception.network.detector import SHIPPED_WEIGHTS
+
+    codebook = load_codebook(beside(SHIPPED_WEIGHTS), load_weights(SHIPPED_WEIGHTS))
+    save_codebook(replace(codebook, stages=codebook.stages.flip(0)), path, {})
+    return path
 
 
 def other_weights(path):  # type: ignore[no-untyped-def]

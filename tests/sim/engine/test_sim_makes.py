@@ -11,6 +11,8 @@ from sim_examples import PATIENT
 
 import sortie
 from sortie.fleet.coverage import unpack_grid
+from sortie.perception.errors import InputError
+from sortie.perception.files import codebook_digest
 from sortie.perception.surrogate.model import SHIPPED, load, save
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.worked import worked
@@ -82,6 +84,34 @@ def test_a_policy_that_knows_sends_boxes_there_and_they_are_joined() -> None:
     assert all(rungs[pair] == {"detections"} for pair in ((0, 2), (1, 2), (2, 0), (2, 1)))
     assert {(0, 2, "detections"), (2, 0, "detections")} <= fused(record)
     assert not any(why == "other_feature_space" for *_, why in sent(record))
+
+
+def test_codes_of_another_codebook_are_refused_and_a_policy_that_knows_sends_boxes(tmp_path: Path) -> None:
+    book = tmp_path / "theirs.safetensors"
+    book.write_bytes(b"another codebook")
+    own = f", codebook: {book}"
+    traffic_alone = ("perception.detector=none", *PATIENT)
+
+    def to_all(view: FleetView) -> list[Directive]:
+        return [d._replace(representation=Representation.CODES) for d in maps_to_all(view)]
+
+    record = run_sortie(fleet(own, *traffic_alone), to_all)
+    delivered = {(i, j, why) for i, j, what, status, why in sent(record) if (what, status) == ("codes", "delivered")}
+    foreign = {(i, j, "other_feature_space") for i, j in ((0, 2), (1, 2), (2, 0), (2, 1))}
+    assert delivered == {(0, 1, ""), (1, 0, "")} | foreign
+    sizes = {r["drone"]: r["wire_bytes"] for r in record.tables["descriptors"].to_pylist()}
+    assert sizes[2] == sizes[0] + 1 + 3 + 7  # version, type and length, digest
+    assert {d.codebook for _, d in descriptors(record) if d.agent_id == 2} == {codebook_digest(book)}
+    assert {d.feature_space for _, d in descriptors(record)} == {""}
+    knows = run_sortie(fleet(own, *traffic_alone, "policy.name=codes", "policy.params={}"))
+    rungs = {(i, j): {what for a, b, what, *_ in sent(knows) if (a, b) == (i, j)} for i in range(3) for j in range(3)}
+    assert all("codes" in rungs[pair] for pair in ((0, 1), (1, 0)))
+    assert all(rungs[pair] == {"detections"} for pair in ((0, 2), (1, 2), (2, 0), (2, 1)))
+    maps = run_sortie(fleet(own, *traffic_alone), maps_to_all)
+    assert not any(why for *_, why in sent(maps) if why == "other_feature_space"), "features need no codebook"
+    book.unlink()
+    with pytest.raises(InputError, match="cannot be read as a codebook"):
+        run_sortie(fleet(own, *traffic_alone), to_all)
 
 
 def test_descriptors_say_it_and_views_compare_it() -> None:

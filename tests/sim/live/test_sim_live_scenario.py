@@ -292,7 +292,7 @@ def test_what_a_flight_leaves_out_is_named_in_one_line() -> None:
 
 USED = {
     "context": {"rate_hz", "degraded_after_periods", "detached_after_periods", "authentication", "publish_every", "trust", "roster"},
-    "perception": {"tracking_rate_hz", "compute_delay_s", "people", "thermal", "scene"},
+    "perception": {"tracking_rate_hz", "compute_delay_s", "people", "thermal", "scene", "code_bytes"},
     "policy": {"name", "params", "dwell_s", "hysteresis", "changes", "commands", "invariants", "of_makes", "shield"},
     "record": set(),
 }  # fmt: skip
@@ -316,6 +316,8 @@ CHANGED = {
     "perception.max_age_s": "0.2",
     "perception.motion_compensation": "false",
     "perception.join": "average",
+    "perception.codebook": "other.safetensors",
+    "perception.common_errors": "unknown",
     "perception.score_threshold": "0.5",
     "perception.cells_by": "norm",
     "perception.unsent_cells": "zero",

@@ -1,0 +1,109 @@
+"""`sortie fit`: what representations need beside a network's weights: a codebook, and how uncertain boxes are."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from sortie.sim.cli.console import out, stages
+from sortie.sim.folders import ensure_files, write_text
+from sortie.sim.user_errors import user_errors
+
+app = typer.Typer(
+    no_args_is_help=True, help="Fit what representations need beside a network: a codebook for codes, errors of boxes."
+)
+BenchOption = Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")]
+WeightsOption = Annotated[Path | None, typer.Option("--weights", help="The network's weights; default: the shipped.")]
+OutOption = Annotated[Path | None, typer.Option("--out", help="File to write; default: beside the weights.")]
+
+
+class Boxes(StrEnum):
+    torch = "torch"
+    surrogate = "surrogate"
+
+
+@app.command("codebook")
+def fit_codebook(
+    weights: WeightsOption = None,
+    out_file: OutOption = None,
+    stages_: Annotated[int, typer.Option("--stages", help="The most bytes of a cell.", min=1, max=20)] = 20,
+    scenes: Annotated[int, typer.Option(help="Number of scenes of the train split.", min=1, max=100)] = 10,
+    iterations: Annotated[int, typer.Option(help="Rounds of k-means in each stage.", min=1)] = 25,
+    seed: Annotated[int, typer.Option(help="Seed of the cells taken and of k-means.", min=0)] = 0,
+    bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
+    bench_dir: BenchOption = Path("runs/bench"),
+) -> None:
+    """Fit a codebook to a network's features: cells become codes of one byte a stage. Takes about two minutes."""
+    from sortie.perception.benchmark.dataset import Benchmark  # here: torch takes a second to import
+    from sortie.perception.network.checkpoint import load_weights
+    from sortie.perception.network.codebook import beside
+    from sortie.perception.network.detector import SHIPPED_WEIGHTS
+    from sortie.perception.training.codebook import CodebookRecipe, make_codebook
+
+    path = weights or SHIPPED_WEIGHTS
+    target = out_file or beside(path)
+    recipe = CodebookRecipe(stages_, scenes, iterations, seed)
+    with user_errors():
+        net = load_weights(path)
+        ensure_files(target)
+        with stages() as progress:
+            facts = make_codebook(
+                net, target, Benchmark(bench_seed, geometry=net.config.geometry), recipe,
+                weights=path.name, root=bench_dir, progress=progress,
+            )  # fmt: skip
+    table = Table("bytes of a cell", "variance that is lost", title=f"{facts['cells']} cells")
+    for length, lost in facts["unexplained"].items():
+        table.add_row(str(length), f"{100 * lost:.1f} %")
+    out.print(table)
+    out.print(f"kept in [bold]{target}[/bold], its card beside it")
+
+
+@app.command("errors")
+def fit_errors(
+    boxes: Annotated[Boxes, typer.Argument(help="Whose boxes: the network's or the surrogate's.")] = Boxes.torch,
+    weights: WeightsOption = None,
+    out_file: OutOption = None,
+    towns: Annotated[
+        int, typer.Option(help="Towns of the surrogate's fit; torch takes the validation split.", min=4)
+    ] = 60,
+    bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
+    bench_dir: BenchOption = Path("runs/bench"),
+) -> None:
+    """Fit how uncertain the places of boxes are, by score and distance, so that drones can send covariances."""
+    from sortie.perception.training import box_errors
+    from sortie.perception.uncertainty import beside, errors_text
+
+    with user_errors():
+        if boxes is Boxes.surrogate:
+            from sortie.perception.surrogate.errors import moments
+            from sortie.perception.surrogate.model import SHIPPED
+
+            path = weights or SHIPPED
+            found = moments(path, "fit", towns)
+            made = {"command": f"sortie fit errors surrogate --towns {towns}", "boxes_of": path.name}
+        else:
+            from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
+            from sortie.perception.network.checkpoint import load_weights
+            from sortie.perception.network.detector import SHIPPED_WEIGHTS
+            from sortie.perception.training.boxes_alone import THRESHOLD, boxes_alone, moments_of
+
+            path = weights or SHIPPED_WEIGHTS
+            net = load_weights(path)
+            split = make_split(Benchmark(bench_seed, geometry=net.config.geometry), "validation", bench_dir)
+            frames = load_frames(split)
+            found = moments_of(frames, boxes_alone(net, frames, THRESHOLD))
+            made = {"command": f"sortie fit errors torch --bench-seed {bench_seed}", "boxes_of": path.name}
+        target = out_file or beside(path)
+        ensure_files(target)
+        model = box_errors.fit(found)
+        fitted = box_errors.calibration(model, found)
+        write_text(target, errors_text(model, made | {"boxes": fitted.boxes}))
+    out.print(
+        f"{fitted.boxes} boxes: {100 * fitted.within[0]:.1f} % of the errors within one standard deviation, "
+        f"{100 * fitted.within[1]:.1f} % within two; {100 * model.common:.0f} % of a variance is common to several drones"
+    )
+    out.print(f"kept in [bold]{target}[/bold]")

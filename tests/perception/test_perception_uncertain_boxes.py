@@ -1,0 +1,177 @@
+"""Boxes with uncertainty: the fitted covariances, and how a receiver joins them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from perception_examples import cross
+
+from sortie.perception.budget import content_bytes
+from sortie.perception.errors import InputError
+from sortie.perception.intersection import intersect, inverse
+from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
+from sortie.perception.lateness import MOVING, SPEED_MPS
+from sortie.perception.training.box_errors import Errors, calibration, common, errors_of, fit
+from sortie.perception.types import Boxes, Share
+from sortie.perception.uncertainty import BoxErrors, beside, errors_text, load_errors, terms
+
+HERE = (0.0, 0.0, 0.0)
+FLAT = BoxErrors((np.log(0.6), 0, 0, 0, 0), (np.log(0.3), 0, 0, 0, 0), common=0.2)
+FITTED = BoxErrors((-0.7, -0.2, 0.01, 0.6, -0.1), (-0.6, -0.2, 0.02, 0.2, 0.05), 0.17)
+
+
+def boxes(*rows: tuple[float, float, float]) -> Boxes:
+    table = np.array([(x, y, 4.5, 1.9, 0.0, score) for x, y, score in rows])
+    return Boxes.placed(table.reshape(-1, 6), HERE)
+
+
+def ego(own: Boxes, *others: SourceBoxes, errors: BoxErrors = FLAT) -> EgoSources:
+    return EgoSources(HERE, own, False, others, errors=errors)
+
+
+def test_a_covariance_lies_along_the_sight() -> None:
+    found = FLAT.covariances_m2(boxes((30, 40, 0.5)), HERE)[0]
+    values, axes = np.linalg.eigh(np.array([[found[0], found[1]], [found[1], found[2]]]))
+    assert values == pytest.approx([0.09, 0.36], rel=1e-5)
+    assert abs(axes[:, 1] @ [0.6, 0.8]) == pytest.approx(1.0)
+    moved = FLAT.covariances_m2(boxes((130, 140, 0.5)), (100.0, 100.0, 2.0))[0]
+    np.testing.assert_array_equal(moved, found)
+
+
+def test_below_the_drone_both_axes_count_alike() -> None:
+    np.testing.assert_allclose(FLAT.covariances_m2(boxes((0, 0, 0.5)), HERE), [[0.225, 0.0, 0.225]], rtol=1e-6)
+
+
+def synthetic(rng: np.random.Generator, model: BoxErrors, shared: float) -> list[Errors]:
+    """Five drones' normal errors of the same cars, as the model has them, with a part in common."""
+    cars = 60
+    together = rng.normal(size=(cars, 2))
+    out = []
+    for _ in range(5):
+        score, distance, angle = rng.uniform(0.1, 0.95, cars), rng.uniform(5, 120, cars), rng.uniform(0, 7, cars)
+        sight = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        mixed = np.sqrt(shared) * together + np.sqrt(1.0 - shared) * rng.normal(size=(cars, 2))
+        c, s = sight.T
+        own = np.stack([c * mixed[:, 0] + s * mixed[:, 1], c * mixed[:, 1] - s * mixed[:, 0]], axis=1)
+        own = own * model.deviations_m(score, distance)
+        back = np.stack([c * own[:, 0] - s * own[:, 1], s * own[:, 0] + c * own[:, 1]], axis=1)
+        out.append(Errors(np.arange(cars), score, distance, sight, back))
+    return out
+
+
+def test_the_fit_finds_what_errors_were_drawn_by_and_is_calibrated_on_others() -> None:
+    rng = np.random.default_rng(3)
+    first, second = ([synthetic(rng, FITTED, 0.3) for _ in range(60)] for _ in range(2))
+    model = fit(first)
+    at = rng.uniform(0.15, 0.9, 200), rng.uniform(10, 110, 200)
+    np.testing.assert_allclose(model.deviations_m(*at), FITTED.deviations_m(*at), rtol=0.06)
+    assert model.common == pytest.approx(0.3, abs=0.03)
+    found = calibration(model, second)
+    assert found.boxes == 60 * 5 * 60
+    assert found.within == pytest.approx((0.6827, 0.9545), abs=0.01)
+    assert found.within_ellipse == pytest.approx((0.3935, 0.8647), abs=0.01)
+    near = calibration(model, second, lambda e: e.distance_m < 40.0)
+    assert near.boxes < found.boxes
+    assert near.within == pytest.approx((0.6827, 0.9545), abs=0.02)
+    assert common(model, [synthetic(rng, FITTED, 0.0) for _ in range(60)]) == pytest.approx(0.0, abs=0.03)
+
+
+def test_errors_are_those_of_boxes_that_lie_on_a_car_each_car_once() -> None:
+    cars = np.array([[30.0, 40.0, 4.5, 1.9, 0.0], [np.nan] * 5, [-50.0, 0.0, 4.5, 1.9, 0.0]])
+    found = errors_of(boxes((30.6, 40.8, 0.9), (30.0, 40.1, 0.8), (90, 0, 0.7), (-50, 0.4, 0.6)), HERE, cars)
+    assert found.car.tolist() == [0, 1]
+    assert found.score == pytest.approx([0.9, 0.6])
+    np.testing.assert_allclose(found.off_m, [[0.6, 0.8], [0.0, 0.4]], atol=1e-5)
+    np.testing.assert_allclose(found.by_sight_m, [[1.0, 0.0], [0.0, -0.4]], atol=0.01)
+    with pytest.raises(ValueError, match="2 boxes lie on a car, must be at least 100"):
+        fit([[found]])
+
+
+def test_the_file_is_read_as_it_was_written_and_faults_name_it(tmp_path: Path) -> None:
+    path = beside(tmp_path / "net.safetensors")
+    with pytest.raises(InputError, match=r"net.errors.json: nobody fitted how uncertain the boxes of net are"):
+        load_errors(path, "net")
+    path.write_text(errors_text(FITTED, {"command": "none"}))
+    assert load_errors(path, "net") == FITTED
+    for text, message in (
+        ('{"along": [1, 2], "across": [1, 2, 3, 4, 5], "common": 0}', r"along is \[1.0, 2.0\], must be 5 finite numbers"),
+        (errors_text(replace(FITTED, common=1.5), {}), r"common is 1.5, must be in \[0, 1\]"),
+        ("[]", "not a file of box errors"),
+    ):  # fmt: skip
+        path.write_text(text)
+        with pytest.raises(InputError, match=message):
+            load_errors(path, "net")
+
+
+def test_a_place_is_the_intersection_of_its_boxes_and_all_else_their_average() -> None:
+    own, theirs = boxes((30, 40, 0.5)), boxes((30.4, 39.8, 0.9))
+    covariances = FLAT.covariances_m2(own, HERE), FITTED.covariances_m2(theirs, (60.0, 0.0, 1.0))
+    peer = SourceBoxes(theirs, 0.5, HERE, covariance_m2=covariances[1])
+    plain = joined_many([ego(own, replace(peer, covariance_m2=None))], "average")[0]
+    for common_share, given in ((FLAT.common, None), (1.0, 1.0)):
+        found = joined_many([ego(own, peer)], "nms", given)[0]  # whichever rule is chosen for other boxes
+        information = inverse(np.concatenate(covariances).astype(float)) * np.array([[1.0], [0.5]])
+        at = np.concatenate([own.xy_m, theirs.xy_m]).astype(float)
+        wanted = intersect(at, information, np.zeros(2, np.intp), common_share)
+        np.testing.assert_allclose(found.xy_m, wanted.xy_m, atol=1e-5)
+        for name in ("size_m", "yaw_rad", "score"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(plain, name))
+    assert abs(plain.xy_m - found.xy_m).max() > 0.02
+
+
+def test_age_grows_a_covariance_by_what_cars_may_have_moved_or_by_a_tracks_velocity() -> None:
+    own, theirs = boxes((30, 40, 0.5)), boxes((30.5, 40, 0.5))
+    covariance = FLAT.covariances_m2(theirs, HERE)
+    late = SourceBoxes(theirs, 1.0, HERE, age_s=0.2, covariance_m2=covariance)
+    first = FLAT.covariances_m2(own, HERE)
+    for source, more_m2 in (
+        (late, MOVING * (SPEED_MPS * 0.2) ** 2),
+        (replace(late, velocity_mps=np.zeros((1, 2)), variance_m2=np.array([0.39**2 + 0.05])), 0.05),
+    ):
+        grown = covariance.astype(float) + more_m2 * np.array([[1.0, 0.0, 1.0]])
+        information = inverse(np.concatenate([first.astype(float), grown]))
+        at = np.concatenate([own.xy_m, theirs.xy_m]).astype(float)
+        wanted = intersect(at, information, np.zeros(2, np.intp), 0.2)
+        np.testing.assert_allclose(joined_many([ego(own, source)], "nms")[0].xy_m, wanted.xy_m, atol=1e-5)
+
+
+def test_egos_with_and_without_covariances_are_each_as_alone() -> None:
+    own, theirs = boxes((30, 40, 0.5)), boxes((30.4, 39.8, 0.9), (60, 0, 0.3))
+    plain = SourceBoxes(theirs, 1.0, HERE)
+    exact = replace(plain, covariance_m2=FLAT.covariances_m2(theirs, HERE))
+    egos = [ego(own, plain), ego(own, exact), ego(own), ego(own, plain, exact)]
+    together = joined_many(egos, "nms")
+    for one, boxes_ in zip(egos, together, strict=True):
+        alone = joined_many([one], "nms")[0]
+        np.testing.assert_array_equal(boxes_.table(), alone.table())
+    assert len(together[2]) == 1
+
+
+def test_a_share_brings_the_covariances_of_its_senders_boxes() -> None:
+    peer = cross(0.0, 0.0, 0.0)[1]
+    share = Share(peer, "uncertain_boxes", 0.0, None, 1.0)
+    alone = boxes((30, 40, 0.5))
+    np.testing.assert_array_equal(
+        source_of(share, alone, FLAT).covariance_m2, FLAT.covariances_m2(alone, peer.est_pose)
+    )
+    of_another = source_of(share._replace(boxes=alone, errors=FITTED), None, FLAT)
+    np.testing.assert_array_equal(of_another.covariance_m2, FITTED.covariances_m2(alone, peer.est_pose))
+    assert source_of(share._replace(representation="detections"), alone, FLAT).covariance_m2 is None
+    with pytest.raises(InputError, match="does not tell how uncertain its boxes are: let policies send detections"):
+        source_of(share, alone)
+
+
+def test_a_box_with_its_covariance_has_36_bytes() -> None:
+    assert content_bytes("uncertain_boxes", boxes=5) == 5 * 36
+    assert content_bytes("uncertain_boxes", boxes=5, classes=True) == 5 * 37
+
+
+def test_scores_and_distances_outside_of_the_fit_stay_within_bounds() -> None:
+    wild = BoxErrors((3.0, 2.0, 1.0, 5.0, 5.0), (-9.0, 0, 0, 0, 0))
+    found = wild.deviations_m(np.array([0.0, 1.0]), np.array([0.0, 900.0]))
+    assert found.max() == 5.0
+    assert found.min() == 0.05
+    assert np.isfinite(terms(np.array([0.0, 1.0]), np.array([0.0, 1e6]))).all()
