@@ -290,7 +290,9 @@ def test_a_traced_loss_takes_tries_as_a_burst_of_that_loss_does(loss: float, tmp
     for given in (dict(trace=trace(tmp_path, *rows)), dict(bursts=BurstSettings(loss_good=loss))):
         flight = Hover(AirSettings(shadowing_sigma_db=0.0, rician_k_db=30.0, **given))  # type: ignore[arg-type]
         flight.fly(6.0, lambda k, flight=flight: flight.send(0, 1, 2_600))  # type: ignore[misc]
-        flown.append([(r.number, r.status, r.t_start_s, r.t_done_s, r.airtime_s, r.fragments_lost) for r in flight.rows])
+        flown.append(
+            [(r.number, r.status, r.t_start_s, r.t_done_s, r.airtime_s, r.fragments_lost) for r in flight.rows]
+        )
     assert len(flown[0]) == 60
     assert flown[0] == flown[1]
 
