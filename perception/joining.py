@@ -113,7 +113,7 @@ def source_of(share: Share, alone: Boxes | None, errors: BoxErrors | None = None
         errors = share.errors or errors
         if errors is None:
             raise InputError("this detector does not tell how uncertain its boxes are: let policies send detections")
-        covariance = errors.covariances_m2(boxes, share.capture.est_pose)
+        covariance = errors.covariances_m2(boxes.xy_m, boxes.score, share.capture.est_pose)
     return SourceBoxes(boxes, *where, truncated, age_s, velocity, variance, covariance)
 
 
@@ -149,7 +149,7 @@ class EgoSources(NamedTuple):
     def sources(self) -> list[SourceBoxes]:
         """Its own boxes, if it has any, and those of the peers that count."""
         weight = OWN_WEIGHT if self.fused else 1.0
-        known = None if self.errors is None else self.errors.covariances_m2(self.own, self.pose)
+        known = None if self.errors is None else self.errors.covariances_m2(self.own.xy_m, self.own.score, self.pose)
         own = [SourceBoxes(self.own, weight, self.pose, age_s=self.age_s, covariance_m2=known)] if self.looked else []
         return own + [o for o in self.others if o.weight > 0.0]
 

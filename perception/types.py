@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from sortie.perception.classes import TargetClass
 from sortie.perception.geometry import USUAL, Cameras, to_world
 from sortie.perception.motion import Tracks
+from sortie.perception.uncertainty import BoxErrors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import MAP_NAMES
-
-if TYPE_CHECKING:
-    from sortie.perception.uncertainty import BoxErrors
 
 
 class Capture(NamedTuple):

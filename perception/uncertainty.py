@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.errors import InputError
-from sortie.perception.types import Boxes
 
 Floats = NDArray[np.float64]
 Pose = tuple[float, float, float]
@@ -44,20 +43,25 @@ class BoxErrors:
         logs = terms(score, distance_m) @ np.array([self.along, self.across]).T
         return np.asarray(np.clip(np.exp(logs), _LEAST_M, _MOST_M))
 
-    def covariances_m2(self, boxes: Boxes, pose: Pose) -> NDArray[np.float32]:
-        """[n, 3] east, east–north and north variance of each place, rounded as it is sent.
+    def covariances_m2(
+        self, xy_m: NDArray[np.floating], score: NDArray[np.floating], pose: Pose
+    ) -> NDArray[np.float32]:
+        """[n, 3] east, east–north and north variance of each box's place, rounded as it is sent.
 
         Args:
+            xy_m: [n, 2] places of the boxes, ENU.
+            score: [n] their scores.
             pose: estimated x, y, yaw of the drone that saw them, ENU.
 
         Example:
-            >>> box = Boxes(*(np.array(v, np.float32) for v in ([[50.0, 0.0]], [[4.5, 1.8]], [0.0], [0.5])))
-            >>> BoxErrors((-1.0, 0, 0, 0, 0), (-2.0, 0, 0, 0, 0)).covariances_m2(box, (0.0, 0.0, 1.0)).round(3).tolist()
-            [[0.13500000536441803, 0.0, 0.017999999225139618]]
+            >>> flat = BoxErrors((-1.0, 0, 0, 0, 0), (-2.0, 0, 0, 0, 0))
+            >>> found = flat.covariances_m2(np.array([[50.0, 0.0]]), np.array([0.5]), (0.0, 0.0, 1.0))
+            >>> [round(float(v), 3) for v in found[0]]
+            [0.135, 0.0, 0.018]
         """
-        x, y = (boxes.xy_m[:, k].astype(np.float64) - pose[k] for k in (0, 1))
+        x, y = (xy_m[:, k].astype(np.float64) - pose[k] for k in (0, 1))
         distance = np.hypot(x, y)
-        along, across = (self.deviations_m(boxes.score, distance) ** 2).T
+        along, across = (self.deviations_m(score, distance) ** 2).T
         # below the drone no sight has a direction over ground: both count alike
         c, s = x / np.maximum(distance, 1e-9), y / np.maximum(distance, 1e-9)
         below = distance < 1e-9

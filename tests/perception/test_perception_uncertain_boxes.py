@@ -28,21 +28,25 @@ def boxes(*rows: tuple[float, float, float]) -> Boxes:
     return Boxes.placed(table.reshape(-1, 6), HERE)
 
 
+def spread_of(model: BoxErrors, some: Boxes, pose: tuple[float, float, float]) -> np.ndarray:
+    return model.covariances_m2(some.xy_m, some.score, pose)
+
+
 def ego(own: Boxes, *others: SourceBoxes, errors: BoxErrors = FLAT) -> EgoSources:
     return EgoSources(HERE, own, False, others, errors=errors)
 
 
 def test_a_covariance_lies_along_the_sight() -> None:
-    found = FLAT.covariances_m2(boxes((30, 40, 0.5)), HERE)[0]
+    found = spread_of(FLAT, boxes((30, 40, 0.5)), HERE)[0]
     values, axes = np.linalg.eigh(np.array([[found[0], found[1]], [found[1], found[2]]]))
     assert values == pytest.approx([0.09, 0.36], rel=1e-5)
     assert abs(axes[:, 1] @ [0.6, 0.8]) == pytest.approx(1.0)
-    moved = FLAT.covariances_m2(boxes((130, 140, 0.5)), (100.0, 100.0, 2.0))[0]
+    moved = spread_of(FLAT, boxes((130, 140, 0.5)), (100.0, 100.0, 2.0))[0]
     np.testing.assert_array_equal(moved, found)
 
 
 def test_below_the_drone_both_axes_count_alike() -> None:
-    np.testing.assert_allclose(FLAT.covariances_m2(boxes((0, 0, 0.5)), HERE), [[0.225, 0.0, 0.225]], rtol=1e-6)
+    np.testing.assert_allclose(spread_of(FLAT, boxes((0, 0, 0.5)), HERE), [[0.225, 0.0, 0.225]], rtol=1e-6)
 
 
 def synthetic(rng: np.random.Generator, model: BoxErrors, shared: float) -> list[Errors]:
@@ -108,7 +112,7 @@ def test_the_file_is_read_as_it_was_written_and_faults_name_it(tmp_path: Path) -
 
 def test_a_place_is_the_intersection_of_its_boxes_and_all_else_their_average() -> None:
     own, theirs = boxes((30, 40, 0.5)), boxes((30.4, 39.8, 0.9))
-    covariances = FLAT.covariances_m2(own, HERE), FITTED.covariances_m2(theirs, (60.0, 0.0, 1.0))
+    covariances = spread_of(FLAT, own, HERE), spread_of(FITTED, theirs, (60.0, 0.0, 1.0))
     peer = SourceBoxes(theirs, 0.5, HERE, covariance_m2=covariances[1])
     plain = joined_many([ego(own, replace(peer, covariance_m2=None))], "average")[0]
     for common_share, given in ((FLAT.common, None), (1.0, 1.0)):
@@ -124,9 +128,9 @@ def test_a_place_is_the_intersection_of_its_boxes_and_all_else_their_average() -
 
 def test_age_grows_a_covariance_by_what_cars_may_have_moved_or_by_a_tracks_velocity() -> None:
     own, theirs = boxes((30, 40, 0.5)), boxes((30.5, 40, 0.5))
-    covariance = FLAT.covariances_m2(theirs, HERE)
+    covariance = spread_of(FLAT, theirs, HERE)
     late = SourceBoxes(theirs, 1.0, HERE, age_s=0.2, covariance_m2=covariance)
-    first = FLAT.covariances_m2(own, HERE)
+    first = spread_of(FLAT, own, HERE)
     for source, more_m2 in (
         (late, MOVING * (SPEED_MPS * 0.2) ** 2),
         (replace(late, velocity_mps=np.zeros((1, 2)), variance_m2=np.array([0.39**2 + 0.05])), 0.05),
@@ -141,7 +145,7 @@ def test_age_grows_a_covariance_by_what_cars_may_have_moved_or_by_a_tracks_veloc
 def test_egos_with_and_without_covariances_are_each_as_alone() -> None:
     own, theirs = boxes((30, 40, 0.5)), boxes((30.4, 39.8, 0.9), (60, 0, 0.3))
     plain = SourceBoxes(theirs, 1.0, HERE)
-    exact = replace(plain, covariance_m2=FLAT.covariances_m2(theirs, HERE))
+    exact = replace(plain, covariance_m2=spread_of(FLAT, theirs, HERE))
     egos = [ego(own, plain), ego(own, exact), ego(own), ego(own, plain, exact)]
     together = joined_many(egos, "nms")
     for one, boxes_ in zip(egos, together, strict=True):
@@ -154,11 +158,9 @@ def test_a_share_brings_the_covariances_of_its_senders_boxes() -> None:
     peer = cross(0.0, 0.0, 0.0)[1]
     share = Share(peer, "uncertain_boxes", 0.0, None, 1.0)
     alone = boxes((30, 40, 0.5))
-    np.testing.assert_array_equal(
-        source_of(share, alone, FLAT).covariance_m2, FLAT.covariances_m2(alone, peer.est_pose)
-    )
+    np.testing.assert_array_equal(source_of(share, alone, FLAT).covariance_m2, spread_of(FLAT, alone, peer.est_pose))
     of_another = source_of(share._replace(boxes=alone, errors=FITTED), None, FLAT)
-    np.testing.assert_array_equal(of_another.covariance_m2, FITTED.covariances_m2(alone, peer.est_pose))
+    np.testing.assert_array_equal(of_another.covariance_m2, spread_of(FITTED, alone, peer.est_pose))
     assert source_of(share._replace(representation="detections"), alone, FLAT).covariance_m2 is None
     with pytest.raises(InputError, match="does not tell how uncertain its boxes are: let policies send detections"):
         source_of(share, alone)
