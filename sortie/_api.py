@@ -187,6 +187,20 @@ class Comparison:
         return Summary(comparison_table(flown), *explanations(flown), *more)
 
     @user_errors()
+    def report(self, path: str | Path) -> Path:
+        """Write the comparison as one self-contained HTML page: the table, and figures of all policies.
+
+        Raises:
+            RunError: the file cannot be written, or matplotlib (extra `report`) is not installed.
+        """
+        from sortie.sim.studies.compare import Flown
+        from sortie.sim.studies.comparison_page import save_comparison_page
+
+        place = as_path("path", path)
+        save_comparison_page(Flown(self.sorties, self.gains), place, self.precision)
+        return place
+
+    @user_errors()
     def save_recording(self, path: str | Path) -> Path:
         """Save the policies' sorties of the first seed side by side as one Rerun recording.
 

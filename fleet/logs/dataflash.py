@@ -36,6 +36,8 @@ class RawLog:
     """Message name → field → values, in the log's order."""
     problems: tuple[str, ...]
     """What was damaged, in plain words."""
+    utc_s: float | None = None
+    """Seconds since 1970 at which the log's clock is 0, if the file says so itself."""
 
     def parameters(self) -> dict[str, float]:
         """The vehicle's parameters, by name; the last value where one was set anew."""

@@ -35,6 +35,11 @@ _FIX_FIELDS = ("latitude_deg", "longitude_deg", "altitude_msl_m")
 """PX4's from 1.14 on."""
 _TIMES = ("TimeUS", "TimeMS", "timestamp")
 
+_GPS_EPOCH_S = 315_964_800.0
+"""1980-01-06 in seconds since 1970."""
+_LEAP_WEEKS, _LEAP_S = (1695, 1851, 1930), 15
+"""GPS weeks from which one leap second more counts, and how many there were before."""
+
 Found = dict[str, tuple[Array, Array]]
 """Name of a FlightLog field → times, s by the log's clock, and values [K, C]; `fix` holds degrees and metres."""
 
@@ -134,6 +139,24 @@ def from_ulog(raw: RawLog) -> tuple[Found, str]:
         unit, heard = "percent", remote["rssi"] >= 0
         found["rssi"] = _stacked(_seconds(remote)[heard], remote["rssi"][heard])
     return found, unit
+
+
+def utc_at_zero_s(raw: RawLog) -> float | None:
+    """Seconds since 1970 at which the log's clock is 0, by its GNSS or its own stamps; None where it does not say.
+
+    The median over all fixes: a receiver's first times may be wrong.
+    """
+    if gps := _first_of(raw.tables.get("GPS", {})):
+        for week, milliseconds in (("GWk", "GMS"), ("Week", "TimeMS")):
+            if week in gps and milliseconds in gps and "Status" in gps and (fixed := gps["Status"] >= 3).any():
+                weeks = gps[week][fixed].astype(np.float64)
+                leap_s = np.searchsorted(_LEAP_WEEKS, weeks, side="right") + _LEAP_S
+                utc_s = _GPS_EPOCH_S + weeks * 604_800 + gps[milliseconds][fixed] * 1e-3 - leap_s
+                return float(np.median(utc_s - _seconds(gps, "T")[fixed]))
+    gps = raw.tables.get("vehicle_gps_position", {})
+    if "time_utc_usec" in gps and (known := gps["time_utc_usec"] > 0).any():
+        return float(np.median(gps["time_utc_usec"][known] * 1e-6 - _seconds(gps)[known]))
+    return raw.utc_s
 
 
 def with_fields(tables: Mapping[str, Table], problems: list[str]) -> dict[str, Table]:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sortie.fleet.logs.dataflash import RawLog, is_dataflash, read_dataflash
-from sortie.fleet.logs.fields import Found, from_dataflash, from_tlog, from_ulog, with_fields
+from sortie.fleet.logs.fields import Found, from_dataflash, from_tlog, from_ulog, utc_at_zero_s, with_fields
 from sortie.fleet.logs.ulog import is_ulog, read_ulog
 from sortie.scenarios.errors import SortieError
 
@@ -72,6 +72,13 @@ class FlightLog:
     """Latitude and longitude in degrees, and metres above mean sea level."""
     parameters: Mapping[str, float]
     problems: tuple[str, ...]
+    utc_s: float | None = None
+    """Seconds since 1970 at its begin; None where the log does not say."""
+
+    @property
+    def name(self) -> str:
+        """The file, and the system where it is one of several."""
+        return self.path.name if self.system is None else f"{self.path.name} system {self.system}"
 
     @property
     def origin_deg(self) -> tuple[float, float] | None:
@@ -138,7 +145,8 @@ def _assembled(
     several = sorted(name for name in raw.tables if name.startswith("battery_status."))
     if several:
         problems.append(f"{len(several) + 1} batteries, the first is taken")
-    found, unit = translate(RawLog(with_fields(raw.tables, problems), raw.problems))
+    whole = RawLog(with_fields(raw.tables, problems), raw.problems, raw.utc_s)
+    found, unit = translate(whole)
     found = {name: _sound(name, *each, problems) for name, each in found.items() if len(each[0])}
     found = {name: each for name, each in found.items() if len(each[0])}
     fix = None
@@ -151,6 +159,7 @@ def _assembled(
             found.setdefault("position", (fix[0], local_m(fix[1])))
     begin_s = min((t_s[0] for t_s, _ in found.values()), default=0.0)
     end_s = max((t_s[-1] for t_s, _ in found.values()), default=0.0)
+    utc_s = utc_at_zero_s(whole)
     series = {}
     for name, (t_s, values) in found.items():
         if name == "position":
@@ -182,6 +191,7 @@ def _assembled(
         fix=None if fix is None else Series(fix[0] - begin_s, fix[1]),
         parameters=raw.parameters(),
         problems=tuple(problems),
+        utc_s=None if utc_s is None or not math.isfinite(utc_s) else utc_s + begin_s,
     )
 
 

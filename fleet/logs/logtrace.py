@@ -87,6 +87,47 @@ def _columns(log: FlightLog, at_s: Array) -> dict[str, Array]:
     return {name: column for name, column in columns.items() if not np.isnan(column).all()}
 
 
+def on_one_clock(logs: Sequence[FlightLog], *, together: bool = False) -> tuple[FlightLog, ...]:
+    """Flights of several files with `begin_s` by one clock: seconds since 1970, as each file has it from its GNSS.
+
+    Vehicles of one file keep the clock that they share. A file that does not say when it began begins with the first
+    of the others, and that is told.
+
+    Args:
+        logs: the flights, those of one file one after another.
+        together: let every file begin at the same time, whatever their clocks say.
+
+    Raises:
+        LogError: a file has no moment in common with the others; the message names it.
+    """
+    files = {log.path: [each for each in logs if each.path == log.path] for log in logs}
+    known_s = {
+        path: min(log.utc_s for log in of if log.utc_s is not None)
+        for path, of in files.items()
+        if not together and any(log.utc_s is not None for log in of)
+    }
+    first_s = min(known_s.values(), default=0.0)
+    placed: list[FlightLog] = []
+    for path, of in files.items():
+        begin_s = known_s.get(path, first_s)
+        unknown = path not in known_s and not together and len(files) > 1
+        told = ("it does not say when it began: it begins with the first log",) * unknown
+        own_s = min(log.begin_s for log in of)
+        placed += [replace(log, begin_s=begin_s + log.begin_s - own_s, problems=(*log.problems, *told)) for log in of]
+    for log in placed:
+        others = [each for each in placed if each is not log]
+        if others and not any(_overlap(log, each) for each in others):
+            away_s = min(max(each.begin_s - log.begin_s, log.begin_s - each.begin_s) for each in others)
+            raise LogError(
+                f"{log.path}: has no moment in common with the other logs ({away_s:.0f} s away); --together lets all begin at once"
+            )
+    return tuple(placed)
+
+
+def _overlap(a: FlightLog, b: FlightLog) -> bool:
+    return a.begin_s < b.begin_s + b.duration_s and b.begin_s < a.begin_s + a.duration_s
+
+
 def beside(logs: Sequence[FlightLog]) -> tuple[FlightLog, ...]:
     """The vehicles of one log on one clock, and in metres from the first place on the globe of the first that has one.
 

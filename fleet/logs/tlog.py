@@ -57,7 +57,7 @@ def read_tlog(data: bytes) -> dict[int, RawLog]:
         tables = {name: _columns(rows, begin_us) for name, rows in kept.items()}
         tables["PARM"] = parameter_table({row["param_id"]: float(row["param_value"]) for _, row in settings})
         own_told = [f"the vehicle restarted {own.restarts} times"] if own.restarts else []
-        logs[system] = RawLog(tables, (*told, *own_told))
+        logs[system] = RawLog(tables, (*told, *own_told), begin_us * 1e-6)
     return logs
 
 

@@ -46,6 +46,9 @@ def compare(
     recording: Annotated[
         Path | None, typer.Option(help="Save the first seed's sorties side by side as a Rerun recording.")
     ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write the comparison as one self-contained HTML page here.")
+    ] = None,
     readme: Annotated[
         Path | None, typer.Option(help="Write the comparison between the markers of this Markdown file.")
     ] = None,
@@ -86,7 +89,7 @@ def compare(
     if conditions is not None:
         refuse(
             {
-                "seed": seed, "seeds": seeds, "own-fusion": own_fusion or None, "recording": recording, "readme": readme,
+                "seed": seed, "seeds": seeds, "own-fusion": own_fusion or None, "recording": recording, "report": report, "readme": readme,
                 "half-width": half_width, "metric": metric, "pilot": pilot, "most-seeds": most_seeds, "kept": kept,
             }
         )  # fmt: skip
@@ -96,7 +99,7 @@ def compare(
         raise RunError(f"--by-torch goes with a set of conditions; for {scenario}: --set perception.detector=torch")
     labels = split_policies(policies)
     base = [loaded(scenario, set_, label) for label in labels][0]  # noqa: RUF015  every policy's notes are printed
-    ensure_files(out_file, recording, kept)
+    ensure_files(out_file, recording, report, kept)
     ensure_between(readme, BEGIN, END)
     if half_width is not None:
         if seeds is not None or recording is not None:
@@ -104,10 +107,10 @@ def compare(
         first = []
         if seed is not None:  # in the town that a comparison of several seeds gives it
             first = [f"seed={seed}", f"perception.scene.seed={in_town_of(base, seed).perception.scene.seed}"]
-        with stages() as report:
+        with stages() as stage_bar:
             compared = sortie.compare(
                 scenario, labels, [*(set_ or []), *first], own_fusion=own_fusion,
-                progress=lambda stage, done, of: report(stage, done, round(of)), half_width=half_width, metric=metric or METRICS[0], pilot=pilot, most_seeds=most_seeds,
+                progress=lambda stage, done, of: stage_bar(stage, done, round(of)), half_width=half_width, metric=metric or METRICS[0], pilot=pilot, most_seeds=most_seeds,
                 kept=kept or True,
             )  # fmt: skip
     else:
@@ -125,6 +128,9 @@ def compare(
     if out_file is not None:
         write_text(out_file, json.dumps(_plain(compared), indent=2, allow_nan=False) + "\n")
         out.print(f"kept in [bold]{out_file}[/bold]")
+    if report is not None:
+        compared.report(report)
+        out.print(f"kept in [bold]{report}[/bold]", soft_wrap=True)
     if readme is not None:
         command = compare_command(
             scenario, policies, seed, seeds, set_ or [], own_fusion=own_fusion, half_width=half_width, metric=metric

@@ -28,6 +28,9 @@ AP_WINDOW_S = 5.0
 MARKED = ("ap", "battery", "goodput", "traffic", "age", "lost", "medium")
 """Plots in which phase changes and events are marked."""
 EVENT_LANE: c.Rgba = (150, 108, 20, 255)
+OVER = "·"
+"""What every lane shows after the end: lanes go on to the right of it."""
+OVER_COLOUR: c.Rgba = (0, 0, 0, 255)
 RUNGS = ("nothing", *list(REPRESENTATION_OF)[1:])
 FATES: dict[str, c.Rgba] = {"expired": (225, 222, 240, 255), "lost": (255, 50, 70, 255)}
 """Colours of traffic that did not arrive; what arrived has its representation's colour."""
@@ -57,6 +60,7 @@ class Charts:
         self._lane_colours: dict[int, dict[str, c.Rgba]] = defaultdict(dict)
         self._phase: dict[int, str] = {}
         self._event_texts: list[str] = []
+        self._over = False
 
     def begin(self) -> None:
         """Name and colour every plot line that is known beforehand."""
@@ -67,7 +71,8 @@ class Charts:
             canvas.static(f"plots/goodput/{i}", line(f"drone {i}", colour))
         phases = list(c.PHASES)
         for group in range(len(self._scenario.mission.phases_of)):
-            states = rr.StateConfiguration(values=phases, colors=[c.PHASES[p] for p in phases])
+            colours = [*(c.PHASES[p] for p in phases), OVER_COLOUR]
+            states = rr.StateConfiguration(values=[*phases, OVER], colors=colours)
             canvas.static(phase_lane(group), states)
         canvas.static("plots/ap/full_scene", line("full scene", (120, 200, 255, 255), width=2.5))
         canvas.static("plots/ap/mission", line("mission disc", c.MISSION, width=2.5))
@@ -96,6 +101,8 @@ class Charts:
         self._decisions(new["directives"])
         self._down(states)
         self._events(new["events"])
+        if known_s >= self._scenario.duration_s and not self._over:
+            self._end_lanes()
 
     def _seconds(self, known_s: float) -> list[tuple[float, float]]:
         """The seconds (begin, end) that are whole by now; the last one of a sortie may be short."""
@@ -250,6 +257,23 @@ class Charts:
             self._canvas.static(path, rr.StateConfiguration(values=list(colours), colors=list(colours.values())))
         self._state(path, t_s, level)
 
+    def _end_lanes(self) -> None:
+        """Let every lane end with the sortie."""
+        self._over, end_s = True, self._scenario.duration_s
+        for drone in self._lanes:
+            colours = {**self._lane_colours[drone], OVER: OVER_COLOUR}
+            lane = rr.StateConfiguration(values=list(colours), colors=list(colours.values()))
+            self._canvas.static(f"lanes/drone_{drone}", lane)
+            self._state(f"lanes/drone_{drone}", end_s, OVER)
+        for group in self._phase:
+            self._state(phase_lane(group), end_s, OVER)
+        if self._event_texts:
+            self._event_lane([*self._event_texts, OVER], [EVENT_LANE] * len(self._event_texts) + [OVER_COLOUR])
+            self._state("lanes/events", end_s, OVER)
+
+    def _event_lane(self, texts: list[str], colours: list[c.Rgba]) -> None:
+        self._canvas.static("lanes/events", rr.StateConfiguration(values=texts, colors=colours))
+
     def _state(self, path: str, t_s: float, state: str) -> None:
         self._canvas.columns(path, np.array([t_s]), rr.StateChange.columns(state=[state]))
 
@@ -262,8 +286,7 @@ class Charts:
             self._canvas.columns("log/events", np.array(t_s), columns)
             self._marks("event", t_s)
             self._event_texts += [text for text in dict.fromkeys(texts) if text not in self._event_texts]
-            colours = [EVENT_LANE] * len(self._event_texts)
-            self._canvas.static("lanes/events", rr.StateConfiguration(values=self._event_texts, colors=colours))
+            self._event_lane(self._event_texts, [EVENT_LANE] * len(self._event_texts))
             self._canvas.columns("lanes/events", np.array(t_s), rr.StateChange.columns(state=texts))
 
     def _marks(self, kind: str, t_s: list[float]) -> None:

@@ -56,5 +56,5 @@ def _plot(scenario: Scenario, labels: Sequence[str], name: str, entity: str, y: 
         },
         axis_x=time_axis(scenario),
         axis_y=None if y is None else rrb.ScalarAxis(range=y),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
     )

@@ -9,6 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from sortie.fleet.coverage import cameras_of, footprint_radius_m
+from sortie.perception.scene.scene_model import MARGIN_M
 from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback.canvas import SIM_TIME, SPAN_M
@@ -27,6 +28,10 @@ Pale spheres are the people themselves.
 
 EGO = 0
 """Whose detections are shown until another's are switched on."""
+LEGEND_SHARE = 0.3
+"""Of the sortie's time, to the right of it."""
+MAP_EDGE_M = 50.0
+"""The map shows so much around the fleet's way."""
 MAX_LANES = 8
 """Lanes of more drones than this would push the plots out."""
 
@@ -34,7 +39,8 @@ LEGEND = """
 **{name}**: {description}
 
 Each drone has one colour, here and in the plots; its label is its number and charge, the **ring** on the ground
-what its camera sees straight below. Drones are drawn {span:.0f} m wide. The **pink ring** is the mission disc.
+what its camera sees straight below. Drones are drawn {span:.0f} m wide. The **pink ring** is the mission region, on the
+ground and once more above the roofs. An **orange ball** is a jammer that is on. The **map** has north up.
 
 **Arrows** are links: as wide as the traffic of the last second; green carries 100 Mb/s or more, yellow 10,
 red 1 or less; grey: nothing is sent; a **red cross**: all but gone. **Marks** on the plots' floors: yellow, something
@@ -43,44 +49,70 @@ happened to the fleet; pink, the phase changed.
 """
 
 
-def blueprint(scenario: Scenario, *, live: bool = False) -> rrb.Blueprint:
-    """Scene and decisions on the left, causes and costs over time on the right."""
+def blueprint(
+    scenario: Scenario, *, live: bool = False, spread_m: float | None = None, town_m: tuple[float, float] | None = None
+) -> rrb.Blueprint:
+    """Scene, decisions and map on the left, causes and costs over time on the right.
+
+    Args:
+        scenario: what flies.
+        live: whether it is still flying.
+        spread_m: how far drones fly from the fleet's middle; None: as in the formation.
+        town_m: width and height of the town that is drawn; the map then shows the middle of it, where the fleet flies.
+    """
     axis = time_axis(scenario)
 
-    def plot(name: str, folder: str, y: tuple[float, float] | None = None, *, legend: bool = True) -> rrb.View:
+    def plot(name: str, folder: str, y: tuple[float, float] | None = None) -> rrb.View:
         return rrb.TimeSeriesView(
             name=name,
             contents=[f"/plots/{folder}/**"],
             axis_x=axis,
             axis_y=None if y is None else rrb.ScalarAxis(range=y),
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
         )
 
     plots: list[rrb.View | rrb.Container] = [
         lanes_view(scenario),
-        plot("battery, %", "battery", legend=False),
-        plot("goodput, mean of a drone's links, Mb/s", "goodput", legend=False),
-        plot("traffic, Mb/s: features green, boxes orange; too late white, lost red", "traffic", legend=False),
-        rrb.Horizontal(
-            plot("age of descriptors, 99th percentile, ms", "age", legend=False),
-            plot("descriptors lost, %", "lost", legend=False),
-            plot("channel busy, %", "medium", (0.0, 104.0), legend=False),
+        rrb.Tabs(
+            plot("goodput, mean of a drone's links, Mb/s", "goodput"), plot("battery, %", "battery", (0.0, 104.0))
+        ),
+        plot("traffic by what became of it, Mb/s", "traffic"),
+        rrb.Tabs(
+            plot("age of descriptors, 99th percentile, ms", "age"),
+            plot("descriptors lost, %", "lost", (0.0, 104.0)),
+            plot("channel busy, %", "medium", (0.0, 104.0)),
         ),
     ]
-    shares = [1.0, 1.0, 1.2, 0.9]
+    shares = [1.2, 1.2, 1.0]
     if scenario.perception.detector != "none":
-        plots.insert(1, plot("AP@0.5, last 5 s: full scene blue, mission disc pink", "ap", (0.0, 1.0), legend=False))
+        plots.insert(1, plot("AP@0.5, last 5 s", "ap", (0.0, 1.0)))
         shares.insert(0, 1.2)
     lanes_height = 0.07 + 0.048 * (
         min(scenario.fleet.drones, MAX_LANES) + 2
     )  # part of the window that shows every lane
     shares.insert(0, sum(shares) * lanes_height / (1.0 - lanes_height))
     about = rrb.TextDocumentView(name="how to read this", contents=["/about"])
+    above = rrb.Spatial2DView(
+        name="map",
+        origin="/map",
+        contents="/map/**",
+        background=(20, 24, 30, 255),
+        visual_bounds=None if town_m is None else _middle(town_m),
+    )
     left = rrb.Vertical(
-        scene_view(scenario), rrb.Horizontal(log_view(), about, column_shares=[1, 1]), row_shares=[12, 5]
+        scene_view(scenario, spread_m=spread_m),
+        rrb.Horizontal(log_view(), rrb.Tabs(above, about), column_shares=[5, 4]),
+        row_shares=[11, 8],
     )
     body = rrb.Horizontal(left, rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2])
     return sheet(body, live=live)
+
+
+def _middle(town_m: tuple[float, float]) -> rrb.VisualBounds2D:
+    """The town but for its margin, and a little of that."""
+    edge_m = MARGIN_M - MAP_EDGE_M
+    (width_m, height_m) = town_m
+    return rrb.VisualBounds2D(x_range=(edge_m, width_m - edge_m), y_range=(edge_m, height_m - edge_m))
 
 
 def sheet(body: rrb.Container, *, live: bool = False) -> rrb.Blueprint:
@@ -101,8 +133,10 @@ def sheet(body: rrb.Container, *, live: bool = False) -> rrb.Blueprint:
     )
 
 
-def scene_view(scenario: Scenario, root: str = "", name: str = "the fleet over the town") -> rrb.View:
-    """The 3-D scene below `root`, from an eye that flies along."""
+def scene_view(
+    scenario: Scenario, root: str = "", name: str = "the fleet over the town", spread_m: float | None = None
+) -> rrb.View:
+    """The 3-D scene below `root`, from an eye that flies along and sees all drones and what they see on the ground."""
     fleet, n = scenario.fleet, scenario.fleet.drones
     altitude_m = fleet.formation.altitude_m
     offsets = slots(fleet.formation.shape, max(1, len(fleet.in_formation)), fleet.formation.spacing_m)
@@ -110,7 +144,7 @@ def scene_view(scenario: Scenario, root: str = "", name: str = "the fleet over t
         footprint_radius_m(height_m, cameras)
         for height_m, cameras in zip(fleet.altitudes_m, cameras_of(fleet), strict=True)
     )
-    reach_m = float(np.abs(offsets).max()) + widest_m
+    reach_m = (float(np.abs(offsets).max()) if spread_m is None else spread_m) + widest_m
     hidden: dict[str | rr.encodings.EntityPath, Any] = {
         f"{root}/world/{what}/{i}": rrb.EntityBehavior(visible=False)
         for what in ("seen", "received")
@@ -155,12 +189,12 @@ def lanes_view(
 
 
 def time_axis(scenario: Scenario) -> rrb.TimeAxis:
-    """The whole sortie, whatever other views show."""
+    """The whole sortie, whatever other views show, and room beside it where a legend hides no curve."""
     return rrb.TimeAxis(
         link="Independent",
         view_range=rrb.TimeRange(
             start=rrb.TimeRangeBoundary.absolute(seconds=0.0),
-            end=rrb.TimeRangeBoundary.absolute(seconds=scenario.duration_s),
+            end=rrb.TimeRangeBoundary.absolute(seconds=(1.0 + LEGEND_SHARE) * scenario.duration_s),
         ),
     )
 

@@ -25,8 +25,10 @@ from sortie.perception.scene.town import KERB_M, LANE_M, PAVEMENT_M
 from sortie.perception.scene.traffic import Cars
 from sortie.perception.types import Boxes
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.events import Jam
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import SPAN_M, Canvas, Floats
+from sortie.sim.playback.ground_map import GroundMap
 from sortie.sim.playback.links import LinkArrows
 from sortie.sim.playback.received import ReceivedCells
 from sortie.sim.results.sightings import Sighting
@@ -57,6 +59,10 @@ class Drawing:
         self._frames = 0
         self._resting: dict[int, Floats] = {}
         self._discs_shown = dict.fromkeys(self._groups, False)
+        self._map = GroundMap(canvas, scenario, scene)
+        self._jams = [event for event in scenario.events if isinstance(event, Jam)]
+        self._jamming: list[Jam] = []
+        self._roofs_m = 0.0
 
     # --- what holds at all times -----------------------------------------------------------------
 
@@ -77,6 +83,10 @@ class Drawing:
                 canvas.static(f"world/footprints/{i}", ring)
             for name, width in (("found", 2.0), ("missed", 1.5), ("false", 1.5)):
                 canvas.static(f"world/seen/{i}/{name}", rr.Boxes3D.from_fields(radii=[-width]))
+        canvas.static(
+            "world/jammers",
+            rr.Points3D.from_fields(radii=[2.0], colors=[c.JAMMER], labels=["jammer"], show_labels=True),
+        )
         self._links.begin()
         self._received.begin()
         canvas.static("world/people", rr.Points3D.from_fields(radii=[PERSON_DRAWN_M / 2], colors=[c.PEOPLE]))
@@ -108,6 +118,8 @@ class Drawing:
         blocks = self._scene.town.blocks(x0, y0, x1, y1)
         houses = np.concatenate([b.buildings for b in blocks])
         houses = houses[_inside(houses[:, :2], self._scene.rect) & _inside(houses[:, 2:4], self._scene.rect)]
+        self._map.begin(ground, houses)
+        self._roofs_m = float(houses[:, 4].max()) if len(houses) else 0.0
         if len(houses):
             low, high, top = houses[:, :2], houses[:, 2:4], houses[:, 4]
             tone = _mix((150, 112, 98), (186, 184, 180), houses[:, 5])
@@ -148,6 +160,8 @@ class Drawing:
         for group in self._groups:
             self._mission(group, new["mission"].filter(pc.equal(new["mission"]["group"], group)))
         self._follow(t_s)
+        self._map.add(t_s, position, new["mission"])
+        self._jammers(t_s)
         self._seen(list(seen))
 
     def _land(self, t_s: Floats, position: Floats, attitude: Floats, airborne: NDArray[np.bool_]) -> None:
@@ -239,7 +253,7 @@ class Drawing:
         there = ~np.isnan(radius)
         before = np.concatenate([[self._discs_shown[group]], there])[: len(there)]
         for k in np.flatnonzero(there != before).tolist():
-            ring = [CIRCLE] if there[k] else []
+            ring = self._cage() if there[k] else []
             strips = rr.LineStrips3D.columns(strips=ring).partition([len(ring)])
             self._canvas.columns(f"{path}/disc", t_s[k : k + 1], strips)
         if len(there):
@@ -247,6 +261,23 @@ class Drawing:
         centre = np.column_stack([x, y, np.full(len(x), 0.6)])[there]
         scale = np.column_stack([radius, radius, np.ones(len(x))])[there]
         self._canvas.columns(path, t_s[there], rr.Transform3D.columns(translation=centre, scale=scale))
+
+    def _cage(self) -> list[Floats]:
+        """A region of radius 1: a ring on the ground and one over the roofs, which no house hides, on posts."""
+        over = CIRCLE + np.array((0.0, 0.0, self._roofs_m + 1.0))
+        posts = [np.stack([CIRCLE[k], over[k]]) for k in range(0, len(CIRCLE) - 1, 6)]
+        return [CIRCLE, over, *posts]
+
+    def _jammers(self, t_s: Floats) -> None:
+        """Show the jammers that are on, from the frame in which one begins or ends."""
+        for t in t_s.tolist():
+            on = [jam for jam in self._jams if jam.at_s <= t < (np.inf if jam.until_s is None else jam.until_s)]
+            if on != self._jamming:
+                self._jamming = on
+                places = np.array([jam.position_m for jam in on]).reshape(-1, 3)
+                columns = rr.Points3D.columns(positions=places).partition([len(on)])
+                self._canvas.columns("world/jammers", np.array([t]), columns)
+                self._map.jammers(t, places[:, :2])
 
     def _follow(self, t_s: Floats) -> None:
         """The pins over the targets."""

@@ -12,10 +12,12 @@ from sortie.scenarios.schema import Fleet, GroundStation
 from sortie.sim.folders import write_text
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.results.report_figures import colour, figures
+from sortie.sim.results.report_figures import colour, figures, moments
 from sortie.sim.results.sentences import decision_in_words, event_in_words, losses_in_words
 from sortie.sim.results.summary import PLURAL
 
+MOST_EVENTS = 30
+"""Listed above the figures; the table of decisions has all."""
 STYLE = """
 :root { color-scheme: light; }
 body { font: 15px/1.55 system-ui, sans-serif; color: #1c2128; background: #f4f5f7; margin: 0; }
@@ -32,6 +34,7 @@ table { border-collapse: collapse; width: 100%; overflow: hidden; } th { text-al
 td, th { padding: .35rem .8rem; border-top: 1px solid #eceef1; vertical-align: top; }
 td.t { text-align: right; font-variant-numeric: tabular-nums; width: 5rem; color: #5a6472; }
 .event td { background: #fdf6df; } i { display: inline-block; width: .7em; height: .7em; border-radius: 50%; margin-right: .5em; }
+.events { list-style: none; padding: 0; margin: .4rem 0 1rem; color: #6b5200; } .events b { display: inline-block; min-width: 1.6em; }
 details { padding: .6rem 1rem; margin-top: .7rem; } pre { overflow-x: auto; font-size: .8rem; }
 footer { color: #5a6472; font-size: .85rem; margin-top: 2rem; }
 """
@@ -68,8 +71,8 @@ def page(record: SortieRecord) -> str:
 <p>{escape(scenario.description)}</p>
 <div class="tiles">{"".join(_tile(*tile) for tile in _tiles(result))}</div>
 <h2>What happened</h2>
-<p>Dashed lines: the mission's phase changes. Dotted lines: something happened to the fleet.</p>
-{drawn}
+<p>Dashed lines: the mission's phase changes. Dotted lines: something happened to the fleet, by number:</p>
+{_happened(record)}{drawn}
 <h2>Who decided what, and why</h2>
 {_decisions(result)}
 <h2>In numbers</h2>
@@ -79,6 +82,18 @@ def page(record: SortieRecord) -> str:
 </main></body>
 </html>
 """
+
+
+def _happened(record: SortieRecord) -> str:
+    """The events by the numbers that they have in the figures."""
+    events = moments(record)
+    items = "".join(
+        f"<li><b>{k}</b> {t_s:g} s: {escape('; '.join(texts))}</li>"
+        for k, (t_s, texts) in enumerate(events[:MOST_EVENTS], start=1)
+    )
+    more = len(events) - MOST_EVENTS
+    items += f"<li>and {more} more in the table below</li>" if more > 0 else ""
+    return f'<ul class="events">{items or "<li>nothing</li>"}</ul>'
 
 
 def _tile(name: str, value: str, note: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -15,16 +16,19 @@ from sortie.perception.metrics.ap import average_precision
 from sortie.perception.scene.traffic import TargetPath
 from sortie.scenarios.link_state import is_tried
 from sortie.scenarios.representation import REPRESENTATION_OF
+from sortie.scenarios.schema.events import Jam
 from sortie.sim.folders import RunError
 from sortie.sim.results.accuracy import matched
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
+from sortie.sim.results.sentences import event_in_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
+Drawer = Callable[["Axes", SortieRecord], None]
 
 DRONES = ("#2f6fd0", "#d9780f", "#8a4fd0", "#0f9a8b", "#d0407a", "#9a8a12", "#4f88b8", "#b5603c", "#6a9a3a", "#85756d")
 """Colours of drones, on white."""
@@ -34,7 +38,9 @@ SENT = {
 }  # fmt: skip
 HANDSHAKES = "#a89a3c"
 FATES = {"lost": "#d02f45", "expired": "#8a90a0"}
-MISSION, EVENT = "#d02fae", "#a8830d"
+MISSION, EVENT, JAMMER = "#d02fae", "#8a6a00", "#c8201f"
+DISCS = 6
+"""A mission region that moves is drawn on the map at so many times."""
 WINDOW_S = 5.0
 """Accuracy is drawn over this long before each second, as in the playback."""
 
@@ -50,37 +56,66 @@ def figures(record: SortieRecord) -> dict[str, str]:
     Raises:
         RunError: matplotlib is not installed.
     """
+    plots: list[tuple[str, float, Drawer]] = [
+        (
+            "What each drone was to send on its best link (upper bar), and the best that arrived each second (lower bar)",
+            0.6 + 0.45 * _drones(record),
+            _lanes,
+        ),
+        ("Accuracy of all drones over the last five seconds, AP@0.5", 2.6, _accuracy),
+        ("Traffic by representation and fate, Mb/s", 2.6, _traffic),
+        ("Goodput, mean of each drone's links measured lately and of each second, Mb/s", 2.6, _goodput),
+        ("Battery, %", 2.4, _battery),
+        ("Age of descriptors when a policy read them, 99th percentile, ms", 2.2, _age),
+        ("The way over the ground, m: drones, targets, mission regions and jammers", 5.2, _map),
+    ]
+    if record.detector == "none":
+        del plots[1]
+
+    def over_time(draw: Drawer) -> Callable[[Axes], None]:
+        def both(axes: Axes) -> None:
+            draw(axes, record)
+            if draw is not _map:
+                mark_moments(axes, record)
+
+        return both
+
+    return drawn([(caption, height_in, over_time(draw)) for caption, height_in, draw in plots])
+
+
+def drawn(plots: Sequence[tuple[str, float, Callable[[Axes], None]]]) -> dict[str, str]:
+    """Figures of one pair of axes each, by caption, as SVG text; letters stay readable at half the size.
+
+    Args:
+        plots: caption, height in inches (all are 9 wide), and what draws it.
+
+    Raises:
+        RunError: matplotlib is not installed.
+    """
     try:
         import matplotlib as mpl
         from matplotlib.figure import Figure
     except ImportError as error:
         raise RunError("matplotlib is missing: pip install 'sortie-sim[report]'") from error
-    plots: list[tuple[str, float, Any]] = [
-        ("What each drone sent on its best link, and when it changed", 0.4 + 0.34 * (_drones(record) + 1), _lanes),
-        ("Accuracy of all drones over the last five seconds, AP@0.5", 2.2, _accuracy),
-        ("Traffic by representation and fate, Mb/s", 2.2, _traffic),
-        ("Goodput, mean of each drone's links measured lately, Mb/s", 2.2, _goodput),
-        ("Battery, %", 2.0, _battery),
-        ("Age of descriptors when a policy read them, 99th percentile, ms", 1.8, _age),
-        ("The way over the ground, m: drones, and the target with its mission disc", 4.2, _map),
-    ]
-    if record.detector == "none":
-        del plots[1]
     style: dict[Any, Any] = {
-        "svg.hashsalt": "sortie", "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9.0,
+        "svg.hashsalt": "sortie", "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 12.0,
         "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#888888", "axes.grid": True,
-        "grid.color": "#e6e6e6", "axes.axisbelow": True, "legend.frameon": False, "legend.fontsize": 8.0,
+        "grid.color": "#e6e6e6", "axes.axisbelow": True, "legend.frameon": False, "legend.fontsize": 12.0,
+        "legend.handlelength": 1.2, "legend.borderaxespad": 0.2, "legend.labelspacing": 0.3,
     }  # fmt: skip
-    drawn = {}
+    made = {}
     with mpl.rc_context(style):
         for caption, height_in, draw in plots:
             figure = Figure(figsize=(9.0, height_in), layout="constrained")
-            axes = figure.add_subplot()
-            draw(axes, record)
-            if draw is not _map:
-                _moments(axes, record)
-            drawn[caption] = _svg(figure)
-    return drawn
+            draw(figure.add_subplot())
+            made[caption] = _svg(figure)
+    return made
+
+
+def legend_beside(axes: Axes) -> None:
+    """A legend to the right of the axes, where it hides no curve."""
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
 
 
 def _svg(figure: Figure) -> str:
@@ -95,15 +130,36 @@ def _drones(record: SortieRecord) -> int:
     return record.scenario.fleet.drones
 
 
-def _moments(axes: Axes, record: SortieRecord) -> None:
-    """Phase changes and events as lines through the figure; time runs along the whole sortie."""
+def moments(record: SortieRecord) -> list[tuple[float, list[str]]]:
+    """What happened to the fleet: times, each with its events in words; the k-th is marked k + 1 in every figure."""
+    at: dict[float, list[str]] = {}
+    for row in record.tables["events"].to_pylist():
+        at.setdefault(row["t_s"], []).append(event_in_words(row))
+    return sorted(at.items())
+
+
+def mark_moments(axes: Axes, record: SortieRecord) -> None:
+    """Phase changes by name and events by number, as lines through the figure; time runs along the whole sortie."""
+    end_s = record.scenario.duration_s
+    labels: dict[float, list[tuple[str, str]]] = {}
+    for k, (t_s, _) in enumerate(moments(record), start=1):
+        axes.axvline(t_s, color=EVENT, linewidth=1.2, linestyle=":")
+        labels.setdefault(t_s, []).append((str(k), EVENT))
     for phase in chain(*record.scenario.mission.phases_of):
-        if 0 < phase.at_s < record.scenario.duration_s:
-            axes.axvline(phase.at_s, color=MISSION, linewidth=1.0, linestyle="--")
-    for t_s in record.tables["events"]["t_s"].to_pylist():
-        axes.axvline(t_s, color=EVENT, linewidth=1.0, linestyle=":")
-    axes.set_xlim(0.0, record.scenario.duration_s)
-    axes.set_xlabel("s", loc="right")
+        if 0 < phase.at_s < end_s:
+            axes.axvline(phase.at_s, color=MISSION, linewidth=1.2, linestyle="--")
+            labels.setdefault(phase.at_s, []).append((phase.phase, MISSION))
+    free_s = -end_s
+    for t_s, said in sorted(labels.items()):
+        label = " ".join(text for text, _ in said)
+        if t_s >= free_s:  # a label that would lie on the one before is left out
+            axes.annotate(
+                label, (t_s, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
+                ha="center", va="bottom", color=said[-1][1], fontsize=11,
+            )  # fmt: skip
+            free_s = t_s + (0.012 + 0.012 * len(label)) * end_s
+    axes.set_xlim(0.0, end_s)
+    axes.set_xlabel("s", loc="right", labelpad=-2)
 
 
 def _column(table: pa.Table, name: str) -> Floats:
@@ -124,9 +180,11 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
     def close(drone: int, t_s: float) -> None:
         begin_s, kind = since[drone]
         axes.broken_barh(
-            [(begin_s, t_s - begin_s)], (drone - 0.38, 0.76), facecolor=SENT[kind], edgecolor="white", linewidth=0.5
+            [(begin_s, t_s - begin_s)], (drone - 0.42, 0.5), facecolor=SENT[kind], edgecolor="white", linewidth=0.5
         )
 
+    for drone, begin_s, until_s, kind in arrived(record):
+        axes.broken_barh([(begin_s, until_s - begin_s)], (drone + 0.11, 0.26), facecolor=SENT[kind])
     for change in transitions(record.tables["directives"], {}):
         carried |= {(change["drone"], peer): change["to"] for peer in change["peers"]}
         kind = best(carried, change["drone"])
@@ -140,11 +198,36 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
             since[drone] = (down[drone], "nothing")
         close(drone, end_s)
     axes.set_yticks(range(n), [f"drone {i}" for i in range(n)])
-    axes.set_ylim(n - 0.4, -1.3)
+    axes.set_ylim(n - 0.5, -0.5)
     axes.grid(visible=False)
-    for kind in rungs:
+    for kind in rungs[::-1]:
         axes.plot([], [], color=SENT[kind], linewidth=6, label=kind)
-    axes.legend(ncols=len(rungs), loc="upper right")
+    legend_beside(axes)
+
+
+def arrived(record: SortieRecord) -> list[tuple[int, float, float, str]]:
+    """Drone, begin and end in s, and the richest representation of its payloads that reached any peer in that second.
+
+    Seconds that are alike are joined; those in which nothing arrived are left out.
+    """
+    sent = record.tables["transmissions"]
+    came = pc.is_in(sent["status"], pa.array(["delivered", "partial"]))
+    came = pc.and_(came, pc.not_equal(sent["representation"], HANDSHAKE))
+    rows = sent.filter(came)
+    edges, ladder = _edges(record), list(REPRESENTATION_OF)
+    best: dict[tuple[int, int], int] = {}
+    seconds = np.searchsorted(edges, _column(rows, "t_done_s"), side="right") - 1
+    for drone, second, kind in zip(
+        rows["drone"].to_pylist(), seconds.tolist(), rows["representation"].to_pylist(), strict=True
+    ):
+        best[drone, second] = max(best.get((drone, second), 0), ladder.index(kind))
+    spans: list[tuple[int, float, float, str]] = []
+    for (drone, second), level in sorted(best.items()):
+        begin_s, until_s, kind = float(edges[second]), float(edges[min(second + 1, len(edges) - 1)]), ladder[level]
+        if spans and spans[-1][0] == drone and spans[-1][2] == begin_s and spans[-1][3] == kind:
+            begin_s = spans.pop()[1]
+        spans.append((drone, begin_s, until_s, kind))
+    return spans
 
 
 def _down_s(record: SortieRecord) -> dict[int, float]:
@@ -161,21 +244,40 @@ def _edges(record: SortieRecord) -> Floats:
     return np.append(np.arange(0.0, end_s - 1e-9), end_s)
 
 
+def accuracy_points(record: SortieRecord, *, mission: bool) -> Floats:
+    """Second and AP@0.5 of all drones over the `WINDOW_S` before it, [K, 2]; seconds without a fusion are left out."""
+    fusions = matched(record, mission=mission)
+    t_s = np.array([t for t, _ in fusions])
+    frames = list(fusions.values())
+    points = []
+    for end_s in _edges(record)[1:]:
+        within = [frames[k] for k in np.flatnonzero((t_s >= end_s - WINDOW_S) & (t_s < end_s))]
+        if within:
+            points.append((end_s, average_precision(within)))
+    return np.array(points).reshape(-1, 2)
+
+
 def _accuracy(axes: Axes, record: SortieRecord) -> None:
     for mission, label, ink in ((False, "full scene", "#2f6fd0"), (True, "mission disc", MISSION)):
-        fusions = matched(record, mission=mission)
-        t_s = np.array([t for t, _ in fusions])
-        frames = list(fusions.values())
-        points = []
-        for end_s in _edges(record)[1:]:
-            within = [frames[k] for k in np.flatnonzero((t_s >= end_s - WINDOW_S) & (t_s < end_s))]
-            if within:
-                points.append((end_s, average_precision(within)))
-        if points:
-            axes.plot(*np.array(points).T, color=ink, label=label, linewidth=1.6)
+        points = accuracy_points(record, mission=mission)
+        if len(points):
+            axes.plot(*points.T, color=ink, label=label, linewidth=2.0)
     axes.set_ylim(0.0, 1.0)
-    if axes.get_lines():
-        axes.legend(loc="upper left", ncols=2)
+    legend_beside(axes)
+
+
+def delivered_mbps(record: SortieRecord) -> Floats:
+    """Second and payload that arrived in it, Mb/s, [K, 2]."""
+    sent = record.tables["transmissions"].filter(pc.equal(record.tables["transmissions"]["status"], "delivered"))
+    edges = _edges(record)
+    megabits, _ = np.histogram(_column(sent, "t_done_s"), edges, weights=8e-6 * _column(sent, "payload_bytes"))
+    return np.column_stack([edges[1:], megabits / np.diff(edges)])
+
+
+def draw_lanes(axes: Axes, record: SortieRecord) -> None:
+    """What each drone was to send and what arrived, with the moments of the sortie."""
+    _lanes(axes, record)
+    mark_moments(axes, record)
 
 
 def _traffic(axes: Axes, record: SortieRecord) -> None:
@@ -191,9 +293,8 @@ def _traffic(axes: Axes, record: SortieRecord) -> None:
             continue
         megabits, _ = np.histogram(done[kinds == kind], edges, weights=8e-6 * size[kinds == kind])
         ink = FATES.get(fate) or {**SENT, HANDSHAKE: HANDSHAKES}[representation]
-        axes.plot(edges[1:], megabits / np.diff(edges), color=ink, label=kind, linewidth=1.4)
-    if axes.get_lines():
-        axes.legend(loc="upper right", ncols=3)
+        axes.plot(edges[1:], megabits / np.diff(edges), color=ink, label=kind, linewidth=1.8)
+    legend_beside(axes)
     axes.set_ylim(bottom=0.0)
 
 
@@ -207,10 +308,15 @@ def _goodput(axes: Axes, record: SortieRecord) -> None:
     mean = np.where(
         known.any(axis=1), np.where(known, links, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan
     )
+    edges = _edges(record)
     for i in range(_drones(record)):
-        axes.plot(t_s[drone == i], mean[drone == i], color=colour(i), linewidth=1.0, label=f"drone {i}")
+        own = (drone == i) & ~np.isnan(mean)
+        total, _ = np.histogram(t_s[own], edges, weights=mean[own])
+        count, _ = np.histogram(t_s[own], edges)
+        each = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        axes.plot(edges[1:], each, color=colour(i), linewidth=1.6, label=f"drone {i}")
     axes.set_ylim(bottom=0.0)
-    axes.legend(loc="upper right", ncols=5)
+    legend_beside(axes)
 
 
 def _battery(axes: Axes, record: SortieRecord) -> None:
@@ -219,10 +325,11 @@ def _battery(axes: Axes, record: SortieRecord) -> None:
     each = max(1, round(record.scenario.context.rate_hz))  # a point a second is enough
     for i in range(_drones(record)):
         axes.plot(
-            t_s[drone == i][::each], 100.0 * soc[drone == i][::each], color=colour(i), linewidth=1.4, label=f"drone {i}"
+            t_s[drone == i][::each], 100.0 * soc[drone == i][::each], color=colour(i), linewidth=1.6, label=f"drone {i}"
         )
-    axes.set_ylim(0.0, 100.0)
-    axes.legend(loc="lower left", ncols=5)
+    lowest = float(soc.min()) if len(soc) else 0.0
+    axes.set_ylim(max(0.0, 100.0 * np.floor(20.0 * lowest - 0.5) / 20.0), 100.0)
+    legend_beside(axes)
 
 
 def _age(axes: Axes, record: SortieRecord) -> None:
@@ -244,18 +351,43 @@ def _map(axes: Axes, record: SortieRecord) -> None:
         own = (x[drone == i], y[drone == i])
         standing = record.scenario.fleet.station(i) is not None
         name, marker = (f"station {i}", "^") if standing else (f"drone {i}", "o")
-        axes.plot(own[0][::each], own[1][::each], color=colour(i), linewidth=1.0, label=name)
-        axes.plot(own[0][-1:], own[1][-1:], marker, color=colour(i), markersize=4)
+        axes.plot(own[0][::each], own[1][::each], color=colour(i), linewidth=1.6, label=name)
+        axes.plot(own[0][-1:], own[1][-1:], marker, color=colour(i), markersize=7)
     t_s = np.unique(_column(mission, "t_s"))[::each]
     for k, target in enumerate(record.scenario.mission.targets):
         way = np.array([TargetPath.of(target).pose(t)[:2] for t in t_s.tolist()])
-        axes.plot(*way.T, ":", color=MISSION, label="target" if k == 0 else "")
+        axes.plot(*way.T, ":", color=MISSION, linewidth=2.5, zorder=4, label="target" if k == 0 else "")
     for rows in (mission.filter(pc.equal(mission["group"], g)) for g in pc.unique(mission["group"]).to_pylist()):
-        there = np.flatnonzero(~np.isnan(_column(rows, "region_radius_m")))
-        if len(there):
-            from matplotlib.patches import Circle
+        _discs(axes, rows)
+    jammers = [event for event in record.scenario.events if isinstance(event, Jam)]
+    for k, jam in enumerate(jammers):
+        x_m, y_m, _ = jam.position_m
+        axes.plot([x_m], [y_m], "X", color=JAMMER, markersize=11, label="jammer" if k == 0 else "")
+        until = "" if jam.until_s is None else f"–{jam.until_s:g}"
+        axes.annotate(
+            f"{jam.at_s:g}{until} s", (x_m, y_m), xytext=(8, 6), textcoords="offset points", color=JAMMER, fontsize=11
+        )
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("east")
+    axes.set_ylabel("north")
+    legend_beside(axes)
 
-            x_m, y_m, radius_m = (_column(rows, f"region_{c}")[there[-1]] for c in ("x_m", "y_m", "radius_m"))
-            axes.add_patch(Circle((x_m, y_m), radius_m, fill=False, edgecolor=MISSION))
-    axes.set_aspect("equal")
-    axes.legend(loc="best", ncols=3)
+
+def _discs(axes: Axes, rows: pa.Table) -> None:
+    """A group's mission region over time: faint where it was, strong where it was last."""
+    from matplotlib.patches import Circle
+
+    there = np.flatnonzero(~np.isnan(_column(rows, "region_radius_m")))
+    if not len(there):
+        return
+    shown = np.unique(there[np.linspace(0, len(there) - 1, DISCS).astype(int)])
+    for k in shown.tolist():
+        x_m, y_m, radius_m = (_column(rows, f"region_{c}")[k] for c in ("x_m", "y_m", "radius_m"))
+        last = k == shown[-1]
+        axes.add_patch(Circle((x_m, y_m), radius_m, fill=True, facecolor=MISSION, edgecolor="none", alpha=0.06))
+        axes.add_patch(
+            Circle((x_m, y_m), radius_m, fill=False, edgecolor=MISSION, linewidth=1.8, alpha=1.0 if last else 0.35)
+        )
+    if "mission region" not in axes.get_legend_handles_labels()[1]:
+        axes.plot([], [], "o", mfc="none", color=MISSION, markersize=11, label="mission region")
+    axes.autoscale_view()

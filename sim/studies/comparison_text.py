@@ -20,12 +20,11 @@ BEGIN, END = "<!-- compare:begin -->", "<!-- compare:end -->"
 
 def comparison_table(flown: Flown) -> Table:
     """Policies side by side, a column each; gains are over the first, in AP points with paired 95 % intervals."""
-    first = flown.sorties[0]
-    table = Table(title=f"{first.outcome['scenario']} · {_seeds(flown)}", caption=_what_gains_are(flown) or None)
+    table = Table(title=heading(flown), caption=_what_gains_are(flown) or None)
     table.add_column("", style="bold")
     for policy in _by_policy(flown):
         table.add_column(policy, justify="right")
-    for name, cells in _side_by_side(flown).items():
+    for name, cells in side_by_side(flown).items():
         table.add_row(name, *cells)
     return table
 
@@ -37,7 +36,7 @@ def comparison_markdown(flown: Flown, command: str, precision: Precision | None 
     if first["ap50"]["scored_fusions"]:
         head += f", accuracy scored at {first['ap50']['sample_rate_hz']:g} Hz by `{first['ap50']['detector']}`"
     what = " ".join(filter(None, [f"{head}.", _what_gains_are(flown)]))
-    cells = ((name.strip(), *values) for name, values in _side_by_side(flown).items())
+    cells = ((name.strip(), *values) for name, values in side_by_side(flown).items())
     told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
     why = [line.replace("[bold]", "**").replace("[/bold]", "**") for line in told]
     lines = [BEGIN, "", what, "", *table(("", *_by_policy(flown)), cells), "", *(f"- {line}" for line in why), "", END]
@@ -63,6 +62,11 @@ def compare_command(
     said += [] if half_width is None else ["--half-width", f"{half_width:g}"]
     said += [] if metric is None else ["--metric", metric]
     return shlex.join(said + ["--own-fusion"] * own_fusion)
+
+
+def heading(flown: Flown) -> str:
+    """The scenario, and how many sorties the figures are means of."""
+    return f"{flown.sorties[0].outcome['scenario']} · {_seeds(flown)}"
 
 
 def explanations(flown: Flown) -> Iterator[str]:
@@ -136,7 +140,7 @@ def _what_gains_are(flown: Flown) -> str:
     return f"Gains are in AP points over {flown.sorties[0].policy}, paired: {covers}."
 
 
-def _side_by_side(flown: Flown) -> dict[str, list[str]]:
+def side_by_side(flown: Flown) -> dict[str, list[str]]:
     """What is compared, a row each: its name and a cell a policy. Figures are means over the policy's sorties."""
     gains = {(g.policy, g.metric): g for g in flown.gains}
     sorties = {s.seed for s in flown.sorties}

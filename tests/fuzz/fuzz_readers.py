@@ -294,7 +294,7 @@ def _log(path: Path) -> None:
     """All of `sortie import` but for what it writes."""
     from sortie.sim.cli.import_log import flown_log, told
 
-    flights, columns, _ = flown_log(path, path.parent)
+    flights, columns, _ = flown_log([path], path.parent)
     assert all(len(line.splitlines()) == 1 for line in told(flights, columns)), "a problem of more than a line"
 
 

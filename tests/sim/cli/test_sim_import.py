@@ -13,7 +13,7 @@ import pytest
 from sim_examples import example
 from typer.testing import CliRunner
 
-from sortie.fleet.logs.flightlog import read_log
+from sortie.fleet.logs.flightlog import read_log, read_logs
 from sortie.fleet.logs.logtrace import context_trace
 from sortie.fleet.traces import COLUMNS, read_traces
 from sortie.scenarios.errors import SortieError
@@ -202,3 +202,96 @@ def test_a_capacity_that_no_pack_has_is_left_out(capacity: float, tmp_path: Path
     done = CliRunner().invoke(app, ["import", str(log), "--out", str(tmp_path / "out")], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     assert load(tmp_path / "out/scenario.yaml").fleet.battery.capacity_wh == 130.0
+
+
+# --- several logs ----------------------------------------------------------------------------------
+
+
+def gathered(folder: Path, files: dict[str, bytes], *more: str) -> tuple[Path, str]:
+    """The folder that `sortie import` makes of several logs, and what it says."""
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    named = [str(folder / name) for name in files]
+    done = CliRunner().invoke(app, ["import", *named, "--out", str(folder / "out"), *more], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return folder / "out", " ".join(done.output.split())
+
+
+def columns_of(folder: Path, drone: int) -> dict[str, np.ndarray]:
+    table = pq.read_table(folder / "trace.parquet")
+    rows = table["drone"].to_numpy() == drone
+    return {name: table[name].to_numpy()[rows] for name in table.column_names}
+
+
+def test_logs_of_three_kinds_fly_together_by_their_utc(tmp_path: Path) -> None:
+    """The same flight three times: by DataFlash, 2 s later by ULog, and by telemetry that began with the first."""
+    files = {"a.bin": examples.dataflash(), "b.ulg": examples.ulog(late_s=2.0), "c.tlog": examples.tlog()}
+    folder, said = gathered(tmp_path, files)
+    assert "DataFlash and ULog and MAVLink telemetry, 11.9 s" in said
+    assert "3 vehicles: drone 0 is a.bin, drone 1 is b.ulg, drone 2 is c.tlog system 1" in said
+    scenario = load(folder / "scenario.yaml")
+    assert (scenario.fleet.drones, scenario.duration_s) == (3, 11.9)
+    states = run_sortie(scenario).tables["states"]
+    t_s, drone, x = (states[name].to_numpy() for name in ("t_s", "drone", "x_m"))
+    for number, late_s in ((0, 0.0), (1, 2.0), (2, 0.0)):
+        own = (drone == number) & (t_s >= late_s) & (t_s <= late_s + 9.8)
+        np.testing.assert_allclose(x[own], 3 * (t_s[own] - late_s), atol=0.05)
+
+
+def test_a_log_without_utc_begins_with_the_first_and_that_is_told(tmp_path: Path) -> None:
+    files = {"late.bin": examples.dataflash(late_s=100.0), "blind.ulg": examples.ulog()}
+    folder, said = gathered(tmp_path, files)
+    assert "blind.ulg: it does not say when it began: it begins with the first log" in said
+    assert "blind.ulg: it has no place on the globe, and its places are left out" in said
+    assert columns_of(folder, 1)["soc"][0] == pytest.approx(0.9, abs=1e-6)
+
+
+def test_logs_of_different_days_fly_together_only_if_that_is_meant(tmp_path: Path) -> None:
+    files = {"a.bin": examples.dataflash(), "b.bin": examples.dataflash(late_s=86_400.0)}
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    command = ["import", str(tmp_path / "a.bin"), str(tmp_path / "b.bin"), "--out", str(tmp_path / "out")]
+    with pytest.raises(
+        SortieError, match=r"a\.bin: has no moment in common with the other logs \(86400 s away\); --together"
+    ):
+        CliRunner().invoke(app, command, catch_exceptions=False)
+    assert not (tmp_path / "out").exists()
+    folder, said = gathered(tmp_path, files, "--together")
+    assert "DataFlash, 9.9 s" in said
+    np.testing.assert_allclose(columns_of(folder, 0)["x_m"], columns_of(folder, 1)["x_m"], atol=0.01)
+
+
+def test_a_ground_station_stands_where_it_is_said_to_stand(tmp_path: Path) -> None:
+    """100 m north of where the flight began, and 10 m above its altitude; another one without an altitude."""
+    north_deg = 100 / 111_170
+    places = (f"{47 + north_deg},8,410", "47,8.001")
+    folder, _ = gathered(tmp_path, {"a.bin": examples.dataflash()}, "--ground", places[0], "--ground", places[1])
+    scenario = load(folder / "scenario.yaml")
+    assert (scenario.fleet.drones, [station.drone for station in scenario.fleet.ground]) == (3, [1, 2])
+    first, second = columns_of(folder, 1), columns_of(folder, 2)
+    assert (first["x_m"][0], first["y_m"][0]) == pytest.approx((0.0, 100.0), abs=0.1)
+    assert first["z_m"][0] == pytest.approx(2.0 + 10.0, abs=0.05)  # the flight's lowest point is lifted to 2 m
+    assert (second["x_m"][0], second["z_m"][0]) == pytest.approx((76.1, 2.0), abs=0.1)
+    record = run_sortie(scenario)
+    save_tlog(record, tmp_path / "again.tlog", 10**15)
+    fixes = [flight.fix.values for flight in read_logs(tmp_path / "again.tlog") if flight.fix is not None]
+    assert fixes[0][0] == pytest.approx([47.0, 8.0, 400.0], abs=0.05)  # at the same place on the globe
+    said = CliRunner().invoke(app, ["import", str(tmp_path / "a.bin"), "--ground", "north"])
+    assert "origin is 'north', must be latitude,longitude" in str(said.exception)
+    (tmp_path / "blind.ulg").write_bytes(examples.ulog())
+    said = CliRunner().invoke(app, ["import", str(tmp_path / "blind.ulg"), "--ground", "47,8"])
+    assert str(said.exception).endswith(
+        "blind.ulg: has no place on the globe, so that --ground cannot be placed beside it"
+    )
+
+
+def test_what_goes_with_one_log_alone_is_named(tmp_path: Path) -> None:
+    for name in ("a.tlog", "b.tlog"):
+        (tmp_path / name).write_bytes(examples.tlog())
+    a, b = (str(tmp_path / name) for name in ("a.tlog", "b.tlog"))
+    for arguments, message in (
+        ([a, b, "--system", "1"], "--system chooses from one log, and several are named"),
+        ([a, b, a], f"{a}: is named twice"),
+    ):
+        said = CliRunner().invoke(app, ["import", *arguments, "--out", str(tmp_path / "out")])
+        assert str(said.exception) == message

@@ -24,8 +24,9 @@ from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.playback import recording
 from sortie.sim.playback.canvas import goodput_colours
+from sortie.sim.playback.charts import OVER
 from sortie.sim.playback.received import hatch
-from sortie.sim.playback.recording import save_rrd, scene_of
+from sortie.sim.playback.recording import save_rrd, scene_of, spread_m
 from sortie.sim.playback.viewer import LiveViewer, open_viewer, to_file, to_new_viewer
 from sortie.sim.results.accuracy import accuracy, matched
 from sortie.sim.results.outcome import outcome, transitions
@@ -167,7 +168,7 @@ def test_there_is_one_recording_with_its_layout(saved: Path) -> None:
         return sorted(v for b in batches if name in b.schema.names for (v,) in b[name].to_pylist())
 
     assert column("ViewBlueprint:class_identifier") == [
-        "3D", "StateTimeline", "TextDocument", "TextLog", *["TimeSeries"] * 7,
+        "2D", "3D", "StateTimeline", "TextDocument", "TextLog", *["TimeSeries"] * 7,
     ]  # fmt: skip
     assert column("TimePanelBlueprint:timeline") == ["sim_time"]
 
@@ -389,6 +390,7 @@ def test_events_and_phase_changes_are_marked_on_the_plots(rows: Rows) -> None:
     assert [(t_s, v) for t_s, _, v in rows["/lanes/events"]["StateChange:state"]] == [
         (4.0, ["drone 2: links of 2 lose 60 dB"]),
         (6.0, ["drone 3: fell silent"]),
+        (8.0, [OVER]),
     ]
 
 
@@ -404,7 +406,7 @@ def test_goodput_runs_from_red_by_yellow_to_green() -> None:
 def test_the_disc_and_the_target_follow_the_mission(rows: Rows, record: SortieRecord) -> None:
     mission = record.tables["mission"].to_pylist()
     there = [m for m in mission if not math.isnan(m["region_radius_m"])]
-    assert [(t_s, len(v)) for t_s, _, v in rows["/world/mission/disc"]["LineStrips3D:strips"]] == [(3.0, 1)]
+    assert [(t_s, len(v)) for t_s, _, v in rows["/world/mission/disc"]["LineStrips3D:strips"]] == [(3.0, 10)]
     drawn = rows["/world/mission"]["Transform3D:translation"]
     assert [v[0][:2] for _, _, v in drawn] == [
         pytest.approx([m["region_x_m"], m["region_y_m"]], rel=1e-6) for m in there
@@ -416,6 +418,7 @@ def test_the_disc_and_the_target_follow_the_mission(rows: Rows, record: SortieRe
     assert [(t_s, v) for t_s, _, v in rows["/lanes/phase"]["StateChange:state"]] == [
         (0.0, ["search"]),
         (3.0, ["track"]),
+        (8.0, [OVER]),
     ]
 
 
@@ -520,9 +523,55 @@ def test_a_lane_shows_the_best_that_a_drone_sends(rows: Rows) -> None:
     states = [(t_s, v) for t_s, _, (v,) in rows["/lanes/drone_2"]["StateChange:state"]]
     assert any(v.startswith("features") for t_s, v in states if t_s < 4.0)
     assert next(v for t_s, v in states if t_s > 4.0).startswith("detections at 2 Hz")
-    *_, before, last = [(t_s, v) for t_s, _, (v,) in rows["/lanes/drone_3"]["StateChange:state"]]
+    *_, before, last, over = [(t_s, v) for t_s, _, (v,) in rows["/lanes/drone_3"]["StateChange:state"]]
     assert before[1].startswith("features")
     assert last == (6.0, "nothing")  # it was lost then, and nothing was decided on it any more
+    assert over == (8.0, OVER)
+
+
+def test_no_house_hides_the_mission_region(rows: Rows, record: SortieRecord) -> None:
+    """Its second ring lies above every roof."""
+    ((_, _, (ground, above, *posts)),) = rows["/world/mission/disc"]["LineStrips3D:strips"]
+    roofs = rows["/world/town/buildings"]["Boxes3D:half_sizes"][0][2]
+    assert {z for _, _, z in ground} == {0.0}
+    assert {z for _, _, z in above} == {pytest.approx(2 * max(half[2] for half in roofs) + 1.0, rel=1e-5)}
+    assert len(posts) == 8
+
+
+def test_the_map_has_the_fleet_where_it_flew_with_north_up(rows: Rows, record: SortieRecord) -> None:
+    scene, n = scene_of(record), record.scenario.fleet.drones
+    x0, _, _, y1 = scene.rect
+    states = record.tables["states"].to_pylist()
+    drawn = rows["/map/drones"]["Points2D:positions"]
+    assert len(drawn) == record.scenario.frames
+    for frame in (0, 20, 50):
+        expected = [[s["x_m"] - x0, y1 - s["y_m"]] for s in states[n * frame : n * (frame + 1)]]
+        assert np.allclose(drawn[frame][2], expected, atol=1e-2)
+    rings = {t_s: v for t_s, _, v in rows["/map/mission"]["LineStrips2D:strips"]}
+    assert rings[2.5] == []
+    region = next(m for m in record.tables["mission"].to_pylist() if m["t_s"] == pytest.approx(5.0))
+    (ring,) = rings[5.0]
+    assert np.allclose(np.mean(ring[:-1], axis=0), [region["region_x_m"] - x0, y1 - region["region_y_m"]], atol=1e-2)
+    assert len(rows["/map/trails"]["LineStrips2D:strips"][-1][2]) == n
+
+
+def test_a_jammer_is_shown_while_it_is_on(tmp_path: Path) -> None:
+    jam = "events=[{kind: jam, at_s: 1, until_s: 2, position_m: [10, 20, 5]}]"
+    flown = run_sortie(example("duration_s=3", jam))
+    save_rrd(flown, tmp_path / "jam.rrd")
+    rows = read(tmp_path / "jam.rrd")
+    shown = [(t_s, v) for t_s, _, v in rows["/world/jammers"]["Points3D:positions"]]
+    assert shown == [(1.0, [[10.0, 20.0, 5.0]]), (2.0, [])]
+    x0, _, _, y1 = scene_of(flown).rect
+    assert np.allclose(rows["/map/jammers"]["Points2D:positions"][0][2], [[10 - x0, y1 - 20]], atol=1e-3)
+
+
+def test_the_camera_fits_the_fleet_that_flew(tmp_path: Path) -> None:
+    """Two drones 400 m apart are 200 m from their middle; a ground station counts for nothing."""
+    trace = "t_s,drone,x_m,y_m,z_m\n0,0,0,0,60\n0,1,400,0,60\n"
+    (tmp_path / "far.csv").write_text(trace + "0,2,9000,0,2\n")
+    settings = (f"fleet.trace={tmp_path}/far.csv", "fleet.ground=[{drone: 2}]", "perception.detector=none")
+    assert spread_m(run_sortie(example("duration_s=2", "fleet.drones=3", *settings))) == pytest.approx(200.0)
 
 
 # --- live ------------------------------------------------------------------------------------------

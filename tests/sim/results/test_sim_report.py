@@ -24,6 +24,7 @@ from sortie.sim.results import report_figures, run_folder
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report import page, save_page
+from sortie.sim.results.report_figures import moments
 from sortie.sim.results.sentences import decision_in_words
 
 VOID = {"meta", "br", "link", "img"}
@@ -184,6 +185,71 @@ def test_a_lane_says_nothing_of_a_drone_that_is_down() -> None:
     assert lanes[2][-2][1:] == (4.0, report_figures.SENT["features"])
     assert lanes[2][-1] == (4.0, 6.0, report_figures.SENT["nothing"])
     assert lanes[0][-1][1:] == (6.0, report_figures.SENT["features"])
+
+
+@pytest.fixture(scope="module")
+def eventful() -> SortieRecord:
+    """Events at 2 s (twice), at 3 s with a change of phase, and a jammer."""
+    return run_sortie(
+        example(
+            "duration_s=8",
+            "mission.phases=[{phase: search}, {phase: track, at_s: 3, region: {radius_m: 30}}]",
+            "events=[{kind: link_drop, at_s: 2, drone: 2, loss_db: 60}, {kind: link_drop, at_s: 2, drone: 1, loss_db: 3},"
+            " {kind: jam, at_s: 3, until_s: 5, position_m: [10, 20, 5]}, {kind: drone_lost, at_s: 6, drone: 3}]",
+        )
+    )
+
+
+def test_events_have_numbers_in_the_figures_and_words_above_them(eventful: SortieRecord) -> None:
+    """Of the same moment, one number; a phase that changes with an event stands behind its number."""
+    happened = moments(eventful)
+    assert [t_s for t_s, _ in happened] == [2.0, 3.0, 5.0, 6.0]
+    assert [len(texts) for _, texts in happened] == [2, 1, 1, 1]
+    axes = drawn(report_figures.mark_moments, eventful)
+    assert [(text.xy[0], text.get_text()) for text in axes.texts] == [
+        (2.0, "1"),
+        (3.0, "2 track"),
+        (5.0, "3"),
+        (6.0, "4"),
+    ]
+    assert "6 s: drone 3: fell silent" in " ".join(Page(page(eventful)).text)
+
+
+def test_legends_lie_beside_the_curves(eventful: SortieRecord) -> None:
+    for draw in (report_figures._lanes, report_figures._traffic, report_figures._goodput, report_figures._map):
+        axes = drawn(draw, eventful)
+        legend = axes.get_legend()
+        assert legend.get_bbox_to_anchor().x0 >= axes.get_window_extent().x1
+
+
+def test_the_map_shows_the_jammer_and_where_the_region_was(eventful: SortieRecord) -> None:
+    axes = drawn(report_figures._map, eventful)
+    jammer = next(line for line in axes.get_lines() if line.get_label() == "jammer")
+    assert (jammer.get_xdata()[0], jammer.get_ydata()[0]) == (10, 20)
+    assert [text.get_text() for text in axes.texts] == ["3–5 s"]
+    discs = [patch.center for patch in axes.patches]
+    regions = [r for r in eventful.tables["mission"].to_pylist() if r["region_radius_m"] == 30.0]
+    assert discs[0] == (regions[0]["region_x_m"], regions[0]["region_y_m"])
+    assert discs[-1] == (regions[-1]["region_x_m"], regions[-1]["region_y_m"])
+    assert len(discs) == 2 * report_figures.DISCS
+
+
+def test_what_arrived_is_told_second_by_second(eventful: SortieRecord) -> None:
+    """By counting: a span has the richest payload that was delivered in each of its seconds."""
+    ladder = ["detections", "tracks", "features", "raw"]
+    best: dict[tuple[int, int], int] = {}
+    for row in eventful.tables["transmissions"].to_pylist():
+        if row["status"] in ("delivered", "partial"):
+            second = row["drone"], int(row["t_done_s"])
+            best[second] = max(best.get(second, 0), ladder.index(row["representation"]))
+    told = {
+        (drone, second): ladder.index(kind)
+        for drone, begin_s, until_s, kind in report_figures.arrived(eventful)
+        for second in range(int(begin_s), int(until_s))
+    }
+    assert told == best
+    assert len({drone for drone, _ in told}) == 5
+    assert (3, 7) not in told  # it is lost by then
 
 
 def test_the_command_writes_it_into_the_run(record: SortieRecord, tmp_path: Path) -> None:
