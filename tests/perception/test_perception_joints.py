@@ -341,12 +341,20 @@ def test_a_region_is_a_place_in_the_world_whoever_is_turned_how(mine: float, the
     ego, peer = capture(10.0, 20.0, yaw=mine), capture(30.0, 5.0, yaw=theirs, drone=1)
     fleet, eyes = CaptureColumns.of([ego, peer]), Eyes(town())
     looks = eyes.look(fleet)
-    pairs = pair(FeatureShares.of([(ego, [Share(peer, "features", 1.0, disc, 1.0)])], {ego: 0, peer: 1}), looks, fleet)
+    jobs = [(ego, [Share(peer, "features", 1.0, disc, 1.0)])]
+    exchange = FeatureShares.of(jobs, {ego: 0, peer: 1})
+    pairs = pair(exchange, looks, fleet)
     both = pairs.peer[:, 0] >= 0
     inside = np.hypot(*(looks.world_m[pairs.look] - disc[:2]).T) <= disc.radius_m
     assert 3 < np.count_nonzero(inside & both) < np.count_nonzero(both)
     np.testing.assert_array_equal(pairs.aimed[both, 0], inside[both])
     assert np.abs(pairs.shift_m[both]).max() < 0.2  # both know where they are
+    # laid elsewhere, as without motion compensation: the map is shifted, and holds the cells that its sender chose
+    laid = FeatureShares.of(jobs, {ego: 0, peer: 1}, [[(30.0 + 6.0, 5.0 - 8.0, theirs + 0.2)]])
+    elsewhere = pair(laid, looks, fleet)
+    np.testing.assert_array_equal(elsewhere.aimed, pairs.aimed)
+    assert np.hypot(*elsewhere.shift_m[both, 0].T).mean() > 3.0
+    assert laid.allowed == pytest.approx(exchange.allowed)
 
 
 def test_cells_that_went_missing_are_counted_among_those_that_were_allowed() -> None:

@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 from sim_examples import example
 
+from sortie.fleet.clock import Oscillator
+from sortie.fleet.plane import DroneStatus
+from sortie.scenarios.schema import ClockDrift, ClockSkew, GnssLoss
+from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.record import SortieRecord
 
@@ -91,3 +95,41 @@ def test_a_wrong_clock_makes_payloads_old_until_it_is_found_out() -> None:
     ages = [a for f in record.tables["fusions"].to_pylist() for a in f["ages_s"]]
     assert min(ages) >= 0.0
     assert max(ages) < 0.6, "the record has true ages"
+
+
+BEFORE = (
+    GnssLoss(kind="gnss_loss", at_s=0.0),
+    ClockDrift(kind="clock_drift", at_s=0.0, drone=0, drift_ppm=300.0),
+    ClockSkew(kind="clock_skew", at_s=0.0, drone=0, skew_s=-2.0),
+)
+
+
+@pytest.mark.parametrize("gnss", [True, False])
+@pytest.mark.parametrize("first", BEFORE)
+@pytest.mark.parametrize("second", BEFORE)
+def test_a_clock_that_follows_gnss_again_has_its_constant_error_alone(gnss: bool, first: Any, second: Any) -> None:
+    """Whatever was done to it before: no drift is left, and no growth of one."""
+    status = DroneStatus()
+    own = OwnState(status, Oscillator(0.03, 20.0, 600.0), gnss=gnss)
+    own.begin(first, 0, 10.0)
+    own.begin(second, 1, 40.0)
+    own.begin(BEFORE[0], 2, 70.0)
+    own.read(100.0)
+    assert status.clock_skew_s != pytest.approx(0.03, abs=1e-4)
+    own.end(BEFORE[0], 2, 130.0)
+    for t_s in (130.0, 200.0, 4000.0):
+        own.read(t_s)
+        assert status.clock_skew_s == pytest.approx(0.03, abs=1e-12)
+
+
+def test_a_clock_without_gnss_drifts_by_a_rate_that_grows() -> None:
+    """From the moment of the loss on, by its own oscillator; one that an event sets going does not grow."""
+    status = DroneStatus()
+    own = OwnState(status, Oscillator(0.5, 20.0, 60.0), gnss=True)
+    own.begin(BEFORE[0], 0, 100.0)
+    own.read(220.0)
+    assert status.clock_skew_s == pytest.approx(0.5 + (20.0 + 60.0 * 2.0 / 2) * 1e-6 * 120.0)
+    own.begin(BEFORE[1], 1, 220.0)
+    since = status.clock_skew_s
+    own.read(820.0)
+    assert status.clock_skew_s == pytest.approx(since + 300e-6 * 600.0)

@@ -134,3 +134,15 @@ def test_a_link_without_payloads_forgets_its_goodput(loss_db: int, state: LinkSt
     last = [{state_of(mbps) for mbps in d["goodput_mbps"]} for d in said if d["t_s"] > LAST_WORD_S]
     assert len(last) > 10
     assert set().union(*last) == {state}
+
+
+def test_a_drone_is_linked_by_those_that_fly() -> None:
+    """1 is lost, then 2 is cut off, then 3 is lost as well: who is gone has no link, and is none to others."""
+    record = run_sortie(
+        example(
+            "duration_s=5.2", "perception.detector=none", "events=[{kind: drone_lost, at_s: 0.5, drone: 1}, "
+            "{kind: link_drop, at_s: 1.5, drone: 2, loss_db: 200}, {kind: drone_lost, at_s: 2.5, drone: 3}, "
+            "{kind: drone_lost, at_s: 3.5, drone: 4}, {kind: drone_joins, at_s: 4.5, drone: 4}]",
+        )
+    )  # fmt: skip
+    assert record.tables["medium"]["connected_drones"].to_pylist() == [5, 4, 3, 2, 0, 2]
