@@ -244,7 +244,7 @@ def local_m(fixes: Array) -> Array:
     """Latitudes and longitudes in degrees and altitudes in metres as ENU metres from the first, [K, 3].
 
     On the plane tangent to the WGS-84 ellipsoid at the first, with its two radii of curvature: the inverse of
-    `sortie.fleet.logs.mavlink.geodetic`.
+    `sortie.fleet.logs.geodesy.geodetic`.
     """
     a, e2 = 6378137.0, 6.69437999014e-3
     lat, lon, alt = (math.radians(fixes[0, 0]), fixes[0, 1], fixes[0, 2])

@@ -13,6 +13,7 @@ import numpy as np
 import typer
 
 from sortie.fleet.energy.cell import MEAN_CELL_V
+from sortie.fleet.logs.geodesy import Origin, local_enu
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Battery
@@ -22,7 +23,6 @@ from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
     from sortie.fleet.logs.flightlog import FlightLog
-    from sortie.fleet.logs.mavlink import Origin
 
 Array = np.ndarray[Any, Any]
 
@@ -170,8 +170,6 @@ def _called(flight: FlightLog, flights: Sequence[FlightLog]) -> str:
 
 def _zero(flights: Sequence[FlightLog], lifted_m: float) -> Origin | None:
     """Where on the globe ENU (0, 0, 0) of the trace lies; None where no flight has a place."""
-    from sortie.fleet.logs.mavlink import Origin
-
     placed = next((flight for flight in flights if flight.fix is not None), None)
     if placed is None or placed.fix is None:
         return None
@@ -185,7 +183,6 @@ def _zero(flights: Sequence[FlightLog], lifted_m: float) -> Origin | None:
 
 def _with_stations(columns: dict[str, Array], places: Sequence[str], zero: Origin) -> dict[str, Array]:
     """The columns with a row for each ground station, which are the last drones."""
-    from sortie.fleet.logs.mavlink import local_enu
     from sortie.sim.export.telemetry import parse_origin
 
     first = int(columns["drone"].max()) + 1
