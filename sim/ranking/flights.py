@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sortie.policies.contract import Policy
 from sortie.policies.registry import within_budget
@@ -75,7 +75,9 @@ def fly(
     code = code_version()
     asked = [(p, c.name, _task(suite, c, p)) for p in policies for c in suite.conditions]
     kept = _Kept(folder / KEPT)
-    found = {k: kept.flights[key] for k, (_, _, task) in enumerate(asked) if (key := task_key(task, code)) in kept.flights}
+    found = {
+        k: kept.flights[key] for k, (_, _, task) in enumerate(asked) if (key := task_key(task, code)) in kept.flights
+    }
     progress(len(found))
     todo = [(k, task) for k, (_, _, task) in enumerate(asked) if k not in found]
     if todo:
@@ -102,11 +104,7 @@ def fly_callable(
     for k, condition in enumerate(suite.conditions):
         scenario = scenario_of(suite, condition, "silence")
         budget = within_budget(policy, condition.budget)
-
-        def decide(view: Any, budget: Mapping[str, float] = budget) -> Any:
-            return policy(view, **budget)
-
-        result = fly_function(scenario, decide if budget else policy, METRICS)
+        result = fly_function(scenario, functools.partial(policy, **budget) if budget else policy, METRICS)
         flights[condition.name] = _flight(result)
         progress(k + 1)
     return flights

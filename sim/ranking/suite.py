@@ -145,7 +145,10 @@ def _trouble(rng: np.random.Generator, trouble: str, drones: int) -> list[str]:
         case "clear" | "tired":
             return []
         case "weak":
-            return [f"radio.tx_power_dbm={rng.uniform(1, 4):.1f}", f"radio.path_loss_exponent={rng.uniform(2.4, 2.6):.2f}"]
+            return [
+                f"radio.tx_power_dbm={rng.uniform(1, 4):.1f}",
+                f"radio.path_loss_exponent={rng.uniform(2.4, 2.6):.2f}",
+            ]
         case "jammed":
             place = [int(rng.integers(-40, 40)), int(rng.choice([-1, 1]) * rng.integers(35, 60)), 60]
             return event("jam", f"position_m: {place}, power_dbm: {rng.uniform(0, 6):.1f}")
@@ -157,7 +160,9 @@ def _trouble(rng: np.random.Generator, trouble: str, drones: int) -> list[str]:
             about, claim = rng.choice(["coverage", "goodput", "battery"]), rng.choice(["much", "little"])
             return event("lie", f"drone: {drone}, about: {about}, claim: {claim}")
         case "spoof":
-            return event("spoof", f"drone: {drone}, attack: {rng.choice(['forged', 'replayed', 'malformed', 'oversized'])}")
+            return event(
+                "spoof", f"drone: {drone}, attack: {rng.choice(['forged', 'replayed', 'malformed', 'oversized'])}"
+            )
         case "sensor_fault":
             return event(*_sensor_fault(rng, drone))
         case _:
