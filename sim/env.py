@@ -8,15 +8,19 @@ A step is as many whole frames as come nearest to one simulated second, and neve
 `context.rate_hz` is a whole number, 1.33 s at 1.5 Hz, 2 s at 0.5 Hz; the last step ends with the sortie. Each drone's
 action stands for its directives until the next. All that stands between a policy and the gate (checks, staleness,
 damping) stands there too. The sortie runs in a thread of its own that takes turns with the caller, so that the same seed
-and actions give the same record.
+and actions give the same record. A copy of an environment, by `copy.deepcopy` or by pickle, flies the steps taken so far
+again before its next one, and goes on from there.
+
+`TeamEnv` is the whole fleet as one agent, for libraries without multi-agent environments and for `gymnasium.vector`.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -24,24 +28,31 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sortie.perception.metrics.ap import average_precision
-from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, LinkState, Representation, TaskPhase
+from sortie.policies.contract import Directive, FleetView
+from sortie.policies.observation import CHOICES, LIMIT, ROW, Obs, directives, observe
 from sortie.scenarios.schema import DroneJoins, Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.identity import code_version
 from sortie.sim.results.accuracy import matched
 from sortie.sim.results.record import SortieRecord
 
-RUNGS = (Representation.NONE, Representation.DETECTIONS, Representation.FEATURES)
-RHOS = (0.02, 0.1, 0.25, 1.0)
-RATES_HZ = (2.0, 5.0, 10.0)
-CHOICES = (len(RUNGS), len(RHOS), len(RATES_HZ), 2)
-"""Choices of an action for each link: representation, ρ (the share of the feature cells), rate, and whether it is confined to the region."""
-ROW = 25
-"""Numbers of one drone in an observation; `_row` says which."""
-LIMIT = 10.0
 COST_PER_MB, COST_PER_KJ = 0.01, 0.01
 
-Obs = np.ndarray[Any, np.dtype[np.float32]]
+
+class Earned(NamedTuple):
+    """What a drone gained and paid in a step."""
+
+    ap50: float | None
+    """AP@0.5 of its own fusions (mission disc where there is one); None where nothing was scored."""
+    sent_bytes: int
+    """Payloads that it handed to the radio."""
+    spent_j: float
+    """Energy that left its pack, J."""
+
+    @property
+    def reward(self) -> float:
+        """The AP, less `COST_PER_MB` and `COST_PER_KJ`."""
+        return (self.ap50 or 0.0) - COST_PER_MB * self.sent_bytes / 1e6 - COST_PER_KJ * self.spent_j / 1e3
 
 
 class _Closed(BaseException):
@@ -57,6 +68,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     | observation | float32 [N, 25]: the ego's row first, then the others by ascending id, as the ego last heard them; zeros where it heard nothing |
     | action | for each other drone by ascending id: rung, ρ, rate, region (`CHOICES`) |
     | reward | AP@0.5 of the drone's own fusions in the step (mission disc where there is one), less 0.01 a MB that it sent and 0.01 a kJ that it spent |
+    | info | after a step: the parts of the reward, `ap50` (None where nothing was scored), `sent_bytes` and `spent_j` |
     """
 
     metadata = {"name": "sortie_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012 - the library's own way
@@ -82,6 +94,9 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         }
         self._episodes = 0
         self._flight: _Flight | None = None
+        self._begun: tuple[int | None, int] | None = None
+        self._steps: list[tuple[dict[int, np.ndarray[Any, Any]], list[str]]] = []
+        """Actions and agents of each step of the episode, from which a copy flies it again."""
 
     def observation_space(self, agent: str) -> spaces.Box:
         """The same object for the same agent."""
@@ -99,6 +114,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         replication = self._episodes if seed is None else 0
         self._episodes += 1
         self.agents = list(self.possible_agents)
+        self._begun, self._steps = (seed, replication), []
         self._flight = _Flight(self.scenario, seed, replication)
         self._flight.advance()
         return {a: self._observe(a) for a in self.agents}, {a: {} for a in self.agents}
@@ -111,25 +127,38 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         Raises:
             ValueError: no such agent, or an action outside its space; nothing has been flown, the step may be tried again.
         """
-        flight = self._flight
+        flight = self._resumed()
         if flight is None or not self.agents:
             return {}, {}, {}, {}, {}
         taken = {agent: self._checked(agent, action) for agent, action in actions.items()}
-        flight.actions |= {int(agent.removeprefix("drone_")): action for agent, action in taken.items()}
-        flight.advance()
+        step = {int(agent.removeprefix("drone_")): action for agent, action in taken.items()}, self.agents
+        self._steps.append(step)
+        earned, landed = flight.fly(*step)
         flying = self.agents
-        rewards = {a: flight.reward(int(a.removeprefix("drone_"))) for a in flying}
-        landed = {a: flight.is_out(int(a.removeprefix("drone_"))) for a in flying}
         over = dict.fromkeys(flying, flight.done)
         observations = {a: self._observe(a) for a in flying}
         self.agents = [] if flight.done else [a for a in flying if not landed[a]]
-        return observations, rewards, landed, over, {a: {} for a in flying}
+        infos = {a: earned[a]._asdict() for a in flying}
+        return observations, {a: earned[a].reward for a in flying}, landed, over, infos
+
+    def _resumed(self) -> _Flight | None:
+        """The flight; of a copy one that has flown the same steps."""
+        if self._flight is None and self._begun is not None:
+            self._flight = _Flight(self.scenario, *self._begun)
+            self._flight.advance()
+            for step in self._steps:
+                self._flight.fly(*step)
+        return self._flight
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the flight, which runs in a thread."""
+        return {**self.__dict__, "_flight": None}
 
     def close(self) -> None:
         """End the sortie's thread."""
         if self._flight is not None:
             self._flight.close()
-            self._flight = None
+        self._flight = self._begun = None
 
     def render(self) -> None:
         """Nothing: `sortie fly --live` draws."""
@@ -154,33 +183,11 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
 
     def _observe(self, agent: str) -> Obs:
         assert self._flight is not None  # noqa: S101
-        ego, n = int(agent.removeprefix("drone_")), len(self.possible_agents)
-        rows = np.zeros((n, ROW), np.float32)
-        view = self._flight.views.get(ego)
-        me = None if view is None else view.me
-        if view is not None and me is not None:
-            for k, i in enumerate([ego, *(i for i in range(n) if i != ego)]):
-                if i in view.descriptors:
-                    rows[k] = _row(me, view.descriptors[i], view.age_s[i])
-        return np.clip(rows, -LIMIT, LIMIT)
+        ego = int(agent.removeprefix("drone_"))
+        return observe(self._flight.views.get(ego), self._others(ego))
 
-
-def _row(me: Descriptor, d: Descriptor, age_s: float) -> list[float]:
-    """Heard; age, s; place from the ego, 100 m, and velocity, 10 m/s; footprint, 100 m; charge, headrooms, goodput from
-    the ego, 100 Mb/s, and its state (0 unknown, 1/3 silent, 2/3 probed, 1 measured); phase, one-hot; region: there, place
-    from the ego, radius, 100 m; share of the grid seen well; whether it reports targets."""
-    place = [(a - b) / 100 for a, b in zip(d.position_m, me.position_m, strict=True)]
-    phase = [float(d.task_phase == p) for p in TaskPhase]
-    region = [0.0] * 4
-    if d.region is not None:
-        x_m, y_m = d.region.x_m - me.position_m[0], d.region.y_m - me.position_m[1]
-        region = [1.0, x_m / 100, y_m / 100, d.region.radius_m / 100]
-    cells = np.unpackbits(np.frombuffer(d.coverage_grid, np.uint8), bitorder="little").reshape(-1, 2) @ (1, 2)
-    return [
-        1.0, age_s, *place, *(v / 10 for v in d.velocity_mps), d.footprint_radius_m / 100, d.battery_soc,
-        d.cpu_headroom, d.gpu_headroom, me.goodput_to(d.agent_id) / 100, me.link_state(d.agent_id) / LinkState.MEASURED, *phase, *region,
-        float((cells >= Coverage.WELL).mean()), float(bool(d.priority_target_ids)),
-    ]  # fmt: skip
+    def _others(self, ego: int) -> list[int]:
+        return [i for i in range(len(self.possible_agents)) if i != ego]
 
 
 class _Flight:
@@ -217,6 +224,15 @@ class _Flight:
         self._mine.acquire()
         if self._error is not None:
             raise self._error
+
+    def fly(
+        self, actions: Mapping[int, np.ndarray[Any, Any]], flying: list[str]
+    ) -> tuple[dict[str, Earned], dict[str, bool]]:
+        """Fly one step under these actions; what each of these agents earned in it, and whether it is out."""
+        self.actions |= actions
+        self.advance()
+        drones = {a: int(a.removeprefix("drone_")) for a in flying}
+        return {a: self.earned(i) for a, i in drones.items()}, {a: self.is_out(i) for a, i in drones.items()}
 
     def close(self) -> None:
         """Stop it where it is."""
@@ -256,17 +272,8 @@ class _Flight:
     def decide(self, view: FleetView) -> list[Directive]:
         """The standing action of the view's ego as directives; nothing before the first."""
         self.views[view.ego] = view
-        action, me = self.actions.get(view.ego), view.me
-        directives = []
-        for peer in view.peers:
-            if action is None or me is None:
-                directives.append(Directive(view.ego, peer, reason="no action yet"))
-                continue
-            rung, cells, rate, confined = (int(c) for c in action[peer - (peer > view.ego)])
-            rho = RHOS[cells] if RUNGS[rung] == Representation.FEATURES else 0.0
-            roi = me.region if confined else None
-            directives.append(Directive(view.ego, peer, RUNGS[rung], rho, roi, RATES_HZ[rate], reason="action"))
-        return directives
+        others = [i for i in range(self._scenario.fleet.drones) if i != view.ego]
+        return directives(view, others, self.actions.get(view.ego))
 
     # --- results of the last second ------------------------------------------------------------
 
@@ -279,22 +286,70 @@ class _Flight:
             return False
         return drone not in self._waiting and self._t_s >= self._joins_s.get(drone, 0.0)
 
-    def reward(self, drone: int) -> float:
-        """AP of its fusions in the second, less what it sent and spent."""
+    def earned(self, drone: int) -> Earned:
+        """AP of its fusions in the step, what it sent and what it spent."""
         new = {**self._new, "mission": self._mission}
         fusions = new["fusions"].filter(pc.equal(new["fusions"]["drone"], drone))
         record = SortieRecord(self._scenario, "", 0, 0, code_version(), "", {**new, "fusions": fusions}, {})
         frames = list(matched(record, mission=True).values()) or list(matched(record, mission=False).values())
-        ap = average_precision(frames) if frames else 0.0
+        ap = average_precision(frames) if frames else np.nan
+        seen = None if np.isnan(ap) else float(ap)
         sent = new["transmissions"]
         mine = sent.filter(pc.equal(sent["drone"], drone))
-        sent_mb = float(pc.sum(mine["payload_bytes"]).as_py() or 0) / 1e6
-        return float(np.nan_to_num(ap)) - COST_PER_MB * sent_mb - COST_PER_KJ * self._spent_kj(drone)
+        return Earned(seen, int(pc.sum(mine["payload_bytes"]).as_py() or 0), self._spent_of(drone))
 
-    def _spent_kj(self, drone: int) -> float:
-        """What left the drone's pack in the step, by the ledger; it is in the states, and at the end in `energy`."""
+    def _spent_of(self, drone: int) -> float:
+        """What left the drone's pack in the step, J, by the ledger; it is in the states, and at the end in `energy`."""
         table, column = ("energy", "energy_j") if self.done else ("states", "spent_j")
         rows = self._new[table].filter(pc.equal(self._new[table]["drone"], drone))
         spent_j = float(pc.sum(rows[column]).as_py() if self.done else rows[column][-1].as_py())
         before_j, self._spent_j[drone] = self._spent_j.get(drone, 0.0), spent_j
-        return (spent_j - before_j) / 1e3
+        return spent_j - before_j
+
+
+class TeamEnv(gymnasium.Env[Obs, np.ndarray[Any, Any]]):
+    """The fleet as one agent: a `gymnasium.Env`, so that `gymnasium.vector` flies many at once.
+
+    | | |
+    |---|---|
+    | observation | float32 [N, N, 25]: what each drone observes in `SortieEnv`; zeros of a drone that has left |
+    | action | the actions of all drones by ascending id, one after the other |
+    | reward | the mean of the drones' rewards; 0 of a drone that has left |
+    | info | `sent_bytes` and `spent_j`, sums of all drones; `ap50`, mean of the drones that were scored, if there are any |
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Args: `scenario` with at least two drones; its policy is not used."""
+        self.drones = SortieEnv(scenario)
+        n = scenario.fleet.drones
+        one = self.drones.action_space("drone_0")
+        self.observation_space = spaces.Box(-LIMIT, LIMIT, (n, n, ROW), np.float32)
+        self.action_space = spaces.MultiDiscrete(np.tile(one.nvec, n))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin a sortie with this seed; without one, with a seed drawn from the generator of the last seed given."""
+        super().reset(seed=seed)
+        flown = int(self.np_random.integers(2**31)) if seed is None else seed
+        observations, _ = self.drones.reset(seed=flown)
+        return self._stacked(observations), {}
+
+    def step(self, action: np.ndarray[Any, Any]) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        """Fly one step under these actions."""
+        rows = np.reshape(action, (len(self.drones.possible_agents), -1))
+        given = {a: rows[int(a.removeprefix("drone_"))] for a in self.drones.agents}
+        observations, rewards, _, over, infos = self.drones.step(given)
+        seen = [i["ap50"] for i in infos.values() if i["ap50"] is not None]
+        info: dict[str, Any] = {name: sum(i[name] for i in infos.values()) for name in ("sent_bytes", "spent_j")}
+        if seen:
+            info["ap50"] = float(np.mean(seen))
+        reward = sum(rewards.values()) / len(self.drones.possible_agents)
+        done = any(over.values())
+        return self._stacked(observations), reward, not self.drones.agents and not done, done, info
+
+    def close(self) -> None:
+        """End the sortie's thread."""
+        self.drones.close()
+
+    def _stacked(self, observations: Mapping[str, Obs]) -> Obs:
+        empty = np.zeros(self.observation_space.shape[1:], np.float32)  # type: ignore[index]
+        return np.stack([observations.get(a, empty) for a in self.drones.possible_agents])

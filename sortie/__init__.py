@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         open_run,
         replay,
     )
+    from sortie._rank import Ranking, rank
     from sortie._run import Run
     from sortie.policies.contract import (
         Descriptor,
@@ -52,8 +53,8 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
-    "load", "fly", "compare", "replay", "campaign", "check", "env", "open_run", "open_campaign",
-    "Run", "Comparison", "Replay", "CampaignResult", "Scenario",
+    "load", "fly", "compare", "replay", "campaign", "check", "rank", "env", "open_run", "open_campaign",
+    "Run", "Comparison", "Replay", "CampaignResult", "Ranking", "Scenario",
     "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "LinkState",
     "Reposition", "looks_from", "boxes_across_networks", "SortieError", "ScenarioError", "PolicyError", "RunError",
     "__version__",
@@ -64,6 +65,7 @@ _HOMES = {
         "load", "fly", "compare", "replay", "campaign", "check", "env", "open_run", "open_campaign", "Comparison",
         "CampaignResult",
     ),
+    "sortie._rank": ("rank", "Ranking"),
     "sortie._run": ("Run",),
     "sortie.policies.contract": (
         "Policy", "FleetView", "Descriptor", "Directive", "Representation", "Disc", "TaskPhase", "LinkState",

@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from sortie._run import Run, as_path
 from sortie.policies.contract import Policy, PolicyError
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from sortie.sim.check.checking import Checked
     from sortie.sim.engine.sortie import Observer
-    from sortie.sim.env import SortieEnv
+    from sortie.sim.env import SortieEnv, TeamEnv
     from sortie.sim.results.summary import Summary
     from sortie.sim.studies.compare import Compared, Gain
     from sortie.sim.studies.multifidelity import Precision, Settings
@@ -272,7 +272,7 @@ def compare(
     base = load(scenario, overrides)
     if isinstance(policies, str) or not isinstance(policies, Iterable):
         raise PolicyError(f"policies: {policies!r}, must be a list of policies: ['worked', 'silence']")
-    flown = [Contender(_label(policy), *_with_policy(base, policy)) for policy in policies]
+    flown = [Contender(label(policy), *_with_policy(base, policy)) for policy in policies]
     if own_fusion:
         flown = [contender.with_own_fusion() for contender in flown]
     labels = [contender.label for contender in flown]
@@ -526,11 +526,19 @@ def check(
     return tuple(check_scenario(name, overrides, update=update, progress=progress) for name in names)
 
 
-def env(scenario: ScenarioLike, overrides: Overrides = ()) -> SortieEnv:
-    """Return a PettingZoo `ParallelEnv` in which each drone is an agent, to train sharing policies.
+@overload
+def env(scenario: ScenarioLike, overrides: Overrides = (), *, team: Literal[False] = False) -> SortieEnv: ...
+@overload
+def env(scenario: ScenarioLike, overrides: Overrides = (), *, team: Literal[True]) -> TeamEnv: ...
+def env(scenario: ScenarioLike, overrides: Overrides = (), *, team: bool = False) -> SortieEnv | TeamEnv:
+    """Return an environment in which policies are trained: a PettingZoo `ParallelEnv` in which each drone is an agent.
 
     Args:
         scenario, overrides: as for `sortie.load`, with at least two drones. The scenario's policy is not used.
+        team: return a `gymnasium.Env` in which the whole fleet is one agent. `gymnasium.vector` flies many of these at once.
+
+    Returns:
+        The environment. It can be copied by `copy.deepcopy` and by pickle at any step; a copy repeats the steps so far.
 
     Raises:
         ScenarioError: the scenario is wrong.
@@ -544,9 +552,10 @@ def env(scenario: ScenarioLike, overrides: Overrides = ()) -> SortieEnv:
         >>> env.close()
     """
     with user_errors():
-        from sortie.sim.env import SortieEnv
+        from sortie.sim.env import SortieEnv, TeamEnv
 
-        return SortieEnv(load(scenario, overrides))
+        chosen = load(scenario, overrides)
+        return TeamEnv(chosen) if team else SortieEnv(chosen)
 
 
 def _with_policy(scenario: Scenario, policy: PolicyLike | None) -> tuple[Scenario, Policy | None]:
@@ -560,13 +569,14 @@ def _with_policy(scenario: Scenario, policy: PolicyLike | None) -> tuple[Scenari
     try:
         inspect.signature(policy).bind(object())
     except TypeError as error:
-        raise PolicyError(f"policy {_label(policy)!r}: {error}, must take one FleetView") from None
+        raise PolicyError(f"policy {label(policy)!r}: {error}, must take one FleetView") from None
     except ValueError:  # some callables written in C name no parameters
         pass
     return scenario, policy
 
 
-def _label(policy: PolicyLike) -> str:
+def label(policy: PolicyLike) -> str:
+    """How a policy is called in tables: as it was named, or by the function's own name."""
     return policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
 
 

@@ -18,7 +18,7 @@ from sortie.sim.cli.app import app as command_line
 
 API = {
     "Load and fly": ("load", "fly", "open_run", "Run", "Scenario"),
-    "Compare and check": ("compare", "Comparison", "check", "replay", "Replay"),
+    "Compare and check": ("compare", "Comparison", "check", "replay", "Replay", "rank", "Ranking"),
     "Campaigns": ("campaign", "open_campaign", "CampaignResult"),
     "Reinforcement learning": ("env",),
     "What a policy reads": ("Policy", "FleetView", "Descriptor", "LinkState", "TaskPhase"),

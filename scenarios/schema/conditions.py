@@ -36,7 +36,9 @@ class ConditionSet(Section):
     base: str = Field(min_length=1, description="A library scenario's name, or a file.")
     set: tuple[Override, ...] = Field((), max_length=50, description="What holds in every condition.")
     seeds: tuple[Annotated[int, Field(ge=0, lt=2**63)], ...] = Field(
-        (1,), min_length=1, max_length=100, description="Each condition is flown once with each."
+        (1,),
+        max_length=100,
+        description="Each condition is flown once with each; an empty list: once, with its scenario's own seed.",
     )
     conditions: tuple[Condition, ...] = Field(min_length=1, max_length=1000, description="The conditions.")
 

@@ -213,7 +213,7 @@ def make_plan(study: Study) -> CampaignPlan:
             "base": sections,
             "columns": columns,
             "policies": [[label, section] for label, section in policies],
-            "files": _files([file for some in reading for file in named_files(some)]),
+            "files": file_digests([file for some in reading for file in named_files(some)]),
             "code": code_version(),
         }
     )
@@ -247,7 +247,7 @@ def _policy(study: Study, number: int) -> dict[str, Any]:
     return {name: section[name] for name in ("name", "params", "changes", "commands")}
 
 
-def _files(names: list[str]) -> dict[str, str]:
+def file_digests(names: Sequence[str]) -> dict[str, str]:
     """Digests of the files that runs read beside the code, by path; of Python files also of those that they import."""
     digests = {}
     for path in map(Path, names):

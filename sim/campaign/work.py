@@ -11,13 +11,14 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
 from sortie.perception.network.memory import keep_freed
+from sortie.policies.contract import Policy
 from sortie.scenarios.schema import Scenario
 from sortie.sim.campaign.memory import limited
 from sortie.sim.check.expectations import metric
@@ -106,15 +107,26 @@ def _fly(run: int, task: str, code: str, memory_b: int | None) -> RunResult:
     fields, key = json.loads(task), task_key(task, code)
     for path, digest in fields["files"].items():
         _check_file(path, digest)
+    return _result(run, key, lambda: fly_task(task), fields["metrics"], memory_b)
+
+
+def fly_function(scenario: Scenario, policy: Policy, metrics: Sequence[str]) -> RunResult:
+    """The row of a sortie in this process, under a policy that is a function and no name; its key is empty."""
+    return _result(0, "", lambda: run_sortie(scenario, policy), metrics)
+
+
+def _result(
+    run: int, key: str, flown: Callable[[], SortieRecord], metrics: Sequence[str], memory_b: int | None = None
+) -> RunResult:
     try:
-        record = fly_task(task)
+        record = flown()
         result = outcome(record)
-        values = tuple(number(result, name) for name in fields["metrics"])
+        values = tuple(number(result, name) for name in metrics)
     except Exception as error:  # whatever it is, the other runs go on
         what = _in_one_line(error)
         if memory_b is not None and isinstance(error, MemoryError):
             what = f"MemoryError: more than {memory_b / 1e9:.3g} GB (--worker-memory)"
-        return RunResult(run, key, "failed", what, "", (None,) * len(fields["metrics"]))
+        return RunResult(run, key, "failed", what, "", (None,) * len(metrics))
     return RunResult(run, key, "done", "", record.fingerprint[:16], values)
 
 

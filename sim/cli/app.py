@@ -26,6 +26,7 @@ from sortie.sim.cli import (
     live,
     new,
     paper,
+    rank,
     recording,
     replay,
     report,
@@ -71,7 +72,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "fly": fly.fly, "compare": compare.compare, "check": check.check, "view": view.view, "list": listing.list_, "new": new.new,
     "train": train.train, "calibrate": calibrate.calibrate, "paper": paper.paper, "learn": conditions.learn,
     "verify": verify.verify, "overhead": verify.overhead, "export": export.export, "report": report.report,
-    "replay": replay.replay, "import": import_log.import_log, "live": live.live,
+    "rank": rank.rank, "replay": replay.replay, "import": import_log.import_log, "live": live.live,
 }  # fmt: skip
 for name, command in COMMANDS.items():
     app.command(name)(command)

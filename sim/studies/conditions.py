@@ -16,6 +16,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.engine.sortie import DetectorMaker, run_sortie
 from sortie.sim.folders import RunError
+from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results.accuracy import matched
 from sortie.sim.results.outcome import outcome
 
@@ -69,34 +70,36 @@ def fly_all(
     Raises:
         ScenarioError, PolicyError, RunError: a condition or policy that cannot be flown or scored, before anything is.
     """
-    planned = [
-        (p, c, [scenario_of(conditions, c, p)] * len(conditions.seeds)) for p in policies for c in conditions.conditions
-    ]
-    for _, condition, (scenario, *_) in planned:
+    planned = [(p, c, scenario_of(conditions, c, p)) for p in policies for c in conditions.conditions]
+    for _, condition, scenario in planned:
         if scenario.perception.detector == "none":
             raise RunError(
                 f"condition {condition.name}: perception.detector is none, conditions are compared by accuracy"
             )
     cells: list[Cell] = []
-    for k, (policy, condition, scenarios) in enumerate(planned):
-        cells.append(_fly(policy, condition, scenarios, conditions.seeds, detector_of))
+    for k, (policy, condition, scenario) in enumerate(planned):
+        cells.append(_fly(policy, condition, scenario, conditions.seeds or (scenario.seed,), detector_of))
         if progress is not None:
             progress(policy, k % len(conditions.conditions) + 1)
     return cells
 
 
 def scenario_of(conditions: ConditionSet, condition: Condition, policy: str) -> Scenario:
-    """A condition's scenario under a policy, within the condition's budget."""
-    scenario = load(conditions.base, [*conditions.set, *condition.set, f"policy.name={policy}", "policy.params={}"])
-    params = within_budget(resolve(policy), condition.budget)
+    """A condition's scenario under a policy, within the condition's budget.
+
+    Args:
+        policy: a name, `name(key=value)` or `path/to/file.py:function`. Parameters in the brackets stay as they are.
+    """
+    scenario = load(conditions.base, [*conditions.set, *condition.set, *policy_overrides(policy, "")])
+    params = {**within_budget(resolve(scenario.policy.name), condition.budget), **scenario.policy.params}
     return scenario.model_copy(update={"policy": scenario.policy.model_copy(update={"params": params})})
 
 
 def _fly(
-    policy: str, condition: Condition, scenarios: Sequence[Scenario], seeds: Sequence[int], detector_of: DetectorMaker
+    policy: str, condition: Condition, scenario: Scenario, seeds: Sequence[int], detector_of: DetectorMaker
 ) -> Cell:
     frames, results = [], []
-    for scenario, seed in zip(scenarios, seeds, strict=True):
+    for seed in seeds:
         record = run_sortie(scenario, None, seed, detector_of=detector_of)
         frames += list(matched(record, mission=condition.metric == "mission").values())
         results.append(outcome(record))

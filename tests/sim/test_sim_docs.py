@@ -75,6 +75,7 @@ def test_the_guide_is_there_and_has_examples() -> None:
         "detector",
         "event",
         "fusion",
+        "learn",
         "link_model",
         "metric",
         "mobility",

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+from collections.abc import Callable
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -11,8 +15,9 @@ pettingzoo = pytest.importorskip("pettingzoo")
 
 from pettingzoo.test import parallel_api_test, parallel_seed_test  # noqa: E402
 
+from sortie.policies.observation import CHOICES  # noqa: E402
 from sortie.sim.engine.sortie import run_sortie  # noqa: E402
-from sortie.sim.env import CHOICES, COST_PER_KJ, SortieEnv  # noqa: E402
+from sortie.sim.env import COST_PER_KJ, SortieEnv, TeamEnv  # noqa: E402
 from sortie.sim.results.outcome import outcome  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
@@ -217,6 +222,7 @@ def test_spaces_and_a_lone_drone() -> None:
 
 def test_a_region_lies_where_the_ego_sees_it_whoever_publishes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """And a drone pays for what it sent, not for what it was sent."""
+    from sortie.policies import observation
     from sortie.policies.contract import Disc
     from sortie.policies.verification.views import draw_view
     from sortie.sim import env as env_room
@@ -226,12 +232,91 @@ def test_a_region_lies_where_the_ego_sees_it_whoever_publishes_it(monkeypatch: p
     )
     me = peer._replace(agent_id=0, position_m=(10.0, -20.0, 60.0))
     for d in (me, peer):
-        assert env_room._row(me, d, 0.0)[-6:-2] == pytest.approx([1.0, 0.4, 0.4, 0.32])
+        assert observation._row(me, d, 0.0)[-6:-2] == pytest.approx([1.0, 0.4, 0.4, 0.32])
     flight = object.__new__(env_room._Flight)
     fusions = pa.table({"drone": pa.array([], pa.int32())})
     sent = pa.table({"drone": [0, 0, 1], "peer": [1, 1, 0], "payload_bytes": [10**6, 2 * 10**6, 7 * 10**6]})
     flight._new, flight._mission, flight._scenario = {"fusions": fusions, "transmissions": sent}, None, None  # type: ignore[assignment]
     monkeypatch.setattr(env_room, "matched", lambda record, mission: {})
-    monkeypatch.setattr(flight, "_spent_kj", lambda drone: 0.0)
-    assert flight.reward(0) == pytest.approx(-3 * env_room.COST_PER_MB)
-    assert flight.reward(1) == pytest.approx(-7 * env_room.COST_PER_MB)
+    monkeypatch.setattr(flight, "_spent_of", lambda drone: 0.0)
+    assert flight.earned(0).reward == pytest.approx(-3 * env_room.COST_PER_MB)
+    assert flight.earned(1).reward == pytest.approx(-7 * env_room.COST_PER_MB)
+
+
+def test_infos_are_what_rewards_are_made_of_and_what_the_outcome_says() -> None:
+    e = env(*SEEN)
+    _, infos = e.reset(seed=3)
+    assert set(map(len, infos.values())) == {0}
+    sent, spent = 0, dict.fromkeys(e.possible_agents, 0.0)
+    while e.agents:
+        _, rewards, _, _, infos = e.step(all_share(e, 1))
+        for agent, info in infos.items():
+            sent += info["sent_bytes"]
+            spent[agent] += info["spent_j"]
+            assert rewards[agent] == pytest.approx(
+                (info["ap50"] or 0.0) - 1e-8 * info["sent_bytes"] - 1e-5 * info["spent_j"]
+            )
+    assert any(0 < info["ap50"] <= 1 for info in infos.values())
+    assert sent > 0
+    assert min(spent.values()) > 100
+    e.close()
+
+
+def pickled(e: SortieEnv) -> SortieEnv:
+    found = pickle.loads(pickle.dumps(e))  # noqa: S301 - our own
+    assert isinstance(found, SortieEnv)
+    return found
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickled])
+def test_a_copy_goes_on_as_the_environment_does(copied: Callable[[SortieEnv], SortieEnv]) -> None:
+    """Also after a drone has left, and the other is not moved by it."""
+    e = env(*SEEN, "events=[{kind: drone_lost, drone: 1, at_s: 0.5}]")
+    assert copied(e).agents == [], "before any episode"
+    e.reset(seed=3)
+    fresh = copied(e)
+    first = e.step(all_share(e))
+    other = copied(e)
+    for one, two in ((fresh.step(all_share(fresh)), first), (other.step(all_share(other, 1)), e.step(all_share(e, 1)))):
+        assert one[1:] == two[1:]
+        assert one[0].keys() == two[0].keys()
+        assert all(np.array_equal(one[0][a], two[0][a]) for a in one[0])
+    assert other.agents == e.agents == ["drone_0", "drone_2"]
+    for each in (e, fresh, other):
+        each.close()
+        assert each.step({}) == ({}, {}, {}, {}, {})
+
+
+def test_the_fleet_as_one_agent() -> None:
+    from gymnasium.utils.env_checker import check_env
+
+    check_env(TeamEnv(example(*SHORT, "duration_s=2")), skip_render_check=True, skip_close_check=True)
+    team = TeamEnv(example(*SEEN))
+    seen, _ = team.reset(seed=3)
+    drones = env(*SEEN)
+    each, _ = drones.reset(seed=3)
+    assert np.array_equal(seen, np.stack(list(each.values())))
+    action = np.tile(all_share(drones, 1)["drone_0"], 3)
+    for step in range(1, 5):
+        seen, reward, terminated, truncated, info = team.step(action)
+        each, rewards, _, _, infos = drones.step(all_share(drones, 1))
+        assert reward == pytest.approx(np.mean(list(rewards.values())))
+        assert info["sent_bytes"] == sum(i["sent_bytes"] for i in infos.values())
+        assert (terminated, truncated) == (False, step == 4)
+    team.reset()
+    next_one = team.step(action)[1]
+    team.reset(seed=3)
+    team.reset()
+    assert team.step(action)[1] == next_one, "without a seed: drawn from the last one given"
+    team.close()
+
+
+def test_many_fleets_fly_at_once() -> None:
+    from gymnasium.vector import SyncVectorEnv
+
+    fleets = SyncVectorEnv([lambda: TeamEnv(example(*SEEN, "duration_s=2"))] * 2)
+    seen, _ = fleets.reset(seed=3)
+    assert seen.shape == (2, 3, 3, 25)
+    _, rewards, _, _, _ = fleets.step(np.zeros((2, 24), int))
+    assert rewards[0] != rewards[1], "each with its own draws"
+    fleets.close()

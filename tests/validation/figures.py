@@ -325,6 +325,12 @@ def _price() -> Tables:
     return compare_price.tables()
 
 
+def _ranking() -> Tables:
+    import ranking
+
+    return ranking.measure(WORK / "ranking")
+
+
 def _arms() -> Tables:
     """As `sortie learn --by-torch`."""
     from sortie.policies.catalogue.adaptive import ARMS
@@ -644,6 +650,7 @@ FIGURES: dict[str, Figure] = {
     "difficulty": Figure(12, _difficulty),
     "surrogate_in_flight": Figure(45, _surrogate_in_flight),
     "arms": Figure(20, _arms),
+    "ranking": Figure(10, _ranking, timed=True),
     "handshakes": Figure(5, _handshakes),
     "requests": Figure(5, _requests),
     "fusion_methods": Figure(25, _fusion_methods),

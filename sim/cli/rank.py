@@ -1,0 +1,61 @@
+"""`sortie rank`: a policy's place among all built-in ones, on a fixed suite of conditions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import sortie
+from sortie.sim.cli.console import err, out, stages
+from sortie.sim.cli.options import split_policies
+from sortie.sim.ranking.rank import SUITE
+
+
+def rank(
+    policies: Annotated[
+        str,
+        typer.Argument(
+            metavar="POLICY",
+            help="A policy's name, name(key=value), or path/to/file.py:function; several separated by commas.",
+        ),
+    ],
+    suite: Annotated[str, typer.Option(help="The suite: a name of the library, or a file.")] = SUITE,
+    against: Annotated[
+        str | None,
+        typer.Option(help="Policies to rank it among, separated by commas. Default: every built-in one."),
+    ] = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Fly the other policies too, instead of taking their stored results.")
+    ] = False,
+    by_torch: Annotated[
+        bool,
+        typer.Option("--by-torch", help="Fly every policy with the neural detector; minutes for each policy."),
+    ] = False,
+    workers: Annotated[int, typer.Option(help="Number of processes.", min=1)] = 1,
+    out_dir: Annotated[
+        Path,
+        typer.Option("--out", help="Folder for ranking.json, ranking.png and the flights, which are not repeated."),
+    ] = Path("runs/rank"),
+) -> None:
+    """Fly a policy on a fixed, versioned suite of conditions, and print its place among all built-in policies.
+
+    The suite has thirty conditions with different budgets, links, batteries, missions, lies and faults. The policy gets the
+    budget of each condition by its parameter `received_budget`, `sent_budget` or `rho`, if it has one of them.
+
+    A place is a range if the differences between policies are too small to tell. Flights are kept in the folder: after an
+    interruption the same command goes on. Exit code 1 if the policy failed in a condition or breaks a rule of the plane.
+    """
+    with stages() as report:
+        ranking = sortie.rank(
+            split_policies(policies), suite=suite, against=None if against is None else split_policies(against),
+            again=again, by_torch=by_torch, workers=workers, folder=out_dir, progress=report,
+        )  # fmt: skip
+    out.print(ranking.summary())
+    ranking.save(out_dir)
+    out.print(f"kept in [bold]{out_dir}[/bold]: ranking.json, ranking.png", soft_wrap=True)
+    if ranking.faults:
+        for line in ranking.faults:
+            err.print(f"[red]{line}[/red]", soft_wrap=True)
+        raise typer.Exit(1)

@@ -1,0 +1,59 @@
+"""What verification says of a policy that is ranked, in a few words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sortie.policies.contract import Policy
+from sortie.policies.verification.conformance import conform, failing
+from sortie.policies.verification.proof import prove
+from sortie.scenarios.plugins.user_calls import DECISION_S, watched
+
+SEARCH_S = 20.0
+"""Time that the search for views that break the plane's rules may take, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """What `sortie verify` finds, without the properties that a policy states itself."""
+
+    rules: int
+    """Rules of the conformance kit, each tried on drawn views."""
+    broken: tuple[str, ...]
+    """The names of the rules that do not hold."""
+    contract: str
+    """Whether the decisions keep the contract: `proved`, `searched` (some of all views), `drawn` (random views) or `refuted`."""
+    monotone: str
+    """Whether older descriptors never raise what is sent: likewise."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "broken", tuple(self.broken))
+
+    @property
+    def keeps_all(self) -> bool:
+        """Whether no rule is broken and nothing is refuted."""
+        return not self.broken and "refuted" not in (self.contract, self.monotone)
+
+    @property
+    def text(self) -> str:
+        """In a table's cell."""
+        if self.broken:
+            return f"{len(self.broken)} of {self.rules} broken"
+        weakest = next(w for w in (*WORDS, self.contract) if w in (self.contract, self.monotone))
+        return weakest
+
+
+WORDS = ("refuted", "drawn", "searched", "proved over the reals", "proved")
+"""Verdicts, the weakest first."""
+
+
+def verify(policy: Policy, budget_s: float = SEARCH_S) -> Verified:
+    """Try a policy against the conformance kit, and prove the two rules of the plane as far as the time allows.
+
+    Args:
+        budget_s: time for the search, s.
+    """
+    with watched(DECISION_S):
+        checks = conform(policy)
+        contract, monotone = (v.outcome for v in prove(policy, [], budget_s=budget_s)[:2])
+    return Verified(len(checks), tuple(c.name for c in failing(checks)), contract, monotone)

@@ -1,0 +1,360 @@
+"""The suite that policies are ranked on, their flights, their places and what is printed of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+import sortie
+from sortie.policies.registry import POLICIES
+from sortie.scenarios.intervals import Estimate
+from sortie.scenarios.reading.load import condition_sets, load_conditions, read
+from sortie.scenarios.schema.conditions import ConditionSet
+from sortie.sim.campaign.work import RunResult, Task, fly_batch
+from sortie.sim.cli import app
+from sortie.sim.folders import RunError
+from sortie.sim.ranking import flights, rank
+from sortie.sim.ranking.flights import KEPT, METRICS, Flight, fly
+from sortie.sim.ranking.places import PairDifference, differences, places, scores, standings
+from sortie.sim.ranking.stored import made_now, read_results, save_results
+from sortie.sim.ranking.suite import MISSIONS, NEWEST, TROUBLES, digest_of, name_of, suite_text
+from sortie.sim.ranking.verdict import Verified
+from sortie.sim.studies.conditions import scenario_of
+
+SMALL = """
+base: track_target
+set: [perception.detector=surrogate, duration_s=1, fleet.drones=3, "mission.phases=[{at_s: 0, phase: search}]"]
+seeds: []
+conditions:
+  - {name: poor, budget: 0.02, set: [seed=1]}
+  - {name: rich, budget: 0.25, set: [seed=2, perception.scene.seed=8]}
+"""
+MINE = """
+import sortie
+def boxes(view, *, sent_budget=0.5):
+    assert sent_budget in (0.02, 0.25), sent_budget
+    boxes = sortie.Representation.DETECTIONS
+    return [sortie.Directive(view.ego, p, boxes, 0.0, None, 5.0, reason="boxes") for p in view.peers]
+def fails(view, *, sent_budget=0.5):
+    if sent_budget > 0.1:
+        raise RuntimeError("boom")
+    return boxes(view, sent_budget=0.02)
+"""
+FINE = Verified(16, (), "proved", "proved")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A folder with a small suite and a policy; flights fly in this process, and are counted."""
+    flown: list[int] = []
+
+    class Engine:
+        def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
+            for task in tasks:
+                flown.append(task[0])
+                yield fly_batch(code, [task])[0]
+
+    @contextmanager
+    def open_engine(workers: int) -> Iterator[Engine]:
+        yield Engine()
+
+    monkeypatch.setattr(flights, "open_engine", open_engine)
+    monkeypatch.setattr(rank, "verify", lambda policy: FINE)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml").write_text(SMALL)
+    (tmp_path / "mine.py").write_text(MINE)
+    return flown
+
+
+def small() -> ConditionSet:
+    return rank.load_suite("small.yaml")
+
+
+# --- the suite -----------------------------------------------------------------------------------
+
+
+def test_the_generator_gives_the_suites_file_and_a_released_one_never_changes() -> None:
+    name = name_of(NEWEST)
+    assert name in condition_sets()
+    assert read(name)[0] == suite_text(NEWEST)
+    assert digest_of("ranking_v1") == "21fe9f6bc22c"
+
+
+def test_the_suite_crosses_troubles_and_missions_and_draws_all_else() -> None:
+    suite = rank.load_suite("ranking_v1")
+    names = [c.name for c in suite.conditions]
+    assert names == [f"{mission}_{trouble}" for mission in MISSIONS for trouble in TROUBLES]
+    flown = [scenario_of(suite, c, "all-4") for c in suite.conditions]
+    assert Counter(s.fleet.drones for s in flown) == {4: 10, 5: 10, 6: 10}
+    assert len({s.perception.scene.seed for s in flown}) == len({s.seed for s in flown}) == 30
+    budgets = np.sort(np.log([c.budget for c in suite.conditions]))
+    assert np.diff(budgets).max() < 2 * np.log(100) / 30, "spread evenly: one in each thirtieth of the range"
+    for condition, scenario in zip(suite.conditions, flown, strict=True):
+        mission, _, trouble = condition.name.partition("_")
+        assert (condition.metric == "mission") == (mission != "search")
+        assert len(scenario.events) == (trouble not in ("clear", "weak", "tired"))
+        assert (scenario.fleet.battery.initial_soc < 0.3) == (trouble == "tired")
+        assert scenario.policy.invariants.count("\n") == 1
+
+
+def test_the_suite_flies_under_every_policy_within_the_budget() -> None:
+    suite = rank.load_suite("ranking_v1")
+    for policy in POLICIES:
+        for condition in suite.conditions[::10]:
+            assert set(scenario_of(suite, condition, policy).policy.params.values()) <= {condition.budget}
+    own = scenario_of(suite, suite.conditions[0], "best-2(received_budget=0.3)")
+    assert own.policy.params == {"received_budget": 0.3}
+
+
+def test_a_set_with_seeds_of_its_own_is_no_suite(here: object) -> None:
+    Path("seeds.yaml").write_text(SMALL.replace("seeds: []", "seeds: [1, 2]"))
+    with pytest.raises(RunError, match=r"seeds is \[1, 2\], must be \[\]"):
+        rank.load_suite("seeds.yaml")
+    with pytest.raises(RunError, match="holds no conditions"):
+        rank.load_suite("track_target")
+
+
+# --- flights -------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_ranking_goes_on_where_it_was(here: list[int]) -> None:
+    first = fly(small(), ["boxes"], Path("out"))
+    file = Path("out") / KEPT
+    lines = file.read_bytes().splitlines()
+    file.write_bytes(b"\n".join(lines)[:-7])  # the last line was cut off
+    assert len(here) == 2
+    told: list[int] = []
+    again = fly(small(), ["boxes"], Path("out"), progress=told.append)
+    assert (len(here), told) == (3, [1, 2])
+    assert {c: f.fingerprint for c, f in again["boxes"].items()} == {
+        c: f.fingerprint for c, f in first["boxes"].items()
+    }
+    assert again["boxes"]["poor"] == first["boxes"]["poor"]
+    fly(small(), ["boxes"], Path("out"))
+    assert len(here) == 3, "nothing is missing"
+
+
+def test_a_flight_is_flown_again_after_a_change_of_the_policys_file_and_after_a_failure(here: list[int]) -> None:
+    found = fly(small(), ["mine.py:boxes", "mine.py:fails"], Path("out"))
+    assert not found["mine.py:boxes"]["rich"].error
+    failed = found["mine.py:fails"]["rich"]
+    assert "RuntimeError: boom" in failed.error
+    assert set(failed.values.values()) == {None}
+    fly(small(), ["mine.py:boxes", "mine.py:fails"], Path("out"))
+    assert len(here) == 4 + 1
+    Path("mine.py").write_text(MINE + "# changed\n")
+    fly(small(), ["mine.py:boxes"], Path("out"))
+    assert len(here) == 5 + 2
+
+
+def test_a_callable_gets_the_budget_and_flies_as_its_name_does(here: list[int]) -> None:
+    budgets = set()
+
+    def decide(view: sortie.FleetView, *, rho: float = 1.0) -> list[sortie.Directive]:
+        budgets.add(rho)
+        return list(POLICIES["boxes"](view))
+
+    found = flights.fly_callable(small(), decide)
+    assert budgets == {0.02, 0.25}
+    named = fly(small(), ["boxes"], Path("out"))["boxes"]
+    assert [f.values["ap50.full_scene"] for f in found.values()] == [
+        f.values["ap50.full_scene"] for f in named.values()
+    ]
+
+
+# --- places --------------------------------------------------------------------------------------
+
+
+def suite_of(count: int, metric: str = "full_scene") -> ConditionSet:
+    conditions = [{"name": f"c{k}", "budget": 0.1, "metric": metric} for k in range(count)]
+    return ConditionSet.model_validate({"base": "track_target", "seeds": (), "conditions": tuple(conditions)})
+
+
+def flights_of(aps: Mapping[str, list[float | None]], metric: str = "full_scene") -> dict[str, dict[str, Flight]]:
+    """Flights with these APs; NaN is a failure."""
+    found = {}
+    for policy, values in aps.items():
+        found[policy] = {
+            f"c{k}": Flight(
+                "boom" if ap is not None and math.isnan(ap) else "", "",
+                {name: ap if name == f"ap50.{metric}" and ap is not None and not math.isnan(ap) else None for name in METRICS},
+            )
+            for k, ap in enumerate(values)
+        }  # fmt: skip
+    return found
+
+
+def test_places_are_ranges_where_the_intervals_do_not_separate() -> None:
+    rng = np.random.default_rng(0)
+    base = 0.4 + 0.1 * rng.random(30)
+    near = base - 0.001 + 0.02 * rng.standard_normal(30)
+    far = base - 0.2 + 0.02 * rng.standard_normal(30)
+    rows, pairs = standings(suite_of(30), flights_of({"far": list(far), "best": list(base), "near": list(near)}))
+    assert {r.policy: r.place for r in rows} == {"best": (1, 2), "near": (1, 2), "far": (3, 3)}
+    assert rows[-1].policy == "far"
+    assert len(pairs) == 3
+
+
+def test_equal_policies_share_their_places() -> None:
+    aps = list(np.linspace(0.2, 0.5, 12))
+    rows, _ = standings(suite_of(12), flights_of({"a": aps, "b": aps}))
+    assert [r.place for r in rows] == [(1, 2), (1, 2)]
+
+
+def test_intervals_of_pairs_are_students_corrected_for_their_number() -> None:
+    rng = np.random.default_rng(1)
+    scored = {p: 0.4 + 0.01 * rng.standard_normal(20) for p in "abcd"}
+    pair = differences(scored)[0]
+    d = scored["a"] - scored["b"]
+    off = stats.t.ppf(1 - 0.05 / 6 / 2, 19) * d.std(ddof=1) / math.sqrt(20)
+    assert pair.difference.mean == pytest.approx(d.mean())
+    assert pair.difference.high - pair.difference.low == pytest.approx(2 * off, rel=1e-3), (
+        "of six pairs; the scale is flat here"
+    )
+
+
+def test_a_failure_is_last_in_its_condition_and_loses_nothing_else() -> None:
+    aps = {"fails": [0.5, math.nan, 0.5], "flies": [0.4, 0.1, 0.4]}
+    scored = scores(suite_of(3), flights_of(aps))
+    assert scored["fails"].tolist() == [0.5, 0.0, 0.5]
+    rows, _ = standings(suite_of(3), flights_of(aps))
+    failed = next(r for r in rows if r.policy == "fails")
+    assert failed.failed == ("c1",)
+    assert (failed.figures["ap50.full_scene"].mean, failed.figures["ap50.full_scene"].count) == (0.5, 2)
+
+
+def test_a_condition_without_a_car_counts_for_nobody() -> None:
+    scored = scores(suite_of(2), flights_of({"a": [0.5, None], "b": [0.4, 0.9]}))
+    assert {p: s.tolist() for p, s in scored.items()} == {"a": [0.5], "b": [0.4]}
+    with pytest.raises(RunError, match="no condition has an accuracy"):
+        scores(suite_of(1), flights_of({"a": [None]}))
+
+
+def test_the_condition_says_which_ap_counts() -> None:
+    aps = {"a": [0.5, 0.6]}
+    assert scores(suite_of(2, "mission"), flights_of(aps, "mission"))["a"].tolist() == [0.5, 0.6]
+    with pytest.raises(RunError):
+        scores(suite_of(2, "mission"), flights_of(aps, "full_scene"))
+
+
+def test_true_places_lie_within_their_ranges_as_often_as_is_said() -> None:
+    """Drawn rankings of five policies with known means: all ranges hold at once in at least 95 % of them."""
+    rng, means, held = np.random.default_rng(2), np.array([0.4, 0.41, 0.42, 0.45, 0.5]), 0
+    for _ in range(200):
+        scored = dict(zip("abcde", means[:, None] + 0.03 * rng.standard_normal((5, 30)), strict=True))
+        found = places("abcde", differences(scored))
+        held += all(found[p][0] <= 5 - k <= found[p][1] for k, p in enumerate("abcde"))
+    assert held >= 190
+
+
+def test_the_sign_of_a_pair_turns_with_it() -> None:
+    pair = PairDifference("a", "b", Estimate(0.2, 0.1, 0.3, 30))
+    ranked = SimpleNamespace(pairs=[pair], rows=[SimpleNamespace(policy="a"), SimpleNamespace(policy="b")])
+    turned = rank.Ranked.against(ranked, "b")["a"]  # type: ignore[arg-type]
+    assert (turned.sign, turned.difference) == (-1, Estimate(-0.2, -0.3, -0.1, 30))
+    assert rank.Ranked.against(ranked, "a")["b"].sign == 1  # type: ignore[arg-type]
+
+
+# --- stored results, and the whole ---------------------------------------------------------------
+
+
+def test_stored_results_come_back_and_those_of_another_suite_do_not(here: object, tmp_path: Path) -> None:
+    found = flights_of({"a": [0.5, math.nan]})
+    results = made_now("suite", "abc", found, {"a": Verified(16, ("stale views",), "drawn", "refuted")})
+    path = save_results(results, tmp_path)
+    assert read_results("suite", "abc", tmp_path) == results
+    assert read_results("suite", "abd", tmp_path) is None
+    assert read_results("other", "abc", tmp_path) is None
+    path.write_text(path.read_text()[:-9])
+    with pytest.raises(RunError, match=r"suite\.json: is damaged"):
+        read_results("suite", "abc", tmp_path)
+
+
+def test_the_stored_results_are_of_the_newest_suite_and_whole() -> None:
+    found = read_results(rank.SUITE, digest_of(rank.SUITE))
+    assert found is not None
+    assert set(found.flights) <= set(POLICIES)
+    assert rank.REFERENCE in found.flights
+    assert set(found.verified) == set(found.flights)
+    suite = load_conditions(rank.SUITE)
+    assert suite is not None
+    assert all(set(of) == {c.name for c in suite.conditions} for of in found.flights.values())
+
+
+def test_own_flights_are_all_that_a_ranking_costs(
+    here: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others = ["worked", "silence"]
+    flown = fly(small(), others, Path("elsewhere"))
+    save_results(made_now("small", digest_of("small.yaml"), flown, dict.fromkeys(others, FINE)), tmp_path)
+    here.clear()
+    monkeypatch.setattr(rank, "read_results", lambda suite, digest: read_results(suite, digest, tmp_path))
+    ranking = sortie.rank("mine.py:boxes", suite="small.yaml", against=others, folder="out")
+    assert len(here) == 2 + 1, "its own, and one to see whether the stored results are of this version"
+    assert set(ranking.places) == {"mine.py:boxes", *others}
+    assert not ranking.ranked.stale
+    assert "flies otherwise" not in str(ranking.summary())
+    again = sortie.rank("mine.py:boxes", suite="small.yaml", against=others, again=True, folder="again")
+    assert again.places == ranking.places
+    assert again.ranked.stored is None
+    worked = flown["worked"]["poor"]
+    flown["worked"]["poor"] = Flight("", "of another version", {**worked.values, "policy_eval_us.p50": 1e-3})
+    save_results(made_now("small", digest_of("small.yaml"), flown, dict.fromkeys(others, FINE)), tmp_path)
+    ranking = sortie.rank("mine.py:boxes", suite="small.yaml", against=others, folder="out")
+    assert ranking.ranked.stale
+    assert "flies otherwise" in str(ranking.summary())
+    slower = ranking.ranked.speed
+    assert slower == pytest.approx(1e3 * (worked.values["policy_eval_us.p50"] or 0), rel=9), (
+        "as this machine's own flight"
+    )
+    assert ranking.ranked.decision_us("silence") == pytest.approx(
+        slower * ranking.ranked.row("silence").figures["policy_eval_us.p50"].mean
+    )
+
+
+def test_the_command_prints_keeps_and_says_by_its_exit_code_what_failed(here: list[int]) -> None:
+    command = ["rank", "mine.py:boxes,mine.py:fails", "--suite", "small.yaml", "--against", "silence", "--out", "out"]
+    done = CliRunner().invoke(app.app, command)
+    assert done.exit_code == 1, done.output
+    for words in (
+        "mine.py:boxes takes place",
+        "failed in rich: PolicyError",
+        "mine.py:fails failed in 1 of 2 conditions",
+    ):
+        assert words in " ".join(done.output.split())
+    kept = json.loads((Path("out") / "ranking.json").read_text())
+    assert kept["digest"] == digest_of("small.yaml")
+    assert {row["policy"] for row in kept["policies"]} == {"mine.py:boxes", "mine.py:fails", "silence"}
+    assert "boom" in kept["flights"]["mine.py:fails"]["rich"]["error"]
+    assert (Path("out") / "ranking.png").read_bytes().startswith(b"\x89PNG")
+    done = CliRunner().invoke(app.app, [*command[:1], "mine.py:boxes", *command[2:]])
+    assert done.exit_code == 0, done.output
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"policies": "nobody"}, "nobody"),
+        ({"policies": ["boxes", "boxes"]}, "each named once"),
+        ({"policies": []}, "must be one or more"),
+        ({"policies": 3}, "must be a policy or a list"),
+        ({"policies": [3]}, "must be a name, file.py:function or a callable"),
+        ({"policies": "boxes", "workers": 0}, "workers: 0, must be a whole number from 1 on"),
+        ({"policies": "boxes", "against": "worked"}, "must be a list of names"),
+        ({"policies": "best-2(rho=0.1)"}, "rho"),
+    ],
+)
+def test_a_wrong_argument_is_named_before_anything_flies(here: list[int], asked: dict[str, object], words: str) -> None:
+    with pytest.raises(sortie.SortieError, match=words.replace("(", r"\(")):
+        sortie.rank(**{"suite": "small.yaml", "folder": "out"} | asked)  # type: ignore[arg-type]
+    assert not here
