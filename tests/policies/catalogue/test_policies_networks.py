@@ -11,16 +11,17 @@ from sortie.policies.verification.views import draw_view
 
 VIEWS = [v for v in (draw_view(7, n) for n in range(60)) if len(v.peers) >= 2]
 FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS
-NO_FEATURES = ("silence", "boxes", "learned")
+CODES = Representation.CODES
+NO_FEATURES = ("silence", "boxes", "uncertain-boxes", "learned")
 """What the model of `learned` chooses depends on its last fit."""
 BUILT_IN = {**POLICIES, "an arm": arm}
 
 
 def in_spaces(view: FleetView, **names: str) -> FleetView:
-    """The view with every drone in the common feature space, but for some."""
+    """The view with every drone in the common feature space and with the common codebook, but for some."""
     of = {int(k[1:]): name for k, name in names.items()}
     return view._replace(
-        descriptors={i: d._replace(feature_space=of.get(i, "")) for i, d in view.descriptors.items()},
+        descriptors={i: d._replace(feature_space=of.get(i, ""), codebook="") for i, d in view.descriptors.items()},
         age_s=dict.fromkeys(view.age_s, 0.0),
     )
 
@@ -33,7 +34,7 @@ def test_features_become_boxes_for_another_network_and_nothing_else_changes(name
         alike = {d.destination: d for d in policy(in_spaces(view))}
         mixed = {d.destination: d for d in policy(in_spaces(view, **{f"_{other}": "theirs"}))}
         wanted = alike[other]
-        if wanted.representation == FEATURES:
+        if wanted.representation in (FEATURES, CODES):
             replaced += 1
             wanted = wanted._replace(representation=DETECTIONS, rho=0.0)
         assert mixed == {**alike, other: wanted}
