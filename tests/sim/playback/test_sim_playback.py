@@ -23,13 +23,13 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.playback import recording
-from sortie.sim.playback.canvas import goodput_colours
 from sortie.sim.playback.charts import OVER
 from sortie.sim.playback.received import hatch
 from sortie.sim.playback.recording import save_rrd, scene_of, spread_m
 from sortie.sim.playback.viewer import LiveViewer, open_viewer, to_file, to_new_viewer
 from sortie.sim.results.accuracy import accuracy, matched
 from sortie.sim.results.outcome import outcome, transitions
+from sortie.sim.results.palette import goodput_colours
 from sortie.sim.results.record import TABLES, SortieRecord
 from sortie.sim.results.sentences import decision_in_words
 
