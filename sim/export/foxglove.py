@@ -6,7 +6,7 @@ import json
 from importlib.resources import files
 from typing import Any
 
-from sortie.sim.playback.canvas import drone_colour
+from sortie.sim.results.palette import drone_colour
 
 LAYOUT = "foxglove_layout.json"
 

@@ -24,8 +24,8 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import Cars
 from sortie.perception.types import Boxes
 from sortie.scenarios.schema.events import Jam
-from sortie.sim.playback import canvas as c
-from sortie.sim.playback.recording import scene_of
+from sortie.sim.results import palette as c
+from sortie.sim.results.flown_scene import scene_of
 from sortie.sim.results.link_traffic import LinkTraffic
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions

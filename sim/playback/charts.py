@@ -17,9 +17,10 @@ import rerun as rr
 from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema import Scenario
-from sortie.sim.playback import canvas as c
-from sortie.sim.playback.canvas import Canvas, Floats, line
+from sortie.sim.playback.canvas import Canvas, line
+from sortie.sim.results import palette
 from sortie.sim.results.outcome import transitions
+from sortie.sim.results.palette import Floats
 from sortie.sim.results.record import TABLES
 from sortie.sim.results.sentences import decision_in_words, event_in_words
 from sortie.sim.results.sightings import Sighting
@@ -27,12 +28,12 @@ from sortie.sim.results.sightings import Sighting
 AP_WINDOW_S = 5.0
 MARKED = ("ap", "battery", "goodput", "traffic", "age", "lost", "medium")
 """Plots in which phase changes and events are marked."""
-EVENT_LANE: c.Rgba = (150, 108, 20, 255)
+EVENT_LANE: palette.Rgba = (150, 108, 20, 255)
 OVER = "·"
 """What every lane shows after the end: lanes go on to the right of it."""
-OVER_COLOUR: c.Rgba = (0, 0, 0, 255)
+OVER_COLOUR: palette.Rgba = (0, 0, 0, 255)
 RUNGS = ("nothing", *list(REPRESENTATION_OF)[1:])
-FATES: dict[str, c.Rgba] = {"expired": (225, 222, 240, 255), "lost": (255, 50, 70, 255)}
+FATES: dict[str, palette.Rgba] = {"expired": (225, 222, 240, 255), "lost": (255, 50, 70, 255)}
 """Colours of traffic that did not arrive; what arrived has its representation's colour."""
 _INSTANT_S = 1e-6
 """A frame begins a few digits beside its second."""
@@ -57,7 +58,7 @@ class Charts:
         self._window: deque[Sighting] = deque()
         self._carried: dict[tuple[int, int], str] = {}
         self._lanes: dict[int, str] = {}
-        self._lane_colours: dict[int, dict[str, c.Rgba]] = defaultdict(dict)
+        self._lane_colours: dict[int, dict[str, palette.Rgba]] = defaultdict(dict)
         self._phase: dict[int, str] = {}
         self._event_texts: list[str] = []
         self._over = False
@@ -66,23 +67,23 @@ class Charts:
         """Name and colour every plot line that is known beforehand."""
         canvas, drones = self._canvas, range(self._n)
         for i in drones:
-            colour = c.drone_colour(i)
+            colour = palette.drone_colour(i)
             canvas.static(f"plots/battery/{i}", line(f"drone {i}", colour))
             canvas.static(f"plots/goodput/{i}", line(f"drone {i}", colour))
-        phases = list(c.PHASES)
+        phases = list(palette.PHASES)
         for group in range(len(self._scenario.mission.phases_of)):
-            colours = [*(c.PHASES[p] for p in phases), OVER_COLOUR]
+            colours = [*(palette.PHASES[p] for p in phases), OVER_COLOUR]
             states = rr.StateConfiguration(values=[*phases, OVER], colors=colours)
             canvas.static(phase_lane(group), states)
         canvas.static("plots/ap/full_scene", line("full scene", (120, 200, 255, 255), width=2.5))
-        canvas.static("plots/ap/mission", line("mission disc", c.MISSION, width=2.5))
+        canvas.static("plots/ap/mission", line("mission disc", palette.MISSION, width=2.5))
         canvas.static("plots/age/p99_ms", line("descriptor age p99, ms", (190, 190, 200, 255)))
         canvas.static("plots/lost/percent", line("descriptors lost, %", (230, 120, 120, 255)))
         canvas.static("plots/medium/busy_percent", line("channel busy, %", (240, 150, 80, 255)))
         for folder in MARKED:
-            canvas.static(f"plots/{folder}/marks/event", _mark("event", c.WARNING, rr.components.MarkerShape.Up))
+            canvas.static(f"plots/{folder}/marks/event", _mark("event", palette.WARNING, rr.components.MarkerShape.Up))
             canvas.static(
-                f"plots/{folder}/marks/phase", _mark("phase change", c.MISSION, rr.components.MarkerShape.Diamond)
+                f"plots/{folder}/marks/phase", _mark("phase change", palette.MISSION, rr.components.MarkerShape.Diamond)
             )
 
     def add(self, known_s: float, new: Mapping[str, pa.Table], seen: Iterable[Sighting]) -> None:
@@ -153,7 +154,7 @@ class Charts:
                 begin = int(np.argmax(mbps > 0))
                 self._running.add(name)
                 representation, fate = name.split(" ")
-                colour = FATES.get(fate) or c.SENT[representation]
+                colour = FATES.get(fate) or palette.SENT[representation]
                 self._canvas.static(path, line(name, colour))
             self._canvas.scalars(path, edges[1:][begin:], mbps[begin:])
         later = t_s >= edges[-1]  # what is still in flight has no time, and is dropped here
@@ -229,7 +230,7 @@ class Charts:
             columns = rr.TextLog.columns(
                 text=[decision_in_words(x) for x in changes],
                 level=["INFO"] * len(changes),
-                color=[c.drone_colour(x["drone"]) for x in changes],
+                color=[palette.drone_colour(x["drone"]) for x in changes],
             )
             self._canvas.columns("log/decisions", np.array([x["t_s"] for x in changes]), columns)
 
@@ -271,7 +272,7 @@ class Charts:
             self._event_lane([*self._event_texts, OVER], [EVENT_LANE] * len(self._event_texts) + [OVER_COLOUR])
             self._state("lanes/events", end_s, OVER)
 
-    def _event_lane(self, texts: list[str], colours: list[c.Rgba]) -> None:
+    def _event_lane(self, texts: list[str], colours: list[palette.Rgba]) -> None:
         self._canvas.static("lanes/events", rr.StateConfiguration(values=texts, colors=colours))
 
     def _state(self, path: str, t_s: float, state: str) -> None:
@@ -281,7 +282,7 @@ class Charts:
         rows = events.to_pylist()
         if rows:
             texts = [event_in_words(r) for r in rows]
-            columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(rows), color=[c.WARNING] * len(rows))
+            columns = rr.TextLog.columns(text=texts, level=["WARN"] * len(rows), color=[palette.WARNING] * len(rows))
             t_s = [r["t_s"] for r in rows]
             self._canvas.columns("log/events", np.array(t_s), columns)
             self._marks("event", t_s)
@@ -295,13 +296,13 @@ class Charts:
             self._canvas.scalars(f"plots/{folder}/marks/{kind}", np.array(t_s), np.zeros(len(t_s)))
 
 
-def _mark(name: str, colour: c.Rgba, shape: rr.components.MarkerShape) -> rr.SeriesPoints:
+def _mark(name: str, colour: palette.Rgba, shape: rr.components.MarkerShape) -> rr.SeriesPoints:
     return rr.SeriesPoints(colors=[colour], markers=[shape], names=[name], marker_sizes=[4.0])
 
 
-def _level_colour(level: str) -> c.Rgba:
+def _level_colour(level: str) -> palette.Rgba:
     """The representation's colour, darker at lower rates."""
-    colour = c.SENT[level.split(" ")[0]]
+    colour = palette.SENT[level.split(" ")[0]]
     rate = re.search(r"at ([\d.]+) Hz", level)
     light = 1.0 if rate is None else 0.55 + 0.45 * min(1.0, float(rate[1]) / 10.0)
     r, g, b = (round(light * part) for part in colour[:3])

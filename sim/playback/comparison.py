@@ -9,8 +9,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from sortie.scenarios.schema import Scenario
-from sortie.sim.playback.canvas import DRONE_COLOURS
 from sortie.sim.playback.layout import lanes_view, log_view, scene_view, sheet, time_axis
+from sortie.sim.results.palette import DRONE_COLOURS
 
 SHARED = (
     ("AP@0.5 in the mission disc, last 5 s", "ap/mission", (0.0, 1.0)),

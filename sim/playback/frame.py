@@ -18,8 +18,8 @@ from sortie.perception.evaluation.picture import Picture
 from sortie.perception.geometry import CELLS, to_world
 from sortie.perception.scene.render import CAMERAS
 from sortie.perception.types import Boxes
-from sortie.sim.playback.canvas import MISSION, drone_colour
 from sortie.sim.playback.recording import new_file
+from sortie.sim.results.palette import MISSION, drone_colour
 
 APPLICATION = "sortie-frame"
 TRUTH, FOUND = (150, 152, 158, 255), (80, 150, 255, 255)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from sortie.perception.scene.scene_model import MARGIN_M, SceneModel
 from sortie.scenarios.schema import Scenario
-from sortie.sim.playback import canvas as c
-from sortie.sim.playback.canvas import Canvas, Floats
+from sortie.sim.playback.canvas import Canvas
+from sortie.sim.results import palette
+from sortie.sim.results.palette import Floats
 
 TRAIL_S = 60
 """So long a way behind each drone is drawn, a point a second."""
@@ -53,16 +54,19 @@ class GroundMap:
             [[(x_m, y_m), (x_m + SCALE_M, y_m)]], colors=[(240, 240, 240, 255)], radii=[-2.5], labels=[f"{SCALE_M:g} m"]
         )
         canvas.static("map/scale", scale)
-        colours = [c.drone_colour(i) for i in range(n)]
+        colours = [palette.drone_colour(i) for i in range(n)]
         names = [str(i) for i in range(n)]
         canvas.static(
             "map/drones", rr.Points2D.from_fields(radii=[-6.0], colors=colours, labels=names, draw_order=40.0)
         )
         canvas.static("map/trails", rr.LineStrips2D.from_fields(radii=[-1.5], colors=colours, draw_order=20.0))
-        canvas.static("map/mission", rr.LineStrips2D.from_fields(radii=[-2.5], colors=[c.MISSION], draw_order=30.0))
-        canvas.static("map/targets", rr.Points2D.from_fields(radii=[-5.0], colors=[c.TARGET], draw_order=35.0))
         canvas.static(
-            "map/jammers", rr.Points2D.from_fields(radii=[-8.0], colors=[c.JAMMER], labels=["jammer"], draw_order=38.0)
+            "map/mission", rr.LineStrips2D.from_fields(radii=[-2.5], colors=[palette.MISSION], draw_order=30.0)
+        )
+        canvas.static("map/targets", rr.Points2D.from_fields(radii=[-5.0], colors=[palette.TARGET], draw_order=35.0))
+        canvas.static(
+            "map/jammers",
+            rr.Points2D.from_fields(radii=[-8.0], colors=[palette.JAMMER], labels=["jammer"], draw_order=38.0),
         )
 
     def add(self, t_s: Floats, position: Floats, mission: pa.Table) -> None:

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from sortie.scenarios.link_state import is_tried
 from sortie.sim.playback import canvas as c
-from sortie.sim.playback.canvas import SPAN_M, Canvas, Floats
+from sortie.sim.playback.canvas import SPAN_M, Canvas
+from sortie.sim.results import palette
 from sortie.sim.results.link_traffic import LinkTraffic
+from sortie.sim.results.palette import Floats
 
 MANY_DRONES = 8
 """In fleets above this, links that carry nothing are left out."""
@@ -40,7 +42,7 @@ class LinkArrows:
     def begin(self) -> None:
         """Say how crosses look."""
         if self._n > 1:
-            self._canvas.static("world/broken", rr.LineStrips3D.from_fields(colors=[c.BROKEN], radii=[-2.2]))
+            self._canvas.static("world/broken", rr.LineStrips3D.from_fields(colors=[palette.BROKEN], radii=[-2.2]))
 
     def add(self, t_s: Floats, position: Floats, airborne: NDArray[np.bool_], new: Mapping[str, pa.Table]) -> None:
         """Draw the frames at `t_s` [T] from positions [T, N, 3], `descriptors` and `transmissions`."""
@@ -61,7 +63,7 @@ class LinkArrows:
         shown = airborne[:, i] & airborne[:, j]
         if self._n > MANY_DRONES:
             shown = shown & busy
-        colours = np.where(busy[..., None], c.goodput_colours(goodput[:, i, j]), np.array(c.IDLE, np.uint8))
+        colours = np.where(busy[..., None], palette.goodput_colours(goodput[:, i, j]), np.array(palette.IDLE, np.uint8))
         width = np.where(busy, 1.5 + 1.0 * np.log2(1.0 + mbps[:, i, j]), 0.75)
         links = rr.Arrows3D.columns(
             origins=begin[shown], vectors=(end - begin)[shown], colors=c.packed(colours[shown]), radii=-width[shown]

@@ -24,7 +24,9 @@ from sortie.perception.geometry import CELLS
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import CELL_NAMES
 from sortie.sim.playback import canvas as c
-from sortie.sim.playback.canvas import Canvas, Floats
+from sortie.sim.playback.canvas import Canvas
+from sortie.sim.results import palette
+from sortie.sim.results.palette import Floats
 
 STEP_S = 0.5
 """The hatching is drawn anew so often."""
@@ -77,7 +79,7 @@ class ReceivedCells:
     def begin(self) -> None:
         """Say how each sender's cells look."""
         for ego, peer in self._links():
-            colour, path = c.drone_colour(peer), f"world/received/{ego}/{peer}"
+            colour, path = palette.drone_colour(peer), f"world/received/{ego}/{peer}"
             self._canvas.static(f"{path}/cells", rr.Boxes3D.from_fields(colors=[colour], fill_mode="solid"))
             self._canvas.static(f"{path}/whole_map", rr.LineStrips3D.from_fields(colors=[colour], radii=[-1.2]))
 

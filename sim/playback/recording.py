@@ -23,6 +23,7 @@ from sortie.sim.playback.charts import Charts
 from sortie.sim.playback.comparison import comparison, roots
 from sortie.sim.playback.layout import blueprint, legend
 from sortie.sim.playback.scene import Drawing
+from sortie.sim.results.flown_scene import scene_of
 from sortie.sim.results.record import Recorder, SortieRecord
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.sightings import sightings
@@ -145,20 +146,3 @@ def spread_m(record: SortieRecord) -> float:
             away = np.linalg.norm(xy - np.nanmean(xy, axis=1, keepdims=True), axis=-1)
             farthest.append(np.nanmax(away, axis=1))
     return float(np.quantile(np.concatenate(farthest), 0.95)) if farthest else 0.0
-
-
-def scene_of(record: SortieRecord) -> SceneModel:
-    """The scene that the sortie flew over, made anew from its scenario and where it flew."""
-    scenario = record.scenario
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for batch in batches(record.tables, "states", ["x_m", "y_m"]):
-        xy = np.column_stack([column.to_numpy() for column in batch.columns])
-        low, high = np.minimum(low, xy.min(axis=0)), np.maximum(high, xy.max(axis=0))
-    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    return SceneModel(
-        scenario.perception.scene,
-        scenario.mission.target,
-        bounds,
-        scenario.mission.more_targets,
-        scenario.perception.people,
-    )

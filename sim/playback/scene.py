@@ -27,10 +27,12 @@ from sortie.perception.types import Boxes
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.events import Jam
 from sortie.sim.playback import canvas as c
-from sortie.sim.playback.canvas import SPAN_M, Canvas, Floats
+from sortie.sim.playback.canvas import SPAN_M, Canvas
 from sortie.sim.playback.ground_map import GroundMap
 from sortie.sim.playback.links import LinkArrows
 from sortie.sim.playback.received import ReceivedCells
+from sortie.sim.results import palette
+from sortie.sim.results.palette import Floats
 from sortie.sim.results.sightings import Sighting
 
 TRAIL_S, TRAIL_STEP_S = 10.0, 0.5
@@ -72,7 +74,7 @@ class Drawing:
         canvas.static("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._town()
         for i in range(self._n):
-            colour = c.drone_colour(i)
+            colour = palette.drone_colour(i)
             if i in self._stations:
                 _mast(canvas, f"world/drones/{i}", colour, self._stations[i].position_m[2])
             else:
@@ -85,19 +87,19 @@ class Drawing:
                 canvas.static(f"world/seen/{i}/{name}", rr.Boxes3D.from_fields(radii=[-width]))
         canvas.static(
             "world/jammers",
-            rr.Points3D.from_fields(radii=[2.0], colors=[c.JAMMER], labels=["jammer"], show_labels=True),
+            rr.Points3D.from_fields(radii=[2.0], colors=[palette.JAMMER], labels=["jammer"], show_labels=True),
         )
         self._links.begin()
         self._received.begin()
-        canvas.static("world/people", rr.Points3D.from_fields(radii=[PERSON_DRAWN_M / 2], colors=[c.PEOPLE]))
+        canvas.static("world/people", rr.Points3D.from_fields(radii=[PERSON_DRAWN_M / 2], colors=[palette.PEOPLE]))
         canvas.static("world/cars/moving", rr.Boxes3D.from_fields(fill_mode="solid"))
         for group in self._groups:
-            disc = rr.LineStrips3D.from_fields(colors=[c.MISSION], radii=[-2.5])
+            disc = rr.LineStrips3D.from_fields(colors=[palette.MISSION], radii=[-2.5])
             canvas.static(f"{_mission_path(group)}/disc", disc)
         for k in range(self._targets):
             label = "target" if self._targets == 1 else f"target {k}"
             pin = rr.Arrows3D(
-                vectors=[(0, 0, -12)], origins=[(0, 0, 15)], radii=[0.6], colors=[c.TARGET], labels=[label]
+                vectors=[(0, 0, -12)], origins=[(0, 0, 15)], radii=[0.6], colors=[palette.TARGET], labels=[label]
             )
             canvas.static(f"{_target_path(k)}/pin", pin)
 
@@ -184,7 +186,7 @@ class Drawing:
             self._resting[drone] = np.array([last[0], last[1], 0.3])
             nothing = Boxes.empty()
             self._sighting_rows(drone, np.array([t_s]), [nothing], [nothing], [nothing])
-        paint = _body_colours(c.drone_colour(drone)) if up else [c.FALLEN] * 4
+        paint = _body_colours(palette.drone_colour(drone)) if up else [palette.FALLEN] * 4
         columns = rr.Boxes3D.columns(colors=paint).partition([4])
         self._canvas.columns(f"world/drones/{drone}/body", np.array([t_s]), columns)
 
@@ -296,9 +298,9 @@ class Drawing:
     ) -> None:
         """Send boxes of these times, a list of them each; the less sure the drone was, the darker."""
         for name, several, colour in (
-            ("found", found, c.FOUND),
-            ("missed", missed, c.MISSED),
-            ("false", false, c.FALSE),
+            ("found", found, palette.FOUND),
+            ("missed", missed, palette.MISSED),
+            ("false", false, palette.FALSE),
         ):
             boxes = Boxes.join(several)
             light = 0.25 + 0.75 * np.clip(boxes.score, 0.0, 1.0)[:, None]
@@ -325,11 +327,11 @@ def ground_image(rect: tuple[float, float, float, float], block_m: float) -> NDA
     return image
 
 
-def _body_colours(colour: c.Rgba) -> list[c.Rgba]:
+def _body_colours(colour: palette.Rgba) -> list[palette.Rgba]:
     return [(230, 230, 235, 255), (230, 230, 235, 255), colour, (255, 255, 255, 255)]
 
 
-def _drone(canvas: Canvas, path: str, colour: c.Rgba) -> None:
+def _drone(canvas: Canvas, path: str, colour: palette.Rgba) -> None:
     """A quadrotor: nose, body and two crossed arms, four rotors."""
     arm = SPAN_M / 2 * np.sqrt(0.5)
     diagonal = [(0.0, 0.0, np.sin(a / 2), np.cos(a / 2)) for a in (np.pi / 4, -np.pi / 4)]
@@ -353,7 +355,7 @@ def _drone(canvas: Canvas, path: str, colour: c.Rgba) -> None:
     canvas.static(f"{path}/name", rr.Points3D([(0, 0, 5.0)], radii=[0.01], colors=[colour], show_labels=True))
 
 
-def _mast(canvas: Canvas, path: str, colour: c.Rgba, height_m: float) -> None:
+def _mast(canvas: Canvas, path: str, colour: palette.Rgba, height_m: float) -> None:
     """A ground station: a mast from the ground to its antenna, and a ball where the antenna is."""
     mast = rr.Cylinders3D(
         lengths=[max(height_m, 0.1)], radii=[0.25], centers=[(0, 0, -height_m / 2)], colors=[(150, 150, 155, 255)],

@@ -26,8 +26,8 @@ from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.bag import write_bag
 from sortie.sim.export.foxglove import layout
 from sortie.sim.export.messages import descriptors
-from sortie.sim.playback.recording import scene_of
 from sortie.sim.results import run_folder
+from sortie.sim.results.flown_scene import scene_of
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words

@@ -23,13 +23,13 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.playback import recording
-from sortie.sim.playback.canvas import goodput_colours
 from sortie.sim.playback.charts import OVER
 from sortie.sim.playback.received import hatch
 from sortie.sim.playback.recording import save_rrd, scene_of, spread_m
 from sortie.sim.playback.viewer import LiveViewer, open_viewer, to_file, to_new_viewer
 from sortie.sim.results.accuracy import accuracy, matched
 from sortie.sim.results.outcome import outcome, transitions
+from sortie.sim.results.palette import goodput_colours
 from sortie.sim.results.record import TABLES, SortieRecord
 from sortie.sim.results.sentences import decision_in_words
 
@@ -534,7 +534,7 @@ def test_no_house_hides_the_mission_region(rows: Rows, record: SortieRecord) -> 
     ((_, _, (ground, above, *posts)),) = rows["/world/mission/disc"]["LineStrips3D:strips"]
     roofs = rows["/world/town/buildings"]["Boxes3D:half_sizes"][0][2]
     assert {z for _, _, z in ground} == {0.0}
-    assert {z for _, _, z in above} == {pytest.approx(2 * max(half[2] for half in roofs) + 1.0, rel=1e-5)}
+    assert [z for _, _, z in above] == pytest.approx([2 * max(half[2] for half in roofs) + 1.0] * len(above), rel=1e-5)
     assert len(posts) == 8
 
 
