@@ -27,8 +27,8 @@ def test_a_late_map_s_boxes_lie_where_its_sender_was_or_without_compensation_whe
     )
     assert len(there) > 5
     c, s = np.cos(0.2), np.sin(0.2)
-    off = there.xy_m - [10.0, 20.0]
-    turned = np.stack([c * off[:, 0] - s * off[:, 1], s * off[:, 0] + c * off[:, 1]], axis=1) + [16.0, 20.0]
+    off = there.xy_m - np.array([10.0, 20.0])
+    turned = np.array([16.0, 20.0]) + np.stack([c * off[:, 0] - s * off[:, 1], s * off[:, 0] + c * off[:, 1]], axis=1)
     apart = np.hypot(*(turned[:, None] - moved.xy_m[None]).transpose(2, 0, 1)).min(axis=1)
     inner = np.hypot(*off.T) < 80.0  # both squares hold these
     assert np.count_nonzero(inner) > 5
