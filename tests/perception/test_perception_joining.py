@@ -130,6 +130,16 @@ def test_under_suppression_an_own_box_stands_against_a_late_or_a_doubted_one() -
         assert out.xy_m[:, 0].tolist() == pytest.approx([stays])
 
 
+def test_a_mean_points_where_the_best_box_does_after_what_weight_and_age_leave() -> None:
+    """A late or doubted box with the higher score is not the best one."""
+    own, other = boxes((0, 0, 0.5)), source((0.2, 0, 0.6, np.pi))
+    assert 0.6 * left(1.0) < 0.5
+    for peer, yaw_rad in ((other, np.pi), (replace(other, age_s=1.0), 0.0), (replace(other, weight=0.8), 0.0)):
+        (out,) = joined_many([EgoSources(HERE, own, False, [peer])], "average")
+        assert len(out) == 1
+        assert np.cos(out.yaw_rad[0] - yaw_rad) == pytest.approx(1.0, abs=1e-5)
+
+
 def test_ages_count_beside_the_freshest_look() -> None:
     """All of one age: as if all were fresh. An own look that is the oldest gives way."""
     own, peer = boxes((0, 0, 0.6)), source((0.6, 0, 0.5), (40, 0, 0.5))

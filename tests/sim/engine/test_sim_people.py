@@ -263,3 +263,20 @@ def test_the_own_camera_is_known_after_the_delay_of_perception() -> None:
     assert len(people.known(here, [], t_s + 0.03)) == len(people.found(here)) == 1
     assert len(people.found(here._replace(t_s=t_s + 0.1))) == 0
     assert people.truth(t_s, here).car.tolist() == [0]
+
+
+def test_people_are_looked_for_where_they_are_at_the_scoring() -> None:
+    """One runs 10 m/s, and a fusion comes 0.8 s after its frame. A drone that was lost would have had to find her as well."""
+    record = run_sortie(
+        example(
+            "duration_s=3", "perception.detector=surrogate", "perception.fusion_delay_s=0.8", "perception.thermal={}",
+            "perception.people=[{waypoints_m: [[-30, 5], [60, 5]], speed_mps: 10}]",
+            "events=[{kind: drone_lost, at_s: 0.9, drone: 2}]",
+        ),
+        "silence",
+    )  # fmt: skip
+    rows = [r for r in record.tables["truths"].to_pylist() if r["kind"] == PERSON]
+    assert {r["drone"] for r in rows if r["t_s"] > 2.0} == set(range(5))
+    assert len(rows) > 10
+    for r in rows:
+        assert (r["x_m"], r["y_m"]) == pytest.approx((-30.0 + 10.0 * r["t_s"], 5.0), abs=1e-3)
