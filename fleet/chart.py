@@ -19,7 +19,7 @@ Grids = tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]
 """Packed grids [K, 64], and the row and column of each one's south-west cell in the world's lattice, [K]."""
 
 
-def _loops() -> Any:
+def loops() -> Any:
     """The compiled loops, imported and made ready at their first use: before a flight, whose drones may be real ones."""
     if not _MODULE:
         from sortie.fleet import chart_loops
@@ -50,8 +50,8 @@ class Chart:
     """The ground that the fleet has seen well, as far as one drone knows: from its own looks and its peers' grids."""
 
     def __init__(self) -> None:
-        self._loops = loops = _loops()
-        self._keys = np.full(_FIRST_CELLS, loops.EMPTY, np.int64)
+        self._loops = ready = loops()
+        self._keys = np.full(_FIRST_CELLS, ready.EMPTY, np.int64)
         self._count = 0
         self._new = np.zeros(COVERAGE_CELLS**2, np.bool_)
 

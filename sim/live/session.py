@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
+from sortie.fleet import chart, peers
 from sortie.fleet.logs.geodesy import Origin
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
@@ -103,6 +104,7 @@ def fly_live(
     if unused and warn is not None:
         warn(unused)
     report_progress = progress or (lambda what, done, of: None)
+    peers.loops(), chart.loops()  # compiled and kept here, so that no drone's process has to while it is waited for
     found = traces(
         scenario.model_copy(update={"duration_s": end_s}),
         lambda t_s: report_progress("flying for the context", t_s, end_s),
