@@ -102,7 +102,7 @@ def evaluate(
 
     results: list[FrameResult] = []
     try:
-        for name, found in _in_order(task, len(keys), workers, getattr(instrument, "start_worker", None)):
+        for name, found in in_order(task, len(keys), workers, getattr(instrument, "start_worker", None)):
             results.append(found if kept is None else kept.add(name, found))
             if kept is not None and len(results) % FLUSH_FRAMES == 0:
                 kept.flush()
@@ -114,7 +114,7 @@ def evaluate(
     return assemble(results, conditions, regions, settings, np.asarray(frames.scene), plain)
 
 
-def _in_order(task: Callable[[int], T], count: int, workers: int, start: Callable[[], None] | None) -> Iterator[T]:
+def in_order(task: Callable[[int], T], count: int, workers: int, start: Callable[[], None] | None) -> Iterator[T]:
     """task(0), task(1), … by so many threads, never more than twice as many ahead as there are threads."""
     if workers <= 1:
         yield from map(task, range(count))
