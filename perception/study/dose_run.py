@@ -176,17 +176,13 @@ def _computed_as(dose: Dose, plain: Sharing) -> tuple[Sharing, Tuning]:
 
 def frames_of(ranges: Sequence[FrameRange], root: Path, tell: Progress) -> Frames:
     """The frames of these ranges, one after the other."""
-    scenes, each = SIZES["test"]
+    scenes, _ = SIZES["test"]  # a scene has one frame
     files: list[Path] = []
     for r in ranges:
-        if not 0 <= r.first <= r.last < scenes * each:
-            raise ValueError(
-                f"frames {r.first} to {r.last} of benchmark {r.bench_seed}: must lie in 0 to {scenes * each - 1}"
-            )
-        count, render = r.last // each + 1, partial(tell, f"rendering benchmark {r.bench_seed}")
-        files += make_split(Benchmark(seed=r.bench_seed), "test", root, scenes=count, progress=render)[
-            r.first // each :
-        ]
+        if not 0 <= r.first <= r.last < scenes:
+            raise ValueError(f"frames {r.first} to {r.last} of benchmark {r.bench_seed}: must lie in 0 to {scenes - 1}")
+        render, which = partial(tell, f"rendering benchmark {r.bench_seed}"), range(r.first, r.last + 1)
+        files += make_split(Benchmark(seed=r.bench_seed), "test", root, scenes=which, progress=render)
     return load_frames(files)
 
 
