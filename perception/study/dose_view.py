@@ -135,4 +135,4 @@ class DoseView:
 
 def _shares(fusion: DiscoNet, logit: torch.Tensor, silent: torch.Tensor, peers: torch.Tensor) -> torch.Tensor:
     part = torch.cat([torch.ones_like(peers[:1]), peers])
-    return fusion.shares(logit, silent, part, logit.new_ones(1, 1).expand(part.shape))
+    return fusion.softmax(logit, silent, part, logit.new_ones(1, 1).expand(part.shape))

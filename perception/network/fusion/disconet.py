@@ -72,9 +72,9 @@ class DiscoNet(PerCell):
     def weights(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
         """Each agent's softmax weight, [agents, p]; as for `mix`."""
         silent = silent_in(features) if self.silent_weight else None
-        return self.shares(self.edge(features), silent, part, weight)
+        return self.softmax(self.edge(features), silent, part, weight)
 
-    def shares(self, logit: Tensor, silent: Tensor | None, part: Tensor, weight: Tensor) -> Tensor:
+    def softmax(self, logit: Tensor, silent: Tensor | None, part: Tensor, weight: Tensor) -> Tensor:
         """Each agent's softmax weight from the edge network's logits, all [agents, p].
 
         Args: `silent` as `silent_in` gives it, or None: nobody's logit is changed.
