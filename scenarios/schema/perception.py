@@ -74,7 +74,7 @@ class Perception(Section):
     )
     fusion_params: Params = Field(
         {},
-        description="Keyword arguments of a fusion of one's own. Of disconet, for studies: temperature (the softmax's logits are divided by it) and silent_weight (added to the logit of cells that were not sent and count as zeros).",
+        description="Keyword arguments of a fusion of one's own. Of disconet, for studies: temperature (the softmax's logits are divided by it; 1e9 gives equal weights) and silent_weight (added to the logit of cells that were not sent and count as zeros).",
     )
     weights: str | None = Field(
         None,
