@@ -177,6 +177,7 @@ def select(
     y_m: float,
     yaw_rad: float,
     missing: Sequence[int] = (),
+    first: Disc | None = None,
 ) -> Bools:
     """[64, 64] bool: the cells that arrive: the `cells_sent` best ones, without those that went missing.
 
@@ -184,11 +185,13 @@ def select(
         rank: [64, 64] confidence or norm, as for `ranking`.
         rho, roi, x_m, y_m, yaw_rad: as for `cells_sent`.
         missing: ranks among the cells sent (0 the best) that did not arrive.
+        first: without a region of interest, cells in this disc are sent before all others.
     """
     count = cells_sent(rho, roi, x_m, y_m, yaw_rad)
     out = np.zeros(CELLS, bool)
     if count:
-        order = ranking(rank[None], None if roi is None else roi_mask(roi, x_m, y_m, yaw_rad)[None])[0]
+        disc = first if roi is None else roi
+        order = ranking(rank[None], None if disc is None else roi_mask(disc, x_m, y_m, yaw_rad)[None])[0]
         out[order[:count]] = True
         out[order[list(missing)]] = False
     return out.reshape(GRID, GRID)

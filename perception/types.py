@@ -75,6 +75,8 @@ class Share(NamedTuple):
     """People that the sender's thermal camera found; None where the payload has none to give."""
     errors: BoxErrors | None = None
     """How uncertain the places of `boxes` are, where they are sent with covariances."""
+    first: Disc | None = None
+    """Cells in this disc are sent before all others (`perception.serve`); None: all by their rank."""
 
     @property
     def is_map(self) -> bool:

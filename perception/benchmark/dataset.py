@@ -145,7 +145,7 @@ def make_split(
     split: Split,
     root: Path,
     *,
-    scenes: int | None = None,
+    scenes: int | range | None = None,
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
@@ -153,23 +153,22 @@ def make_split(
 
     Args:
         root: folder of benchmarks; this one's own lies under it (`Benchmark.folder`), its manifest beside the splits.
-        scenes: only the first so many.
+        scenes: only the first so many, or those of a range.
         workers: processes; left out, one a core.
         progress: called with scenes done and scenes to make.
 
     Raises:
-        ValueError: more scenes than the split has, or none.
+        ValueError: scenes that the split does not have, or none.
         BenchmarkError: a file on disk is broken, or a worker was killed.
     """
     count, frames = SIZES[split]
-    if scenes is not None:
-        if not 1 <= scenes <= count:
-            raise ValueError(f"scenes is {scenes}, must be 1 to the {count} of the {split} split")
-        count = scenes
+    which = scenes if isinstance(scenes, range) else range(count if scenes is None else scenes)
+    if not which or which[0] < 0 or which[-1] >= count:
+        raise ValueError(f"scenes is {scenes}, must be 1 to the {count} of the {split} split")
     folder = bench.folder(root)
-    paths = [folder / split / f"scene_{scene_id(bench.seed, split, k)}_{frames}.npz" for k in range(count)]
+    paths = {k: folder / split / f"scene_{scene_id(bench.seed, split, k)}_{frames}.npz" for k in which}
     known = manifest.listed(folder, split)
-    todo = [k for k, path in enumerate(paths) if not path.exists() or path.name not in known]
+    todo = [k for k, path in paths.items() if not path.exists() or path.name not in known]
     if todo:
         entries: list[tuple[str, dict[str, Any]]] = []
         context = multiprocessing.get_context("spawn")
@@ -187,7 +186,7 @@ def make_split(
             if entries:
                 header = {"format": FORMAT, "key": bench.key(), "benchmark": asdict(bench)}
                 manifest.add(folder, header, split, entries)
-    return paths
+    return list(paths.values())
 
 
 def load_frames(paths: Sequence[Path]) -> Frames:

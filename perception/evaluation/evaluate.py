@@ -102,7 +102,7 @@ def evaluate(
 
     results: list[FrameResult] = []
     try:
-        for name, found in _in_order(task, len(keys), workers, getattr(instrument, "start_worker", None)):
+        for name, found in in_order(task, len(keys), workers, getattr(instrument, "start_worker", None)):
             results.append(found if kept is None else kept.add(name, found))
             if kept is not None and len(results) % FLUSH_FRAMES == 0:
                 kept.flush()
@@ -114,7 +114,7 @@ def evaluate(
     return assemble(results, conditions, regions, settings, np.asarray(frames.scene), plain)
 
 
-def _in_order(task: Callable[[int], T], count: int, workers: int, start: Callable[[], None] | None) -> Iterator[T]:
+def in_order(task: Callable[[int], T], count: int, workers: int, start: Callable[[], None] | None) -> Iterator[T]:
     """task(0), task(1), … by so many threads, never more than twice as many ahead as there are threads."""
     if workers <= 1:
         yield from map(task, range(count))
@@ -148,7 +148,10 @@ def frame_hash(frames: FleetFrames, f: int, key: tuple[int, int]) -> str:
     digest = hashlib.blake2b(repr(key).encode(), digest_size=16)
     for name in ("true_pose", "est_pose", "cars", "images", "index"):
         if hasattr(frames, name):
-            digest.update(np.ascontiguousarray(getattr(frames, name)[f]).tobytes())
+            part = np.ascontiguousarray(getattr(frames, name)[f])
+            if name == "cars":  # padded to the fullest frame that it was loaded with
+                part = part[~np.isnan(part[:, 0])]
+            digest.update(part.tobytes())
     return digest.hexdigest()
 
 

@@ -17,7 +17,7 @@ from sortie.perception.geometry import Geometry
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.codebook import Codebook
 from sortie.perception.network.decode import decode
-from sortie.perception.network.fusion.base import PerCell
+from sortie.perception.network.fusion.base import Fusion, PerCell
 from sortie.perception.network.fusion.disconet import DiscoNet
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
@@ -97,7 +97,7 @@ class CarNetView:
         self, net: CarNet, features: torch.Tensor, est: torch.Tensor, read: torch.Tensor | None = None
     ) -> None:
         """Args: `read` are the features as peers read them, where they are sent otherwise than as they are."""
-        self._net, self._est = net, est
+        self.net, self._est = net, est
         self.features = features
         """[d, 80, 64, 64]: every drone's, on its own grid."""
         self._maps: torch.Tensor = net.spread(features)
@@ -112,7 +112,7 @@ class CarNetView:
     @torch.inference_mode()
     def rank(self, by: CellsBy) -> NDArray[np.floating]:
         """Confidence: the highest score of the cell's head pixels, each drone alone; norm: of its feature vector."""
-        heat = None if by == "norm" else self._net.head(self._maps)[:, :1]
+        heat = None if by == "norm" else self.net.head(self._maps)[:, :1]
         plane = self.features.norm(dim=1) if heat is None else F.max_pool2d(heat, 2)[:, 0]
         out: NDArray[np.floating] = plane.cpu().numpy()
         return out
@@ -122,27 +122,30 @@ class CarNetView:
         """Each ego's boxes before suppression (see `contract.FrameView`)."""
         out: list[Floats] = []
         for at in range(0, len(exchanges), BATCH):
-            fused = torch.stack([self._fuse(e) for e in exchanges[at : at + BATCH]])  # [n, cells, channels]
-            maps = fused.view(-1, self._n, self._n, fused.shape[-1]).permute(0, 3, 1, 2)
-            out += [
-                decode(one, floor, self._net.config.geometry).double().numpy() for one in self._net.head(maps).cpu()
-            ]
+            out += self.boxes(torch.stack([self._fuse(e) for e in exchanges[at : at + BATCH]]), floor)
         return out
 
+    def boxes(self, fused: torch.Tensor, floor: float) -> list[Floats]:
+        """What the head finds in fused maps [n, cells, channels]; as `detect`."""
+        maps = fused.view(-1, self._n, self._n, fused.shape[-1]).permute(0, 3, 1, 2)
+        return [decode(one, floor, self.net.config.geometry).double().numpy() for one in self.net.head(maps).cpu()]
+
     @torch.inference_mode()
-    def weight_on_zeros(self, ego: int, cells: NDArray[np.int64]) -> Floats:
+    def weight_on_zeros(self, ego: int, cells: NDArray[np.int64], fusion: Fusion | None = None) -> Floats:
         """What all other drones together draw of DiscoNet's softmax weight in these cells [p] of an ego's grid of fused
         cells (row by row), where they sent nothing and count as zeros; [p].
+
+        Args: `fusion` in place of the network's, such as a tuned copy.
 
         Raises:
             ValueError: the network's fusion is not DiscoNet.
         """
-        fusion = self._net.fusion
+        fusion = fusion or self.net.fusion
         if not isinstance(fusion, DiscoNet):
             raise ValueError(f"fusion is {fusion.name}, must be disconet")
         peers = tuple(i for i in range(len(self.features)) if i != ego)
-        own = self._table[ego * self._n**2 + torch.from_numpy(cells).to(self._table.device)]
-        inside = self._support(ego, peers).inside.flatten(1)[:, cells]
+        own = self.own(ego)[torch.from_numpy(cells).to(self._table.device)]
+        inside = self.support(ego, peers).inside.flatten(1)[:, cells]
         part = torch.cat([torch.ones_like(inside[:1]), inside])
         said = torch.cat([own[None], own.new_zeros(len(peers), *own.shape)])
         share = fusion.weights(said, part, own.new_ones(1, 1).expand(part.shape))
@@ -151,51 +154,56 @@ class CarNetView:
 
     def _fuse(self, e: Exchange) -> torch.Tensor:
         """[cells, channels]: what one ego makes of its own features and what it was sent."""
-        own: torch.Tensor = self._table[e.ego * self._n**2 : (e.ego + 1) * self._n**2]
+        own = self.own(e.ego)
         if not e.peers:
             return own
-        sent = self._net.sent(torch.from_numpy(e.sent.reshape(len(e.peers), -1))).to(own.device)
-        under = self._support(e.ego, e.peers)
+        sent = self.net.sent(torch.from_numpy(e.sent.reshape(len(e.peers), -1))).to(own.device)
+        under = self.support(e.ego, e.peers)
         weights, arrived = arriving(under, sent)
         inside, arrived = under.inside.flatten(1), arrived.flatten(1)
         trust = self._trust(e)
-        if not isinstance(self._net.fusion, PerCell):
+        if not isinstance(self.net.fusion, PerCell):
             return self._dense(e, own, under, weights, arrived if e.unsent == "masked" else inside, trust)
         at = arrived.any(dim=0).nonzero().squeeze(1)
         base = own if e.unsent == "masked" else self._zeros(e, own, inside, len(at), trust)
         if not len(at):
             return base
-        said = torch.cat([own[at][None], self._gather(e, under, weights, at)])
+        said = torch.cat([own[at][None], self.gather(e, under, weights, at)])
         part = (arrived if e.unsent == "masked" else inside)[:, at]
         return base.index_copy(0, at, self._mix(said, part, trust))
 
-    def _support(self, ego: int, peers: tuple[int, ...]) -> Support:
+    def own(self, ego: int) -> torch.Tensor:
+        """[cells, channels]: an ego's own features, row by row."""
+        own: torch.Tensor = self._table[ego * self._n**2 : (ego + 1) * self._n**2]
+        return own
+
+    def support(self, ego: int, peers: tuple[int, ...]) -> Support:
         """Of these peers under the ego; all of a view's are worked out once."""
         if ego not in self._under:
-            self._under[ego] = support(self._est[ego], self._est, self._net.config.fused_cell_m, self._n)
+            self._under[ego] = support(self._est[ego], self._est, self.net.config.fused_cell_m, self._n)
         every = self._under[ego]
         return Support(*(part[list(peers)] for part in every))
 
     def _trust(self, e: Exchange) -> torch.Tensor:
         """[1 + peers]: the links' weights, 1 but for what the method's handshake makes of them."""
         own, peers = self.features[e.ego], self.features[list(e.peers)]
-        weight = self._net.fusion.weigh(own[None], peers[None], own.new_ones(1, len(e.peers)))[0]
+        weight = self.net.fusion.weigh(own[None], peers[None], own.new_ones(1, len(e.peers)))[0]
         return F.pad(weight, (1, 0), value=1.0)
 
-    def _gather(self, e: Exchange, under: Support, weights: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+    def gather(self, e: Exchange, under: Support, weights: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
         """[peers, p, channels]: what arrived at these cells of the ego's grid."""
         k = len(e.peers)
         first = torch.tensor(e.peers, device=at.device)[:, None, None] * self._n**2
         taps = under.cells.view(k, -1, 4)[:, at] + first
         moved = rows(self._theirs, taps.view(-1, 4), weights.view(k, -1, 4)[:, at].view(-1, 4))
-        said: torch.Tensor = self._net.aligned(
+        said: torch.Tensor = self.net.aligned(
             moved.view(k, len(at), -1), under.offset.view(k, -1, 2)[:, at], under.turn
         )
         return said
 
     def _mix(self, said: torch.Tensor, part: torch.Tensor, trust: torch.Tensor) -> torch.Tensor:
         """Fuse [1 + k, p, channels] cell by cell by the links' weights [1 + k]; the ego takes part everywhere."""
-        fusion = self._net.fusion
+        fusion = self.net.fusion
         assert isinstance(fusion, PerCell)  # noqa: S101 (tells the type checker)
         part = torch.cat([torch.ones_like(part[:1]), part])
         mixed: torch.Tensor = fusion.mix(said, part, trust[:, None].expand(part.shape))
@@ -224,8 +232,8 @@ class CarNetView:
     ) -> torch.Tensor:
         """The whole map, for a fusion that looks beyond its cell."""
         every = torch.arange(len(own), device=own.device)
-        said = torch.cat([own[None], self._gather(e, under, weights, every)])
+        said = torch.cat([own[None], self.gather(e, under, weights, every)])
         part = torch.cat([torch.ones_like(part[:1]), part]).view(1, -1, self._n, self._n)
         agents = said.view(1, -1, self._n, self._n, own.shape[1]).permute(0, 1, 4, 2, 3)
-        fused: torch.Tensor = self._net.fusion(agents, part, trust[None])
+        fused: torch.Tensor = self.net.fusion(agents, part, trust[None])
         return fused[0].permute(1, 2, 0).reshape(own.shape)

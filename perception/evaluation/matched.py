@@ -109,7 +109,7 @@ class Evaluation:
             "settings": asdict(self.settings), "regions": self.regions, "scene": self.scene.tolist(),
             "conditions": [c.label for c in self.conditions],
         }  # fmt: skip
-        _write(_to_table({f"{f:06d}": self._frame(f) for f in range(len(self.scene))}, facts), path)
+        write_frames(path, {f"{f:06d}": self._frame(f) for f in range(len(self.scene))}, facts)
 
     @classmethod
     def load(cls, path: Path) -> Evaluation:
@@ -119,9 +119,7 @@ class Evaluation:
             ValueError: no such file, or not one of these; the message names it.
         """
         try:
-            table = pq.read_table(path)
-            facts = json.loads(table.schema.metadata[b"sortie"])
-            results = _from_table(table)
+            results, facts = read_frames(path)
             frames = [results[f"{f:06d}"] for f in range(len(facts["scene"]))]
             conditions = [Sharing.parse(label) for label in facts["conditions"]]
             return assemble(frames, conditions, facts["regions"], Settings(**facts["settings"]), facts["scene"])
@@ -172,7 +170,7 @@ class MatchedStore:
         self._done: dict[str, FrameResult] = {}
         for part in sorted(self._folder.glob("*.parquet")):
             try:
-                found = _from_table(pq.read_table(part))
+                found, _ = read_frames(part)
             except (OSError, pa.ArrowInvalid, KeyError, ValueError) as error:
                 raise ValueError(f"{part}: not part of an evaluation ({error!r}); remove it to go on") from None
             for key, result in found.items():
@@ -193,7 +191,7 @@ class MatchedStore:
         """Write what is new as one more part."""
         if self._new:
             name = hashlib.blake2b("".join(sorted(self._new)).encode() + os.urandom(8), digest_size=8).hexdigest()
-            _write(_to_table(self._new, {}), self._folder / f"{name}.parquet")
+            write_frames(self._folder / f"{name}.parquet", self._new, {})
             self._new = {}
 
 
@@ -251,6 +249,17 @@ def _from_table(table: pa.Table) -> dict[str, FrameResult]:
     return out
 
 
-def _write(table: pa.Table, path: Path) -> None:
+def write_frames(path: Path, frames: Mapping[str, FrameResult], facts: Mapping[str, Any]) -> None:
+    """Some frames by key, and facts about them as JSON, as one Parquet file; under a temporary name first."""
     with replacing(path) as part:
-        pq.write_table(table, part, compression="zstd")
+        pq.write_table(_to_table(frames, facts), part, compression="zstd")
+
+
+def read_frames(path: Path) -> tuple[dict[str, FrameResult], dict[str, Any]]:
+    """What `write_frames` wrote.
+
+    Raises:
+        Exception: OSError, pyarrow.ArrowInvalid, KeyError or ValueError where it is not such a file.
+    """
+    table = pq.read_table(path)
+    return _from_table(table), json.loads(table.schema.metadata[b"sortie"])

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import FULL_SHARING, Sharing
+from sortie.perception.evaluation.condition import FULL_SHARING, PAPER_WAYS, CellsBy, Sharing, Ways
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, Instrument
 from sortie.perception.evaluation.evaluate import REGION_M, Settings, exchanges, frame_keys, mission_target, truth
+from sortie.perception.evaluation.measures import under
 from sortie.perception.geometry import CELLS, Geometry, to_local, to_world
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.types import Boxes
@@ -52,9 +53,11 @@ def picture(
     ego: int = 0,
     budgets: Sequence[float] = PAPER_BUDGETS,
     tau: float = 0.1,
+    cells_by: CellsBy = "confidence",
+    ways: Ways = PAPER_WAYS,
     views: NDArray[np.uint8] | None = None,
 ) -> Picture:
-    """Frame `f` from one ego.
+    """Frame `f` from one ego, under zero fill; `cells_by` and `ways` as for `measures.under`.
 
     Raises:
         ValueError: no such frame or drone.
@@ -68,7 +71,7 @@ def picture(
     key = frame_keys(frames)[f]
     target = mission_target(frames, f, key)
     view, geometry = instrument.look(frames, f), instrument.geometry
-    conditions = (FULL_SHARING, *(Sharing(budget) for budget in budgets))
+    conditions = [FULL_SHARING, *(under(Sharing(budget), "zero", cells_by, ways) for budget in budgets)]
     given = [e for e, _ in exchanges(view, frames, f, key, conditions, settings, geometry, target) if e.ego == ego]
     found = Boxes.placed(view.detect(given[:1], tau)[0], tuple(frames.est_pose[f, ego].tolist()))
     return Picture(

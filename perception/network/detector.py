@@ -63,8 +63,8 @@ def shipped(fusion: str) -> Path:
     return SHIPPED_WEIGHTS if own else WEIGHTS / f"{fusion}.safetensors"
 
 
-Part = tuple[float, Disc | None, tuple[int, ...], bool]
-"""Which cells a share holds: ρ, region and ranks that are missing, and whether they are codes."""
+Part = tuple[float, Disc | None, tuple[int, ...], bool, Disc | None]
+"""Which cells a share holds: ρ, region and ranks that are missing, whether they are codes, and which region is served first."""
 
 
 @dataclass(slots=True)
@@ -291,7 +291,9 @@ class TorchDetector:
         else:
             assert kept.out is not None  # noqa: S101 (`_must_rank`)
             rank = F.max_pool2d(kept.out.result()[:1], 2)[0].numpy()
-        return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing))[None]
+        return torch.from_numpy(
+            budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing, share.first)
+        )[None]
 
     def _is_fused(self, share: Share) -> bool:
         return self._shares == "features" and share.is_map
@@ -476,8 +478,8 @@ class TorchDetector:
 
 def _part(share: Share) -> Part:
     if share.representation == "raw":
-        return 1.0, None, (), False
-    return share.rho, share.roi, share.missing, share.representation == "codes"
+        return 1.0, None, (), False, None
+    return share.rho, share.roi, share.missing, share.representation == "codes", share.first
 
 
 def _is_ranked(share: Share) -> bool:

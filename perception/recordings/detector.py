@@ -114,7 +114,7 @@ class RecordedDetector:
             rank = np.zeros((CELLS, CELLS))
             if share.missing or budget.must_choose(share.rho, share.roi, *est):
                 rank = self._recording.rank(frame, capture.drone, config.cells_by)
-            cells = budget.select(rank, share.rho, share.roi, *est, share.missing)
+            cells = budget.select(rank, share.rho, share.roi, *est, share.missing, share.first)
         lies = capture if config.motion_compensation else now.get(capture.drone, capture)
         return Sent(frame, capture.drone, cells, self._pose(lies), share.weight, share.age_s)
 

@@ -71,6 +71,7 @@ def report(plan: StudyPlan, rows: Sequence[StudyRow], figures: Sequence[tuple[st
     lines = ["# Why the flip exists: an experiment", "", "## The question", "", *_quoted(plan.paper), ""]
     lines += ["Hypothesis, written down before the networks were trained:", "", *_quoted(plan.hypothesis), ""]
     lines += ["## The answer", "", *answers(plan, found), f"- {on_frames(rows)}", ""]
+    lines += [_BY_INTERVENTION, ""]
     for name, caption in figures:
         lines += picture(name, caption)
     first, seed = plan.variants[0], plan.variants[0].seeds[0]
@@ -186,6 +187,11 @@ def _of(names: Sequence[str], networks: Sequence[object]) -> str:
     )
 
 
+_BY_INTERVENTION = (
+    "What comparing trained networks cannot show, an intervention can: in the "
+    "[dose–response study](../results/doses.md) three of these networks stay as they are, and silent peers draw more weight "
+    "when they fuse."
+)
 _LEGEND = (
     "AP@0.5 of the full scene in points; differences with paired 95 % intervals over frames. *two − four*: two peers minus "
     "four at matched bytes; ▲ two are better, ▼ four are better, · no difference is shown. *starved*: all four at the "

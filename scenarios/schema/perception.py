@@ -74,7 +74,7 @@ class Perception(Section):
     )
     fusion_params: Params = Field(
         {},
-        description="Keyword arguments of a fusion of one's own. Of disconet, for studies: temperature (the softmax's logits are divided by it) and silent_weight (added to the logit of cells that were not sent and count as zeros).",
+        description="Keyword arguments of a fusion of one's own. Of disconet, for studies: temperature (the softmax's logits are divided by it; 1e9 gives equal weights) and silent_weight (added to the logit of cells that were not sent and count as zeros).",
     )
     weights: str | None = Field(
         None,
@@ -129,6 +129,10 @@ class Perception(Section):
     )
     score_threshold: float = Field(0.1, ge=0, le=1, description="Detections below this score are dropped.")
     cells_by: Literal["confidence", "norm"] = Field("confidence", description="What ranks the cells under a budget.")
+    serve: Literal["grid", "region_first"] = Field(
+        "grid",
+        description="Which cells go first under a budget without a region of interest: all by rank, or those in the sender's mission region before all others (for studies; not the surrogate's).",
+    )
     unsent_cells: Literal["masked", "zero"] = Field(
         "masked",
         description="Cells that were not sent: out of the fusion softmax, or zeros in it (as in the paper's instrument).",

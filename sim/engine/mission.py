@@ -50,6 +50,10 @@ class MissionPlan:
         """The mission of each group that has drones, at `t_s`."""
         return {group: self._of(group, t_s) for group in self.groups}
 
+    def region(self, drone: int, t_s: float) -> Disc | None:
+        """The region of a drone's group at `t_s`."""
+        return self._of(self.group_of[drone], t_s).region
+
     def _of(self, group: int, t_s: float) -> MissionNow:
         phase = self._phases[group][bisect_right(self._begins_s[group], t_s + 1e-9) - 1]
         number, target = -1, None

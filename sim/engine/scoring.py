@@ -16,6 +16,7 @@ from sortie.perception.classes import PERSON, vehicle_classes
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import DETECTED_NAMES, NAME_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.people import People
@@ -94,11 +95,13 @@ class Scorer:
         planned: Callable[[int, int], Capture],
         own_tracks: Callable[[int], Tracks],
         people: People,
+        region: Callable[[int, float], Disc | None],
     ) -> None:
         """Args:
         planned: where a drone is in a frame, or would be had it not left the air.
         own_tracks: what a drone's own tracker follows.
         people: finds, joins and records people; the detector has vehicles alone.
+        region: a drone's mission region at a time.
         """
         self._env, self._scenario, self._detector = env, scenario, detector
         # here and not in each call: a check against a protocol takes longer than a fusion
@@ -107,6 +110,7 @@ class Scorer:
         self._agents, self._recorder, self._planned, self._own_tracks = agents, recorder, planned, own_tracks
         self._people, self._has_trucks = people, scenario.perception.scene.trucks > 0.0
         self._delays_s = scenario.compute_delays_s
+        self._region = region if scenario.perception.serve == "region_first" else None
         self._unscored = {station.drone for station in scenario.fleet.ground if not station.scored}
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
@@ -189,6 +193,8 @@ class Scorer:
             received for _, received in sorted(memory.held.items()) if memory.payload_age_s(received, now_s) <= limit_s
         ]
         shares = [as_share(r, memory.trust_in(r.capture.drone), memory.payload_age_s(r, now_s)) for r in held]
+        if (region := self._region) is not None:
+            shares = [s._replace(first=region(s.capture.drone, s.capture.t_s)) for s in shares]
         if any(s.representation in DETECTED_NAMES for s in shares):
             own = self._own_tracks(agent.drone)
             shares = [s._replace(tracks=own) if s.representation in DETECTED_NAMES else s for s in shares]

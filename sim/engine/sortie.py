@@ -259,7 +259,7 @@ def build(
     ]
     scorer = None
     if detector is not None:
-        scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people)
+        scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people, plan.region)
     own_events = OwnEvents(scenario, world, seed, replication)
     schedule(scenario, world, transport, membership, own_events, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)

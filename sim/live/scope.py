@@ -46,6 +46,7 @@ UNUSED = (
     "perception.common_errors",
     "perception.score_threshold",
     "perception.cells_by",
+    "perception.serve",
     "perception.unsent_cells",
     "perception.absent_peers",
     "policy.replays",

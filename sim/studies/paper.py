@@ -90,7 +90,7 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
     scores = measured.all_scores()
     table, points = rows.judge(scores, plane), rows.points(scores)
     varied = sensitivity(measured)
-    seen = picture(instrument, frames, 0, tau=job.settings.tau, views=camera_views(job.seed, 0))
+    seen = picture(instrument, frames, 0, views=camera_views(job.seed, 0), **_drawn(job.settings))
     progress("verdicts", 1, 1)
     facts = {
         "command": job.command,
@@ -124,8 +124,13 @@ def frame_picture(
     """
     frames = bench_frames(job.seed, max(1, frame + 1), work / "bench")
     views = camera_views(job.seed, frame) if frame >= 0 else None
-    instrument = CarNetInstrument.load(job.weights)
-    return picture(instrument, frames, frame, ego=ego, budgets=budgets, tau=job.settings.tau, views=views)
+    instrument = CarNetInstrument.load(job.weights, fusion_params=dict(job.fusion_params))
+    return picture(instrument, frames, frame, ego=ego, budgets=budgets, views=views, **_drawn(job.settings))
+
+
+def _drawn(settings: TableSettings) -> dict[str, Any]:
+    """What a picture of one frame takes of the report's settings."""
+    return {"tau": settings.tau, "cells_by": settings.cells_by, "ways": settings.ways}
 
 
 def ensure_writable(path: Path) -> None:

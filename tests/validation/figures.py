@@ -448,6 +448,12 @@ def _study() -> None:
     _sortie("study", "report", WORK / "study/study.parquet", *report)
 
 
+def _doses() -> Tables:
+    import doses
+
+    return doses.tables(WORK / "study", ROOT / "runs/bench", PICTURES / "doses.png")
+
+
 def _paper_seeds() -> Tables:
     """`sortie paper` on other benchmarks and with other weights, beside docs/paper."""
     from sortie.perception.evaluation import rows
@@ -658,6 +664,7 @@ FIGURES: dict[str, Figure] = {
     "paper_seeds": Figure(30, _paper_seeds),
     "held_out": Figure(30, _held_out),
     "study": Figure(60, _study),
+    "doses": Figure(45, _doses),
 }
 """By the name of the file."""
 

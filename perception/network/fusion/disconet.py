@@ -71,12 +71,17 @@ class DiscoNet(PerCell):
 
     def weights(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
         """Each agent's softmax weight, [agents, p]; as for `mix`."""
-        logit: Tensor = self.edge(features)
+        silent = silent_in(features) if self.silent_weight else None
+        return self.softmax(self.edge(features), silent, part, weight)
+
+    def softmax(self, logit: Tensor, silent: Tensor | None, part: Tensor, weight: Tensor) -> Tensor:
+        """Each agent's softmax weight from the edge network's logits, all [agents, p].
+
+        Args: `silent` as `silent_in` gives it, or None: nobody's logit is changed.
+        """
         if self.temperature != 1.0:
             logit = logit / self.temperature
-        if self.silent_weight:
-            silent = ~features.any(dim=-1)
-            silent[0] = False  # the ego is never silent
+        if silent is not None:
             logit = logit + self.silent_weight * silent
         return (logit + weight.clamp_min(1e-12).log()).masked_fill(~part, -math.inf).softmax(dim=0)
 
@@ -88,3 +93,10 @@ class DiscoNet(PerCell):
         for i, (layer, norm) in enumerate(zip(edge.layers, edge.norms, strict=True)):
             edge.layers[i] = fuse_linear_bn_eval(layer, norm)
             edge.norms[i] = nn.Identity()
+
+
+def silent_in(features: Tensor) -> Tensor:
+    """In which cells an agent counts as zeros, bool [agents, p] from [agents, p, channels]; never the ego, the first."""
+    silent = ~features.any(dim=-1)
+    silent[0] = False
+    return silent

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -186,9 +187,13 @@ def test_a_manifest_that_does_not_fit_is_refused(copy: Path, tmp_path: Path) -> 
         Benchmark.at(tmp_path)
 
 
-@pytest.mark.parametrize("scenes", [0, 41])
-def test_no_more_scenes_than_there_are(tmp_path: Path, scenes: int) -> None:
-    with pytest.raises(ValueError, match=f"scenes is {scenes}, must be 1 to the 40 of the tau split"):
+def test_a_range_names_the_scenes_that_are_made(copy: Path) -> None:
+    assert make_split(BENCH, "tau", copy.parent, scenes=range(1, 2)) == files(copy)[1:]
+
+
+@pytest.mark.parametrize("scenes", [0, 41, range(39, 41), range(-1, 2), range(3, 3)])
+def test_no_more_scenes_than_there_are(tmp_path: Path, scenes: int | range) -> None:
+    with pytest.raises(ValueError, match=rf"scenes is {re.escape(str(scenes))}, must be 1 to the 40 of the tau split"):
         make_split(BENCH, "tau", tmp_path, scenes=scenes)
 
 

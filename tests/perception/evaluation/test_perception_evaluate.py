@@ -12,7 +12,15 @@ from harness_examples import MadeFrames, MadeInstrument, made_frames
 from sortie.perception.evaluation import selection
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.evaluate import REGION_M, Evaluation, evaluate, frame_keys, mission_target, truth
+from sortie.perception.evaluation.evaluate import (
+    REGION_M,
+    Evaluation,
+    evaluate,
+    frame_hash,
+    frame_keys,
+    mission_target,
+    truth,
+)
 from sortie.perception.evaluation.scores import Bootstrap
 from sortie.perception.metrics.ap import CONVENTIONS, match, suppress
 from sortie.perception.types import Boxes
@@ -250,6 +258,16 @@ def test_a_store_answers_only_for_what_it_holds(frames: MadeFrames, tmp_path: Pa
     }
     evaluate(instrument, frames, [FULL_SHARING], store=tmp_path, **knobs.get(change, {}))
     assert len(instrument.looked) == 5
+
+
+def test_a_frame_is_known_again_beside_frames_with_more_cars(frames: MadeFrames) -> None:
+    """Cars are padded to the fullest frame of those that were loaded together."""
+    wider = np.pad(frames.cars, ((0, 0), (0, 3), (0, 0)), constant_values=np.nan)
+    key = frame_keys(frames)[1]
+    assert frame_hash(replace(frames, cars=wider), 1, key) == frame_hash(frames, 1, key)
+    moved = wider.copy()
+    moved[1, 0, 0] += 1e-9
+    assert frame_hash(replace(frames, cars=moved), 1, key) != frame_hash(frames, 1, key)
 
 
 def test_a_broken_store_says_which_file(frames: MadeFrames, tmp_path: Path) -> None:

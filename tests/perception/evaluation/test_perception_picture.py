@@ -9,7 +9,9 @@ import pytest
 from paper_examples import MadeFrames, MadeInstrument, made_frames
 
 from sortie.perception.evaluation import figure_frame, figures
+from sortie.perception.evaluation.condition import Serve, Ways
 from sortie.perception.evaluation.contract import Exchange
+from sortie.perception.evaluation.evaluate import REGION_M
 from sortie.perception.evaluation.picture import picture, sharers
 from sortie.perception.geometry import CELLS, FULL, to_world
 
@@ -53,6 +55,20 @@ def test_a_picture_has_what_was_there_what_was_found_and_what_was_shared(frames:
     assert 1024 * 4 * 0.5 < wide.sum() <= 1024 * 4 * 1.3
     assert 0 < narrow.sum() < wide.sum() / 5
     assert seen.shared[0][0] == 0.25
+
+
+def test_a_picture_shows_the_cells_that_are_served_first(frames: MadeFrames) -> None:
+    """A budget that the mission's disc uses up: no cell beyond it is shared, but for the estimated poses' error."""
+    centre = (np.arange(CELLS) + 0.5 - CELLS / 2) * FULL.cell_m
+    x, y = to_world(*np.meshgrid(centre, centre, indexing="ij"), frames.est_pose[0, 0])
+
+    def furthest(serve: Serve) -> float:
+        seen = picture(MadeInstrument(), frames, 0, budgets=(0.02,), ways=Ways(serve=serve))
+        assert seen.disc is not None
+        apart = np.hypot(x - seen.disc.x_m, y - seen.disc.y_m)
+        return float(apart[seen.shared[0][1] > 0].max())
+
+    assert furthest("region_first") < REGION_M + FULL.cell_m < furthest("grid")
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import torch
 from perception_examples import capture, cross
 from places import HELPERS
 
+from sortie.perception.budget import cells_sent
 from sortie.perception.detectors import make_detector
 from sortie.perception.errors import InputError
 from sortie.perception.ground_truth import ground_truth
@@ -19,6 +20,7 @@ from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene import render
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception, Scene, Target
 
 
@@ -143,6 +145,26 @@ def test_peers_of_whom_nothing_came_dilute_where_they_count_as_zeros(scene: Scen
     assert same(masked.detect(jobs)[0], TorchDetector(scene, Perception(), 1).detect(jobs)[0])
 
 
+def test_cells_of_the_region_that_is_served_first_are_all_that_a_small_budget_sends(
+    scene: SceneModel, fleet: list[Capture]
+) -> None:
+    """A region with more cells than the budget lets through: as if only cells in it might be sent."""
+    detector, region = TorchDetector(scene, Perception(unsent_cells="zero"), seed=1), Disc(10.0, 20.0, 32.0)
+    plain = [share(c, rho=0.01) for c in fleet[1:]]
+    assert all(cells_sent(1.0, region, *c.est_pose) > cells_sent(0.01, None, *c.est_pose) for c in fleet[1:])
+    by_rank, first, within, both = detector.detect(
+        [
+            (fleet[0], plain),
+            (fleet[0], [s._replace(first=region) for s in plain]),
+            (fleet[0], [s._replace(roi=region) for s in plain]),
+            (fleet[0], [s._replace(roi=region, first=Disc(0.0, 0.0, 5.0)) for s in plain]),
+        ]
+    )
+    assert same(first, within)
+    assert same(both, within)  # a region of interest sends nothing from elsewhere
+    assert not same(first, by_rank)
+
+
 @pytest.mark.parametrize(
     ("detector", "message"),
     [
@@ -154,6 +176,14 @@ def test_other_detectors_refuse_peers_as_zeros(scene: SceneModel, detector: str,
     recording = "none.npz" if detector == "recorded" else None
     config = Perception.model_validate({"detector": detector, "absent_peers": "zeros", "recording": recording})
     with pytest.raises(InputError, match=message):
+        make_detector(scene, config, 1)
+
+
+def test_the_surrogate_serves_by_rank_alone(scene: SceneModel) -> None:
+    config = Perception(detector="surrogate", serve="region_first")
+    with pytest.raises(
+        InputError, match=r"perception.serve is 'region_first': .* was calibrated without it, must be grid"
+    ):
         make_detector(scene, config, 1)
 
 

@@ -38,6 +38,9 @@ def test_an_infinite_temperature_gives_equal_weights(fusion: DiscoNet) -> None:
     features, part, weight = rows()
     fusion.tune(temperature=math.inf)
     assert fusion.weights(features, part, weight)[:3] == pytest.approx(torch.full((3, 50), 1 / 3))
+    fusion.tune(temperature=1e9)  # what a scenario can say, whose numbers are finite
+    assert fusion.weights(features, part, weight)[:3] == pytest.approx(torch.full((3, 50), 1 / 3))
+    fusion.tune(temperature=math.inf)
     weight[1] = 0.5
     assert fusion.weights(features, part, weight)[:, 0].tolist() == pytest.approx([0.4, 0.2, 0.4, 0.0])
 

@@ -8,18 +8,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from sortie.perception.benchmark.dataset import Frames
 from sortie.perception.evaluation.condition import SINGLE
+from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.evaluation.matched import FrameResult, Settings
 from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.metrics.ap import Matched
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.detector import shipped
-from sortie.perception.study.dose_run import cells_with_cars, frames_of, weight_on_zeros
+from sortie.perception.study import dose_run
+from sortie.perception.study.dose_run import Found, cells_with_cars, frame_of, frames_of, measure_frames
 from sortie.perception.study.doses import (
     PLAN,
     Dose,
+    DosePlan,
     DoseRow,
     Effect,
     FrameRange,
@@ -31,6 +35,7 @@ from sortie.perception.study.doses import (
 from sortie.perception.study.run import SHIPPED
 
 PLANNED = read_plan()
+NO_BOXES = Matched(np.zeros(0), np.zeros(0, bool), 3)
 NOTHING = Effect(0.0, -1.0, 1.0)
 
 
@@ -94,10 +99,58 @@ def test_the_weight_is_that_of_cells_with_cars_by_true_poses() -> None:
     data.true_pose[0, 0] = [0.0, 0.0, math.pi / 2]  # faces north: the car at (10, 5) is 5 m ahead and 10 m to the right
     cells = cells_with_cars(data, 0, 0, FULL)
     assert cells.tolist()[0] == math.floor((102.4 + 5.0) / 3.2) * CELLS + math.floor((102.4 - 10.0) / 3.2)
-    torch.manual_seed(0)
-    net = load_weights(shipped("disconet"))
-    mean = weight_on_zeros(CarNetInstrument(net, fusion_params={"temperature": 1e9}), fleet())
-    assert 0.5 < mean < 0.8  # equal weights: four fifths where all reach, less at the edges
+
+
+SMALL_PLAN = replace(
+    PLANNED,
+    budgets=(0.05,),
+    dose=(Dose(2.0, 0.35), Dose(2.0, unsent="masked"), Dose(2.0, absent="zeros")),
+)
+"""Every kind of dose, at one budget."""
+
+
+def test_all_doses_at_once_give_what_each_gives_alone() -> None:
+    net, data, key = load_weights(shipped("disconet")), fleet(), (0, 0)
+    few = Settings(egos=1)
+    found, weights = frame_of(SMALL_PLAN, CarNetInstrument(net), data, 0, key, few)
+    for dose in SMALL_PLAN.dose:
+        alone = CarNetInstrument(net, fusion_params=dose.params)
+        conditions = tuple(SMALL_PLAN.conditions(dose))
+        wanted = evaluate(alone, data, conditions, regions=("full",), egos=few.egos)
+        for c in conditions:
+            for unit, other in zip(wanted.units[c, "full"], found[dose.label].units[c.plain(), "full"], strict=True):
+                assert unit.truths == other.truths
+                assert unit.score == pytest.approx(other.score, abs=1e-5)
+                assert unit.hit.tolist() == other.hit.tolist()
+            assert [row[0] for row in found[dose.label].cost[c.plain()]] == wanted.cells[c].tolist()
+        view = alone.look(data, 0)
+        each = [view.weight_on_zeros(ego, cells_with_cars(data, 0, ego, FULL)) for ego in range(5)]
+        expected = np.zeros(len(weights[dose.label])) if dose.unsent == "masked" else np.concatenate(each)
+        assert weights[dose.label] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_study_that_was_cut_off_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[int] = []
+
+    def once(plan: DosePlan, instrument: CarNetInstrument, data: Frames, f: int, key: object) -> Found:
+        if measured == [0]:
+            raise KeyboardInterrupt
+        measured.append(f)
+        found = FrameResult((math.nan, math.nan), {(SINGLE, "full"): [NO_BOXES]}, {SINGLE: [(0, 0, 0)]})
+        return {"T 1": found}, {"T 1": [0.25 * f]}
+
+    monkeypatch.setattr(dose_run, "frame_of", once)
+    plan, data = replace(PLANNED, networks=("full-0",)), fleet(2)
+    with pytest.raises(KeyboardInterrupt):
+        measure_frames(plan, tmp_path, data)
+    measured.append(-1)
+    (several,) = measure_frames(plan, tmp_path, data).values()
+    assert measured == [0, -1, 1]
+    assert [weights for _, weights in several] == [{"T 1": [0.0]}, {"T 1": [0.25]}]
+    # another dose is another study
+    again = replace(plan, dose=(*plan.dose, Dose(3.0)))
+    measure_frames(again, tmp_path, data)
+    assert measured == [0, -1, 1, 0, 1]
 
 
 class Table:

@@ -320,6 +320,7 @@ CHANGED = {
     "perception.common_errors": "unknown",
     "perception.score_threshold": "0.5",
     "perception.cells_by": "norm",
+    "perception.serve": "region_first",
     "perception.unsent_cells": "zero",
     "perception.absent_peers": "zeros",
 }

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,8 +17,10 @@ from sim_examples import example
 
 from sortie.perception.evaluation import report, rows
 from sortie.perception.evaluation.claims import OVERHEAD
+from sortie.perception.evaluation.condition import Ways
 from sortie.perception.evaluation.measures import Elsewhere
 from sortie.perception.evaluation.picture import Picture
+from sortie.perception.evaluation.results import TableSettings
 from sortie.perception.evaluation.sensitivity import Varied
 from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.types import Boxes
@@ -309,3 +313,17 @@ def test_two_frames_from_nothing_to_a_report_and_a_recording(
     assert [r for r in again if r.id not in timed] == [r for r in first if r.id not in timed]
     assert command("paper", "--frame", "1", "--work", "work", "--out", "out") == 0
     assert Path("work/frames/seed0_frame1_ego0.rrd").stat().st_size > 10_000
+
+
+def test_a_frame_is_drawn_by_the_instrument_that_was_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr(paper, "bench_frames", lambda seed, count, root: None)
+    monkeypatch.setattr(paper, "camera_views", lambda seed, frame: None)
+    monkeypatch.setattr(paper.CarNetInstrument, "load", lambda path, fusion_params: seen.append(fusion_params))
+    monkeypatch.setattr(paper, "picture", lambda instrument, frames, f, **options: seen.append(options))
+    settings = TableSettings(("zero",), "norm", 0.3, ways=Ways("zeros", "region_first"))
+    job = paper.PaperSettings(tmp_path / "w", settings, fusion_params={"temperature": math.inf})
+    paper.frame_picture(job, tmp_path, 0)
+    params, options = seen
+    assert params == {"temperature": math.inf}
+    assert (options["tau"], options["cells_by"], options["ways"]) == (0.3, "norm", ("zeros", "region_first"))
