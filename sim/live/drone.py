@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
+from sortie.fleet import chart, peers
 from sortie.fleet.agent import Agent
 from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.memory import PeerMemory
@@ -72,6 +73,7 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
             fallback=orders.fallback,
             deadline_s=scenario.frame_s if orders.decide_within_s is None else orders.decide_within_s,
         )
+        peers.loops(), chart.loops()  # loaded before the drone says that it is ready, which takes a second
         replay = ReplaySenses(scenario, drone, orders.trace, orders.begin_s)
         go = None
         if orders.late:
