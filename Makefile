@@ -39,7 +39,7 @@ lint: $(STAMP) ## style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-scenarios: $(STAMP) ## hold the library's scenarios to their own expectations (minutes each)
+scenarios: $(STAMP) ## fly the library's scenarios and test what each expects (minutes each)
 	$(BIN)/python -m pytest scenarios/library
 
 fuzz: $(STAMP) ## try every reader with damaged inputs, ten minutes of processor time each (SECONDS_EACH=n, READER=name)

@@ -167,7 +167,7 @@ in the paper, but arithmetic on what it prints."""
 
 
 _SENSITIVITY = """\
-The paper names neither its score threshold nor the centre of its mission region. Here are the claims that could hang on
+The paper names neither its score threshold nor the centre of its mission region. Here are the claims that may depend on
 them, over both, from the same detections; a star marks another verdict than above."""
 
 
@@ -188,7 +188,7 @@ def _section(rows: Sequence[ClaimRow], shown: Sequence[str]) -> list[str]:
 
 def _sensitivity(rows: Sequence[ClaimRow], varied: Sequence[Varied]) -> list[str]:
     """A table a knob and instrument, its settings in columns; a star where the verdict is not that of the table above."""
-    lines = ["## What the verdicts hang on", "", _SENSITIVITY, ""]
+    lines = ["## How the verdicts depend on threshold and region", "", _SENSITIVITY, ""]
     first = {(r.id, r.instrument): r for r in rows}
     for knob, title in (("tau", "score threshold τ"), ("disc", "mission disc")):
         for i, name in INSTRUMENTS.items():

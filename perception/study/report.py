@@ -68,7 +68,7 @@ def report(plan: StudyPlan, rows: Sequence[StudyRow], figures: Sequence[tuple[st
     """The whole report; `figures` are file names beside it and what they show."""
     found = StudyRows(rows)
     missing = [v.job(s) for v, s in plan.jobs() if (v.name, s) not in found.networks()]
-    lines = ["# Why the flip exists: an experiment", "", "## The question", "", *_quoted(plan.paper), ""]
+    lines = ["# Do trained networks show the flip? An experiment", "", "## The question", "", *_quoted(plan.paper), ""]
     lines += ["Hypothesis, written down before the networks were trained:", "", *_quoted(plan.hypothesis), ""]
     lines += ["## The answer", "", *answers(plan, found), f"- {on_frames(rows)}", ""]
     lines += [_BY_INTERVENTION, ""]

@@ -99,7 +99,7 @@ def test_the_table_and_its_sensitivity_from_made_frames(found: TableResults) -> 
     other = next(v for v in varied if v.verdict != varied_rows[v.id, v.instrument].verdict)
     (line,) = [
         one
-        for one in text.partition("What the verdicts hang on")[2].splitlines()
+        for one in text.partition("How the verdicts depend on threshold and region")[2].splitlines()
         if one.startswith(f"| {next(r.says for r in table if r.id == other.id)} |") and "*" in one
     ][:1]
     assert " * |" in line
