@@ -148,7 +148,7 @@ def test_nothing_is_sent_where_the_region_is_out_of_sight() -> None:
 def test_compact_payloads_go_reliably() -> None:
     kinds = {r: make_payload(FULL._replace(representation=r), *ORIGIN, lambda roi: 1) for r in list(Representation)[1:]}
     assert {r.name: p.reliable for r, p in kinds.items() if p} == {
-        "TRACKS": True, "DETECTIONS": True, "FEATURES": False, "RAW": False,
+        "TRACKS": True, "DETECTIONS": True, "UNCERTAIN_BOXES": True, "CODES": False, "FEATURES": False, "RAW": False,
     }  # fmt: skip
 
 

@@ -102,7 +102,7 @@ def test_one_appended_byte_is_a_version_and_no_fields(encode: Encode) -> None:
 def test_a_reader_passes_over_what_it_does_not_know(encode: Encode, d: Descriptor, more: bytes, version: int) -> None:
     """The same value as without it, and authentication covers it."""
     plain = encode(d)
-    has_block = d.feature_space or d.roster
+    has_block = d.feature_space or d.roster or d.codebook
     grown = plain + more if has_block else plain + block(more, version=version)
     if len(grown) > MAX_DESCRIPTOR_BYTES:
         return

@@ -217,7 +217,7 @@ SENT = encode_directive(DIRECTIVE)
         (b"\x01" + SENT[1:], "encapsulation is 01010000, must be 00010000"),
         (patch(SENT, 1, b"\x01"), "link 1→1 is none"),
         (patch(SENT, 0, b"\xff"), "link 255→4 is none"),
-        (patch(SENT, 2, b"\x05"), "representation is 5, must be in [0, 4]"),
+        (patch(SENT, 2, b"\x07"), "representation is 7, must be in [0, 6]"),
         (patch(SENT, 3, b"\x65"), "duty_percent is 101, must be in [0, 100]"),
         (patch(SENT, 4, NAN), "a float is not finite"),
         (patch(SENT, 12, struct.pack("<f", -1)), "roi is (10, -20, -1), neither a disc nor none"),
