@@ -29,7 +29,10 @@ def test_bytes_of_boxes_and_tracks() -> None:
     assert budget.content_bytes("detections", boxes=40) == 960
     assert budget.content_bytes("tracks", boxes=12) == 240
     assert budget.content_bytes("raw") == 5_400_000
-    with pytest.raises(ValueError, match=r"representation is 'none', must be features, codes, detections, uncertain_boxes, tracks or raw"):
+    with pytest.raises(
+        ValueError,
+        match=r"representation is 'none', must be features, codes, detections, uncertain_boxes, tracks or raw",
+    ):
         budget.content_bytes("none")
 
 

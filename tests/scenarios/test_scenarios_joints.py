@@ -235,11 +235,30 @@ def test_a_make_s_network_is_its_own_or_the_fleet_s(make: dict[str, Any], networ
     base = scenario("perception: {detector: torch, weights: fleet.w}\nfleet: {drones: 3}").model_dump(mode="json")
     base["fleet"]["makes"] = [{"name": "one", "drones": [1], **make}]
     made = Scenario.model_validate(base)
-    assert tuple(made.networks[1]) == network
-    assert tuple(made.networks[0]) == tuple(made.networks[2]) == ("torch", "fleet.w")
+    assert tuple(made.networks[1]) == (*network, None)
+    assert tuple(made.networks[0]) == tuple(made.networks[2]) == ("torch", "fleet.w", None)
     assert made.feature_spaces[0] == made.feature_spaces[2] == ""
     if "detector" not in make or "feature_space" in make or make["detector"] == "torch":
         assert made.feature_spaces[1] == space
+
+
+@pytest.mark.parametrize(
+    ("make", "codebook"),
+    [
+        ({}, "fleet.cb"),
+        ({"feature_space": "own"}, "fleet.cb"),  # another name for the same network
+        ({"codebook": "own.cb"}, "own.cb"),
+        ({"weights": "own.w"}, None),  # the fleet's codes are of other features
+        ({"detector": "surrogate"}, None),
+        ({"weights": "own.w", "codebook": "own.cb"}, "own.cb"),
+    ],
+)
+def test_a_make_s_codebook_is_its_own_or_that_of_the_same_network(make: dict[str, Any], codebook: str | None) -> None:
+    base = scenario("perception: {detector: torch, weights: fleet.w, codebook: fleet.cb}\nfleet: {drones: 3}")
+    sections = base.model_dump(mode="json")
+    sections["fleet"]["makes"] = [{"name": "one", "drones": [1], **make}]
+    networks = Scenario.model_validate(sections).networks
+    assert [network.codebook for network in networks] == ["fleet.cb", codebook, "fleet.cb"]
 
 
 def test_a_delay_of_zero_is_a_delay() -> None:
