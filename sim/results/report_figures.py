@@ -59,7 +59,7 @@ def figures(record: SortieRecord) -> dict[str, str]:
     plots: list[tuple[str, float, Drawer]] = [
         (
             "What each drone was to send on its best link (upper bar), and the best that arrived each second (lower bar)",
-            0.6 + 0.45 * _drones(record),
+            max(2.0, 0.6 + 0.45 * _drones(record)),  # the legend beside it needs so much
             _lanes,
         ),
         ("Accuracy of all drones over the last five seconds, AP@0.5", 2.6, _accuracy),

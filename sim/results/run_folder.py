@@ -31,7 +31,13 @@ WRITTEN = frozenset(
         RECORDING,
         *(f"{name}.parquet" for name in (*TABLES, *views.TABLES, disagreement.TABLE, rosters.TABLE, beliefs.TABLE)),
     }
-    | {PAGE, "sortie.tlog", "bag/metadata.yaml", "bag/bag.mcap"}  # `sortie report` and `export`, made of the run
+    | {
+        PAGE,
+        "sortie.tlog",
+        "bag/metadata.yaml",
+        "bag/bag.mcap",
+        "bag/foxglove_layout.json",
+    }  # `sortie report` and `export`, made of the run
 )
 """All that a run's folder may hold for another run to take its place: what can be made again."""
 _ROW_GROUP_BYTES = 4 << 20

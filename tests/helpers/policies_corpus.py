@@ -131,7 +131,7 @@ SLIVERS = {
 STAND_INS = {
     "sets an attribute": "try:\n    me.cached = True\nexcept AttributeError:\n    bad = 0.4 < soc < 0.4000001",
     "sets a field": "try:\n    me.battery_soc = 1.0\nexcept AttributeError:\n    bad = 0.4 < soc < 0.4000001",
-    "length": "bad = len(me) == 17 and soc == 0.4",
+    "length": "bad = len(me) == 18 and soc == 0.4",
     "sequence pattern": "match me:\n    case (_, _, _, _, _, _, x, *_):\n        bad = 0.4 < x < 0.4000001",
     "tuple": "bad = isinstance(me, tuple) and soc == 0.4",
     "type": "bad = type(soc) is float and soc == 0.4",

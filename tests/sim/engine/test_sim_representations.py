@@ -57,7 +57,7 @@ def test_codes_are_traffic_of_exact_size_and_the_surrogate_says_that_it_cannot_e
 
 
 def test_every_representation_has_its_colours_and_its_way_on_the_air() -> None:
-    from sortie.sim.playback.canvas import SENT
+    from sortie.sim.results.palette import SENT
 
     sent = set(REPRESENTATION_OF) - {"none"}
     assert sent <= set(SENT)
