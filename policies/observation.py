@@ -1,4 +1,4 @@
-"""What a learner sees and does: a drone's view as numbers, and an action as directives.
+"""Observations and actions of a learner: a drone's view as numbers, and an action as directives.
 
 `sortie.sim.env` trains with these two functions. A policy file that uses them decides as the learner did, with the same
 numbers, and needs neither PettingZoo nor gymnasium.
@@ -33,11 +33,12 @@ def observe(view: FleetView | None, others: Sequence[int]) -> Obs:
         others: the other drones, ascending.
 
     Returns:
-        float32 [1 + others, 25], within −10 … 10: the ego's row, then the others'. Zeros of those that it has not heard.
-        A row has: heard; age, s; place from the ego, 100 m (3), and velocity, 10 m/s (3); footprint, 100 m; charge;
-        headroom of CPU and GPU; goodput from the ego, 100 Mb/s, and its state (0 unknown, 1/3 silent, 2/3 probed, 1
-        measured); phase, one-hot (5); region: there, place from the ego (2), radius, 100 m; share of the grid seen well;
-        whether it reports targets.
+        float32 [1 + others, 25], within −10 … 10: the ego's row, then the others'. A drone that it has not heard has zeros.
+        The columns, with the unit of a number and how many columns there are: heard, 0 or 1; age, s; place from the ego,
+        100 m (3); velocity, 10 m/s (3); footprint, 100 m; charge; headroom of CPU and GPU (2); goodput from the ego,
+        100 Mb/s; state of that link (0 unknown, 1/3 silent, 2/3 probed, 1 measured); phase, one-hot (5); whether it has a
+        region; the region's place from the ego, 100 m (2), and radius, 100 m; share of the grid seen well; whether it
+        reports targets.
 
     Example:
         >>> observe(None, [1, 2]).shape

@@ -1,8 +1,8 @@
 """Means of an expensive measurement, with a cheap one of the same draws as control variate. Pure functions.
 
 The expensive measurement (the torch detector) is made on n units, the cheap one (the surrogate) on the same n and on m
-others. What the cheap one says of its own n units, compared with what it says of all n + m, corrects the mean of the
-expensive one. The mean stays unbiased whatever the error of the cheap one. It gains as the two are correlated.
+others. The mean of the cheap one over the n units, compared with its mean over all n + m, corrects the mean of the
+expensive one. That mean stays unbiased whatever the error of the cheap one. The higher the correlation, the more precise it is.
 
 This is the approximate control variate of Peherstorfer, Willcox and Gunzburger (*Optimal Model Management for Multifidelity
 Monte Carlo Estimation*, 2016) and Gorodetsky et al. (*A Generalized Approximate Control Variate Framework for Multifidelity

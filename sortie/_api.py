@@ -233,8 +233,9 @@ def compare(
 ) -> Comparison:
     """Fly a scenario under several policies, with the same seeds and draws.
 
-    With `half_width`, it flies as many seeds as the answer needs, by the torch detector. Many sorties by the surrogate then
-    serve as control variates, which saves torch sorties without a bias. How this works, and what it saves: *Statistics*.
+    With `half_width`, it flies seeds with the torch detector until the intervals are narrow enough. Sorties of the surrogate
+    serve as control variates (cheap measurements that correct the mean) where this saves time. `docs/site/statistics.md`
+    explains the method.
 
     Args:
         scenario, overrides: as for `sortie.load`.
@@ -244,20 +245,20 @@ def compare(
             random draws, the same for all policies; intervals then cover sorties. With one seed, the flight is over
             the scenario's own town, and intervals cover the instants of that flight alone.
         own_fusion: fly published methods with the fusion that they were published with, not `perception.fusion`.
-        progress: called with the policy's label, the seed and the simulated time (s). With `half_width`: with the stage, the
-            seeds flown in it, and its number of seeds.
-        half_width: fly until the 95 % interval of every gain in `metric` is at most this far to each side, in AP: 0.01 is
-            one AP point. The scenario's detector answers, or torch where that is the surrogate. Not with `seeds`.
+        progress: called with the policy's label, the seed and the simulated time (s). With `half_width`: called with the
+            stage, the number of seeds flown in it, and the number of all its seeds.
+        half_width: fly until the 95 % interval of every gain in `metric` reaches at most this far to each side, in AP: 0.01
+            is one AP point. Scored by the scenario's detector, or by torch if that is the surrogate. Not with `seeds`.
         metric: `ap50.full_scene` or `ap50.mission`.
         pilot: the seeds that both detectors fly before the rest is planned; None is 12.
         most_seeds: the seeds that the torch detector flies at most; None is 200. `precision.reached` says whether that
             was enough.
-        kept: a file that keeps what was flown. After an interruption the same call goes on from there, and a later call
-            can go on to a narrower half-width. True names the file by what is compared, in `runs`; False keeps nothing.
+        kept: a file to which finished seeds are written. After an interruption the same call goes on from there. A later
+            call with a smaller half-width uses them too. True chooses a file in `runs`; False writes nothing.
 
     Raises:
         ScenarioError, PolicyError: the scenario or a policy is wrong; raised before anything flies.
-        RunError: `half_width` where torch is missing or the surrogate cannot fly the scenario, or a file that cannot be used.
+        RunError: with `half_width`: torch is missing, the surrogate cannot fly the scenario, or the file cannot be used.
 
     Example:
         >>> short = {"duration_s": 2, "perception.detector": "surrogate"}
@@ -531,7 +532,7 @@ def env(scenario: ScenarioLike, overrides: Overrides = (), *, team: Literal[Fals
 @overload
 def env(scenario: ScenarioLike, overrides: Overrides = (), *, team: Literal[True]) -> TeamEnv: ...
 def env(scenario: ScenarioLike, overrides: Overrides = (), *, team: bool = False) -> SortieEnv | TeamEnv:
-    """Return an environment in which policies are trained: a PettingZoo `ParallelEnv` in which each drone is an agent.
+    """Return an environment to train policies in: a PettingZoo `ParallelEnv` in which each drone is an agent.
 
     Args:
         scenario, overrides: as for `sortie.load`, with at least two drones. The scenario's policy is not used.

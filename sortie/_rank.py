@@ -30,7 +30,7 @@ class Ranking:
 
     @property
     def places(self) -> dict[str, tuple[int, int]]:
-        """The best and the worst place of each policy that the intervals leave open, the highest score first. With 95 %
+        """The range of places of each policy: the best and the worst one, policies with the highest AP first. With 95 %
         confidence all true places lie within these ranges."""
         return {row.policy: row.place for row in self.ranked.rows}
 
@@ -98,19 +98,19 @@ def rank(
 ) -> Ranking:
     """Rank policies on a fixed, versioned suite of conditions, among all built-in policies.
 
-    Built-in policies are not flown: their results come with Sortie. A policy's own thirty flights take about a minute.
+    Built-in policies are not flown: their results come with Sortie. The thirty flights of a policy take about a minute.
 
     Args:
         policies: one policy or several. Each is a name, `name(key=value)`, `path/to/file.py:function`, or any callable of
             one FleetView.
         suite: the name of a suite of the library, or a file with a set of conditions whose `seeds` are `[]`.
-        against: names of the policies to rank among; None is every built-in one with stored results, and every one with
-            `again`.
-        again: fly these too, instead of taking the stored results.
+        against: names of the policies to rank among. None takes every built-in policy with stored results; with `again`,
+            every built-in policy.
+        again: fly the policies of `against` too, instead of taking their stored results.
         by_torch: fly every policy with the neural detector, which takes minutes for each.
         workers: number of processes that fly policies given by name. Callables fly in this process.
         folder: flights of policies given by name are kept here, so that an interrupted ranking goes on.
-        progress: called with a stage, how much of it is done, and of how much.
+        progress: called with a stage, the number of its steps that are done, and the number of all its steps.
 
     Raises:
         ScenarioError, PolicyError, RunError: the suite, a policy or the folder is wrong; raised before anything flies. A

@@ -88,10 +88,10 @@ def _columns(log: FlightLog, at_s: Array) -> dict[str, Array]:
 
 
 def on_one_clock(logs: Sequence[FlightLog], *, together: bool = False) -> tuple[FlightLog, ...]:
-    """Flights of several files with `begin_s` by one clock: seconds since 1970, as each file has it from its GNSS.
+    """The flights of several files, with every `begin_s` in seconds since 1970 by the file's own GNSS clock.
 
-    Vehicles of one file keep the clock that they share. A file that does not say when it began begins with the first
-    of the others, and that is told.
+    Vehicles of one file keep the clock that they share. A file without such a clock begins at the same time as
+    the first of the others, and its `problems` say so.
 
     Args:
         logs: the flights, those of one file one after another.

@@ -55,8 +55,9 @@ def compare(
     half_width: Annotated[
         float | None,
         typer.Option(
-            help="Fly by the torch detector until all 95 % intervals of --metric are this narrow to each side: 0.01 is one AP "
-            "point. The surrogate's sorties are control variates. The same command goes on after an interruption.",
+            help="Fly with the torch detector until the 95 % intervals of all gains in --metric reach at most this far to each "
+            "side: 0.01 is one AP point. Sorties of the surrogate, which are cheap, serve as control variates to save torch "
+            "sorties. The same command goes on after an interruption.",
             min=0.0,
             max=1.0,
         ),
@@ -77,7 +78,7 @@ def compare(
     kept: Annotated[
         Path | None,
         typer.Option(
-            help="With --half-width: the file that keeps what was flown. Default: runs/compare-NAME-….sqlite."
+            help="With --half-width: the file to which finished seeds are written. Default: runs/compare-NAME-….sqlite."
         ),
     ] = None,
     by_torch: Annotated[

@@ -35,7 +35,7 @@ def export(
     origin: Annotated[
         str | None,
         typer.Option(
-            help="With --tlog and --mcap: LATITUDE,LONGITUDE[,ALTITUDE] of ENU (0, 0, 0); default: fleet.origin, then where a trace in latitude and longitude begins, then a field in Zurich."
+            help="With --tlog and --mcap: LATITUDE,LONGITUDE[,ALTITUDE] of the coordinates' origin, ENU (0, 0, 0). Default: fleet.origin; else the place where a trace in latitude and longitude begins; else a field in Zurich."
         ),
     ] = None,
     key: Annotated[
@@ -45,7 +45,7 @@ def export(
         ),
     ] = None,
     drone: Annotated[
-        int | None, typer.Option(help="With --tlog: the log of this drone alone; default: all.", min=0)
+        int | None, typer.Option(help="With --tlog: write this drone alone; default: all drones.", min=0)
     ] = None,
 ) -> None:
     """Write a run for other tools: a ROS 2 bag (also for Foxglove), a log for ground stations, or a packet capture."""

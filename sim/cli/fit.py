@@ -14,7 +14,8 @@ from sortie.sim.folders import ensure_files, write_text
 from sortie.sim.user_errors import user_errors
 
 app = typer.Typer(
-    no_args_is_help=True, help="Fit what representations need beside a network: a codebook for codes, errors of boxes."
+    no_args_is_help=True,
+    help="Fit what two representations need: a codebook for `codes`, and the errors of boxes for `uncertain_boxes`.",
 )
 BenchOption = Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")]
 WeightsOption = Annotated[Path | None, typer.Option("--weights", help="The network's weights; default: the shipped.")]
@@ -30,10 +31,12 @@ class Boxes(StrEnum):
 def fit_codebook(
     weights: WeightsOption = None,
     out_file: OutOption = None,
-    stages_: Annotated[int, typer.Option("--stages", help="The most bytes of a cell.", min=1, max=20)] = 20,
+    stages_: Annotated[
+        int, typer.Option("--stages", help="Number of stages: the most bytes of a cell.", min=1, max=20)
+    ] = 20,
     scenes: Annotated[int, typer.Option(help="Number of scenes of the train split.", min=1, max=100)] = 10,
     iterations: Annotated[int, typer.Option(help="Rounds of k-means in each stage.", min=1)] = 25,
-    seed: Annotated[int, typer.Option(help="Seed of the cells taken and of k-means.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the draw of cells and of k-means.", min=0)] = 0,
     bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
     bench_dir: BenchOption = Path("runs/bench"),
 ) -> None:
@@ -64,11 +67,16 @@ def fit_codebook(
 
 @app.command("errors")
 def fit_errors(
-    boxes: Annotated[Boxes, typer.Argument(help="Whose boxes: the network's or the surrogate's.")] = Boxes.torch,
+    boxes: Annotated[
+        Boxes, typer.Argument(help="The detector whose boxes are fitted: the neural network or the surrogate.")
+    ] = Boxes.torch,
     weights: WeightsOption = None,
     out_file: OutOption = None,
     towns: Annotated[
-        int, typer.Option(help="Towns of the surrogate's fit; torch takes the validation split.", min=4)
+        int,
+        typer.Option(
+            help="With surrogate: number of towns. The network's boxes are those of the validation split.", min=4
+        ),
     ] = 60,
     bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
     bench_dir: BenchOption = Path("runs/bench"),

@@ -40,7 +40,9 @@ LOWEST_M = 2.0
 def import_log(
     logs: Annotated[
         list[Path],
-        typer.Argument(help="ArduPilot's .bin, MAVLink telemetry (.tlog) or PX4's .ulg; several files fly together."),
+        typer.Argument(
+            help="ArduPilot's .bin, MAVLink telemetry (.tlog) or PX4's .ulg; several files become one fleet."
+        ),
     ],
     out_dir: Annotated[
         Path | None, typer.Option("--out", help="Folder for the trace and the scenario; default: named after the log.")
@@ -57,7 +59,7 @@ def import_log(
     system: Annotated[
         list[int] | None,
         typer.Option(
-            help="With one log: MAVLink system id of a vehicle to take, once for each; default: every vehicle.",
+            help="With one log: MAVLink system id of a vehicle to take; repeat it for more. Default: every vehicle.",
             min=1,
             max=255,
         ),
@@ -68,7 +70,7 @@ def import_log(
     ground: Annotated[
         list[str] | None,
         typer.Option(
-            help="A ground station at LATITUDE,LONGITUDE[,ALTITUDE], once for each; without an altitude its antenna is 2 m above the ground."
+            help="Add a ground station at LATITUDE,LONGITUDE[,ALTITUDE]; repeat it for more. Without an altitude its antenna is 2 m above the ground."
         ),
     ] = None,
 ) -> None:

@@ -18,25 +18,28 @@ def rank(
         str,
         typer.Argument(
             metavar="POLICY",
-            help="A policy's name, name(key=value), or path/to/file.py:function; several separated by commas.",
+            help="The policy to rank: name, name(key=value), or path/to/file.py:function; several separated by commas.",
         ),
     ],
     suite: Annotated[str, typer.Option(help="The suite: a name of the library, or a file.")] = SUITE,
     against: Annotated[
         str | None,
-        typer.Option(help="Policies to rank it among, separated by commas. Default: every built-in one."),
+        typer.Option(help="The other policies, separated by commas. Default: every built-in one with stored results."),
     ] = None,
     again: Annotated[
         bool, typer.Option("--again", help="Fly the other policies too, instead of taking their stored results.")
     ] = False,
     by_torch: Annotated[
         bool,
-        typer.Option("--by-torch", help="Fly every policy with the neural detector; minutes for each policy."),
+        typer.Option(
+            "--by-torch",
+            help="Fly every policy with the neural detector instead of the surrogate; it takes minutes for each policy.",
+        ),
     ] = False,
     workers: Annotated[int, typer.Option(help="Number of processes.", min=1)] = 1,
     out_dir: Annotated[
         Path,
-        typer.Option("--out", help="Folder for ranking.json, ranking.png and the flights, which are not repeated."),
+        typer.Option("--out", help="Folder for ranking.json, ranking.png and the finished flights."),
     ] = Path("runs/rank"),
 ) -> None:
     """Fly a policy on a fixed, versioned suite of conditions, and print its place among all built-in policies.

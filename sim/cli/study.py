@@ -122,14 +122,14 @@ def study_doses(
     frames: Annotated[
         list[str] | None,
         typer.Option(
-            help="Benchmark seed and frames, such as 7:0-239; can be given several times. Default: the plan's."
+            help="Benchmark seed, first and last frame of its test split: 7:0-239. Can be given several times. Default: the plan's."
         ),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Number of frames evaluated in parallel; default: one per core.", min=1)
     ] = None,
 ) -> None:
-    """Measure what more weight on silent peers does to the same networks, and whether the flip appears."""
+    """Measure whether the paper's flip appears when peers that sent nothing get more weight in the fusion."""
     from sortie.perception.evaluation import figures as common
     from sortie.perception.study import dose_figure, doses
     from sortie.perception.study.dose_run import measure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -52,8 +53,10 @@ def accuracy(ranked: Ranked) -> Table:
             place_text(r.place), f"`{r.policy}`", _interval(r.score), *(
                 _interval(r.figures[name])
                 for name in ("ap50.mission", "ap50.full_scene")
-            ), r.figures["tracking.hota"].mean, r.figures["mission.target_detected_share"].mean,
-            r.figures["mission.region_observed_share"].mean,
+            ), *(
+                _known(r.figures[name].mean)
+                for name in ("tracking.hota", "mission.target_detected_share", "mission.region_observed_share")
+            ),
         ]
         for r in ranked.rows
     ]  # fmt: skip
@@ -73,9 +76,10 @@ def costs(ranked: Ranked) -> Table:
     ]  # fmt: skip
     rows: list[list[Cell]] = [
         [
-            f"`{r.policy}`", _interval(r.figures["bytes.data_sent"]), r.figures["bytes.context_sent"].mean,
-            _interval(r.figures["deadline_miss_rate"]), r.figures["energy_j.radio"].mean, r.energy_j,
-            _interval(r.figures["policies.violated_ticks"]), ranked.verified[r.policy].text, ranked.decision_us(r.policy),
+            f"`{r.policy}`", _interval(r.figures["bytes.data_sent"]), _known(r.figures["bytes.context_sent"].mean),
+            _interval(r.figures["deadline_miss_rate"]), _known(r.figures["energy_j.radio"].mean), _known(r.energy_j),
+            _interval(r.figures["policies.violated_ticks"]), ranked.verified[r.policy].text,
+            _known(ranked.decision_us(r.policy)),
         ]
         for r in ranked.rows
     ]  # fmt: skip
@@ -84,6 +88,11 @@ def costs(ranked: Ranked) -> Table:
 
 def _suite(ranked: Ranked) -> str:
     return f"Suite `{ranked.suite}`, digest `{ranked.digest}`, flown with Sortie {ranked.stored}."
+
+
+def _known(value: float) -> Cell:
+    """Nothing in place of NaN, which a policy has that failed everywhere."""
+    return None if math.isnan(value) else value
 
 
 def _interval(estimate: Estimate) -> Cell:
