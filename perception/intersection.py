@@ -59,7 +59,7 @@ def intersect(xy_m: Floats, information: Floats, group: NDArray[np.intp], common
 
     Example:
         >>> two = intersect(np.array([[0.0, 0.0], [1.0, 1.0]]), np.array([[4.0, 0, 1], [1, 0, 4]]), np.array([0, 0]))
-        >>> two.weight.tolist(), two.xy_m.round(3).tolist(), two.covariance_m2.round(3).tolist()
+        >>> two.weight.tolist(), two.xy_m.round(3).tolist(), (two.covariance_m2.round(3) + 0.0).tolist()
         ([0.5, 0.5], [[0.2, 0.8]], [[0.4, 0.0, 0.4]])
     """
     count = int(group.max()) + 1
