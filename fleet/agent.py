@@ -29,6 +29,7 @@ from sortie.fleet.staleness import LinkHealth, cap_by_age, health
 from sortie.fleet.trust import JUDGED_EVERY_S, Standing
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture
+from sortie.policies.checks import check_directives, differing
 from sortie.policies.contract import (
     PERSON_FLAG,
     Descriptor,
@@ -38,8 +39,6 @@ from sortie.policies.contract import (
     Policy,
     Roster,
     TaskPhase,
-    check_directives,
-    differing,
     nothing,
 )
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp

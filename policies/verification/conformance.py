@@ -21,17 +21,8 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
-from sortie.policies.contract import (
-    Descriptor,
-    Directive,
-    FleetView,
-    Policy,
-    PolicyError,
-    Representation,
-    check_directives,
-    check_reposition,
-    find_wrong_type,
-)
+from sortie.policies.checks import check_directives, check_reposition, find_wrong_type
+from sortie.policies.contract import Descriptor, Directive, FleetView, Policy, PolicyError, Representation
 from sortie.policies.registry import parameters, viewpoint_of
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.invariants import just_heard

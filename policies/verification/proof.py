@@ -31,15 +31,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sortie.policies.contract import (
-    Directive,
-    FleetView,
-    Policy,
-    PolicyError,
-    check_directives,
-    find_inexact,
-    find_wrong_type,
-)
+from sortie.policies.checks import check_directives, find_inexact, find_wrong_type
+from sortie.policies.contract import Directive, FleetView, Policy, PolicyError
 from sortie.policies.verification.advice import advise
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.conformance import missing_links, older_views, raised_part, without_detached

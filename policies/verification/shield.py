@@ -16,7 +16,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, FleetView, Policy, Representation, check_directives
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, FleetView, Policy, Representation
 from sortie.policies.verification.compiled import Context, Rule, compiled
 from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, Recent, just_heard
 from sortie.policies.verification.nearest import Box, Far, distance, nearest

@@ -11,7 +11,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from sortie.fleet.staleness import cap_by_age, health
-from sortie.policies.contract import Directive, FleetView, Policy, check_directives, nothing
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import Directive, FleetView, Policy, nothing
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.verification.enforced import Steps, Violation, effective, judge, put_right
 from sortie.policies.verification.invariants import Invariant, just_heard

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sortie.policies.contract import PHASE_NAMES, Directive, FleetView, Policy, PolicyError, TaskPhase, check_directives
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import PHASE_NAMES, Directive, FleetView, Policy, PolicyError, TaskPhase
 from sortie.policies.verification.conformance import raised_part
 from sortie.policies.verification.proof import RepeatableView
 from sortie.policies.verification.views import to_json

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from sortie.fleet.staleness import cap_by_age, health
-from sortie.policies.contract import DETACHED_AFTER_PERIODS, Directive, Disc, Policy, find_inexact, nothing
+from sortie.policies.checks import find_inexact
+from sortie.policies.contract import DETACHED_AFTER_PERIODS, Directive, Disc, Policy, nothing
 from sortie.policies.damping import EPSILON_S, DampedLink, damp, is_climb, is_switch, lower_of
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.enforced import effective

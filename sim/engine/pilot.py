@@ -15,6 +15,7 @@ from typing import NamedTuple
 import simpy
 
 from sortie.fleet.agent import Guard
+from sortie.policies.checks import check_directives, check_reposition
 from sortie.policies.contract import (
     PHASE_NAMES,
     PHASE_OF,
@@ -25,8 +26,6 @@ from sortie.policies.contract import (
     Reposition,
     TaskPhase,
     Viewpoint,
-    check_directives,
-    check_reposition,
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
 from sortie.policies.verification.conformance import raised_part

@@ -14,7 +14,8 @@ from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
 from typing import NamedTuple
 
-from sortie.policies.contract import Directive, Disc, FleetView, PolicyError, Representation, check_directives
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import Directive, Disc, FleetView, PolicyError, Representation
 from sortie.policies.registry import describe_error
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.audit import Audit

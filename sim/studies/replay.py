@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-from sortie.policies.contract import Directive, PolicyError, Reposition, check_directives, nothing
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import Directive, PolicyError, Reposition, nothing
 from sortie.policies.registry import viewpoint_of
 from sortie.scenarios.plugins.user_calls import watched
 from sortie.scenarios.representation import NAME_OF

@@ -20,14 +20,8 @@ from sortie.fleet.messages.wire import (
 )
 from sortie.fleet.plane import DroneStatus
 from sortie.fleet.staleness import LinkHealth, cap_by_age
-from sortie.policies.contract import (
-    Directive,
-    FleetView,
-    PolicyError,
-    Representation,
-    boxes_across_networks,
-    check_directives,
-)
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import Directive, FleetView, PolicyError, Representation, boxes_across_networks
 from sortie.policies.damping import DampedLink, damp, lower_of
 from sortie.policies.verification.invariants import parse, violations
 from sortie.policies.verification.shield import shield

@@ -12,16 +12,8 @@ from policies_examples import fleet_of
 
 from sortie.policies.catalogue.baselines import everyone, silence
 from sortie.policies.catalogue.vantage import MOST_M, over_region
-from sortie.policies.contract import (
-    Directive,
-    Disc,
-    FleetView,
-    PolicyError,
-    Reposition,
-    TaskPhase,
-    check_reposition,
-    looks_from,
-)
+from sortie.policies.checks import check_reposition
+from sortie.policies.contract import Directive, Disc, FleetView, PolicyError, Reposition, TaskPhase, looks_from
 from sortie.policies.registry import POLICIES, resolve, viewpoint_of
 from sortie.policies.verification.conformance import conform, failing
 

@@ -7,6 +7,7 @@ from policies_examples import fleet_of
 
 from sortie.policies.catalogue.deputies import deputies
 from sortie.policies.catalogue.worked import worked
+from sortie.policies.checks import check_directives
 from sortie.policies.contract import (
     Directive,
     Disc,
@@ -16,7 +17,6 @@ from sortie.policies.contract import (
     PolicyError,
     Representation,
     TaskPhase,
-    check_directives,
 )
 from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.registry import parameters, resolve

@@ -12,7 +12,8 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.perception.budget import cells_in
-from sortie.policies.contract import PolicyError, Representation, check_directives
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import PolicyError, Representation
 from sortie.policies.registry import BOUNDS, POLICIES, parameters, resolve
 from sortie.policies.verification.conformance import conform, failing
 from sortie.policies.verification.views import draw_views, to_json

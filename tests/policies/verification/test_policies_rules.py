@@ -25,16 +25,8 @@ from sortie.fleet.messages.auth import Dropped, Sealer, open_datagram
 from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES
 from sortie.fleet.messages.wire import decode_directive, encode_descriptor, encode_directive
 from sortie.fleet.staleness import cap_by_age, health
-from sortie.policies.contract import (
-    Descriptor,
-    Directive,
-    Disc,
-    FleetView,
-    Policy,
-    PolicyError,
-    Representation,
-    check_directives,
-)
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Policy, PolicyError, Representation
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.registry import POLICIES
 from sortie.policies.verification.confine import Reached, confined
