@@ -63,14 +63,10 @@ def differing(
         return None
     if all(map(operator.is_, directives, before.values())):
         return []
-    try:
-        changed = [d for d in directives if before.get(d[1]) is not d]
-        if len({d[1] for d in directives}) != len(before):
-            return None
-    except Exception:  # no directive
-        return None
-    known = all(type(d) is Directive and d.destination in before for d in changed)
-    return changed if known and _is_plainly_valid(changed, view) else None
+    kept = set(map(id, before.values()))
+    changed = [d for d in directives if id(d) not in kept]
+    is_whole = _is_plainly_valid(changed, view) and {d.destination for d in directives} == before.keys()
+    return changed if is_whole else None
 
 
 def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:

@@ -1,0 +1,67 @@
+"""An answer that repeats most of the one before is checked where it differs, as strictly as a whole one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from policies_examples import fleet_of
+
+from sortie.policies.checks import check_directives, differing
+from sortie.policies.contract import Directive, PolicyError, Representation
+
+VIEW = fleet_of(5)
+BEFORE = {p: Directive(VIEW.ego, p, Representation.FEATURES, 0.5, rate_hz=10.0, reason="share") for p in VIEW.peers}
+FIRST, SECOND, *REST = BEFORE.values()
+
+
+class Own(Directive):
+    """A type of a policy's own, which may read differently the next time."""
+
+
+@given(st.permutations(list(BEFORE)), st.sets(st.sampled_from(list(BEFORE))), st.booleans())
+def test_what_is_new_is_found_in_any_order(order: list[int], new: set[int], is_tuple: bool) -> None:
+    answer = [BEFORE[p]._replace(rate_hz=2.0) if p in new else BEFORE[p] for p in order]
+    assert differing(BEFORE, tuple(answer) if is_tuple else answer, VIEW) == [d for d in answer if d.rate_hz == 2.0]
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        [FIRST, FIRST, *REST],
+        [FIRST, FIRST._replace(rate_hz=2.0), *REST],
+        [FIRST._replace(rate_hz=2.0), FIRST._replace(rate_hz=5.0), *REST],
+        [FIRST, SECOND._replace(destination=VIEW.ego), *REST],
+        [FIRST, SECOND._replace(destination=99), *REST],
+        [FIRST, SECOND._replace(destination=[1]), *REST],  # type: ignore[arg-type]
+        [FIRST, SECOND._replace(source=99), *REST],
+        [FIRST, SECOND._replace(rho=1.5), *REST],
+        [FIRST, SECOND._replace(rate_hz=float("nan")), *REST],
+        [FIRST, Own(*SECOND), *REST],
+        [FIRST, tuple(SECOND), *REST],
+        [FIRST, None, *REST],
+        iter(BEFORE.values()),
+        None,
+    ],
+)  # fmt: skip
+def test_what_a_whole_check_refuses_goes_to_a_whole_check(answer: Any) -> None:
+    assert differing(BEFORE, answer, VIEW) is None
+    with pytest.raises(PolicyError):
+        check_directives(answer, VIEW)
+
+
+@pytest.mark.parametrize(
+    "answer", [[FIRST, SECOND], [*BEFORE.values(), FIRST], [FIRST, SECOND._replace(rho=np.float32(0.1)), *REST]]
+)  # fmt: skip
+def test_what_is_not_plainly_the_same_links_goes_to_a_whole_check(answer: list[Directive]) -> None:
+    assert differing(BEFORE, answer, VIEW) is None
+
+
+@pytest.mark.parametrize("make", [list, tuple])
+def test_an_answer_of_the_same_objects_has_nothing_new(make: Callable[..., Any]) -> None:
+    assert differing(BEFORE, make(BEFORE.values()), VIEW) == []
+    assert differing({}, make(), VIEW) == []
