@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,27 +14,25 @@ from sortie.policies.contract import COVERAGE_BYTES, COVERAGE_CELL_M, COVERAGE_C
 _FIRST_CELLS = 1024
 _FARTHEST = 1 << 30
 """Rows and columns are held to this: a position may be any 32-bit float."""
-_MODULE: list[Any] = []
 
 Grids = tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]
 """Packed grids [K, 64], and the row and column of each one's south-west cell in the world's lattice, [K]."""
 
 
+@cache
 def loops() -> Any:
     """The compiled loops, imported and made ready at their first use: before a flight, whose drones may be real ones."""
-    if not _MODULE:
-        from sortie.fleet import chart_loops
+    from sortie.fleet import chart_loops
 
-        keys, new = np.full(1, chart_loops.EMPTY, np.int64), np.zeros(COVERAGE_CELLS**2, np.bool_)
-        own = np.frombuffer(bytes(COVERAGE_BYTES), np.uint8)
-        grids = np.frombuffer(b"", np.uint8).reshape(0, COVERAGE_BYTES), *(np.zeros(0, np.int64) for _ in range(2))
-        chart_loops.fold(keys, 0, *grids, 0)
-        chart_loops.enlarge(keys, keys)
-        chart_loops.unknown(keys, own, 0, 0, new)
-        chart_loops.without(new, 0, 0, 0, *grids)
-        chart_loops.mark(np.frombuffer(bytearray(COVERAGE_BYTES), np.uint8), new, 0)
-        _MODULE.append(chart_loops)
-    return _MODULE[0]
+    keys, new = np.full(1, chart_loops.EMPTY, np.int64), np.zeros(COVERAGE_CELLS**2, np.bool_)
+    own = np.frombuffer(bytes(COVERAGE_BYTES), np.uint8)
+    grids = np.frombuffer(b"", np.uint8).reshape(0, COVERAGE_BYTES), *(np.zeros(0, np.int64) for _ in range(2))
+    chart_loops.fold(keys, 0, *grids, 0)
+    chart_loops.enlarge(keys, keys)
+    chart_loops.unknown(keys, own, 0, 0, new)
+    chart_loops.without(new, 0, 0, 0, *grids)
+    chart_loops.mark(np.frombuffer(bytearray(COVERAGE_BYTES), np.uint8), new, 0)
+    return chart_loops
 
 
 def grids_of(claims: Sequence[Descriptor]) -> Grids:

@@ -6,6 +6,7 @@ over these arrays (`sortie.fleet.peer_loops`). Pages of the arrays that no drone
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,25 +14,22 @@ from numpy.typing import NDArray
 
 from sortie.scenarios.disc import AGENT_IDS
 
-_MODULE: list[Any] = []
 
-
+@cache
 def loops() -> Any:
     """The compiled loops, imported and made ready at their first use: before a flight, whose drones may be real ones."""
-    if not _MODULE:
-        from sortie.fleet import peer_loops
+    from sortie.fleet import peer_loops
 
-        none, ids, flags = np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.uint8)
-        bits, square = np.zeros((0, 1), np.uint64), np.zeros((0, 0))
-        peer_loops.hear(
-            ids, 0, none, 0, 0.0, 0.0, True, np.uint64(0), 1.0, 1.0, 1, square.astype(np.uint64), square, square,
-            square.astype(np.uint8), bits[None],
-        )  # fmt: skip
-        peer_loops.fill(0, 0.0, 1.0, 1, ids, none, bits, none, none)
-        peer_loops.ages(0.0, 0.0, ids, none, none, none)
-        peer_loops.overdue(0, 0.0, 1.0, 1.0, 1.0, 1.0, ids, none, none, flags, flags, flags)
-        _MODULE.append(peer_loops)
-    return _MODULE[0]
+    none, ids, flags = np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.uint8)
+    bits, square = np.zeros((0, 1), np.uint64), np.zeros((0, 0))
+    peer_loops.hear(
+        ids, 0, none, 0, 0.0, 0.0, True, np.uint64(0), 1.0, 1.0, 1, square.astype(np.uint64), square, square,
+        square.astype(np.uint8), bits[None],
+    )  # fmt: skip
+    peer_loops.fill(0, 0.0, 1.0, 1, ids, none, bits, none, none)
+    peer_loops.ages(0.0, 0.0, ids, none, none, none)
+    peer_loops.overdue(0, 0.0, 1.0, 1.0, 1.0, 1.0, ids, none, none, flags, flags, flags)
+    return peer_loops
 
 
 class PeerTable:

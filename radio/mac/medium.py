@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from functools import cache
 from heapq import heappop, heappush
 from math import inf, nan
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -42,16 +43,14 @@ _AHEAD_NS = 100_000_000
 """A plan goes no further than this; frames of the flight change the links as often."""
 _LAST = EventPriority(2)
 """After everything else of the same instant."""
-_MODULE: list[Any] = []
 
 
+@cache
 def _edca() -> Any:
     """The compiled stations, imported at their first use: numba takes half a second."""
-    if not _MODULE:
-        from sortie.radio.mac import edca
+    from sortie.radio.mac import edca
 
-        _MODULE.append(edca)
-    return _MODULE[0]
+    return edca
 
 
 class Link(NamedTuple):
