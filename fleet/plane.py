@@ -97,9 +97,9 @@ class DroneStatus:
     """
 
     feature_space: str = ""
+    """The network of the drone: only maps of one feature space can be fused. Empty: the fleet's common one."""
     codebook: str = ""
     """Digest of its codebook; empty for the fleet's common one."""
-    """The network of the drone: only maps of one feature space can be fused. Empty: the fleet's common one."""
     looks: bool = True
     """Whether it has a detector. Without one it sends context alone, and uses the boxes that it is sent."""
     airborne: bool = True
