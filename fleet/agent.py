@@ -108,14 +108,12 @@ Guard = Callable[[FleetView, Sequence[Steps], Cap], Sequence[Directive]]
 class _OutgoingLink:
     """An outgoing link: its state of damping, what its gate enforces, and what was last asked while its peer was fresh."""
 
-    __slots__ = ("asked", "by_clock", "enforced", "state")
+    __slots__ = ("asked", "enforced", "state")
 
     def __init__(self, me: int, peer: int) -> None:
         self.state = DampedLink(nothing(me, peer, ""))
         self.enforced = self.state.enforced  # before the wire rounds it
         self.asked: Directive | None = None
-        self.by_clock = False
-        """Whether it is reduced for a descriptor that has just come and looks old by its stamp."""
 
 
 class Agent:
@@ -179,6 +177,7 @@ class Agent:
         self._asked_of: dict[int, Directive] = {}  # what the policy answered last, by peer; it was checked
         self._ids: NDArray[np.int64] | None = None  # `memory.ids` as it was then
         table, row = memory.table, memory.row
+        self._heard_s = table.heard_s[row]
         self._busy, self._at_rest, self._blamed = table.busy[row], table.at_rest[row], table.blamed[row]
         self._find_overdue = loops().overdue
         self._alert = False  # whether it knows of a person in its region
@@ -358,11 +357,10 @@ class Agent:
 
     def _overdue(self, ages_s: NDArray[np.float64], now_s: float) -> list[int]:
         """Peers to which the link's directive may change although the policy asks for nothing new."""
-        memory, rules = self.memory, self._rules
-        table, row, ids = memory.table, memory.row, memory.ids
+        ids = self.memory.ids
         places = self._find_overdue(
-            self.drone, now_s, self._fresh_s, self._period_s, rules.degraded_after_periods, memory.clocks.delay_s, ids,
-            ages_s, table.heard_s[row], table.busy[row], table.at_rest[row], table.blamed[row],
+            self.drone, now_s, self._fresh_s, self._period_s, self._rules.degraded_after_periods,
+            self.memory.clocks.delay_s, ids, ages_s, self._heard_s, self._busy, self._at_rest, self._blamed,
         )  # fmt: skip
         found: list[int] = ids[places].tolist()
         return found
@@ -374,7 +372,7 @@ class Agent:
         is_aged = age_s > self._fresh_s
         if is_aged:
             fidelity, link.asked = self._health(age_s), None
-        self._blame_clock(link, asked.destination, fidelity, age_s, now_s)
+        self._blame_clock(asked.destination, fidelity, age_s, now_s)
         is_at_rest = not before.proposals and asked[2:8] == _NOTHING and asked == before.enforced
         self._at_rest[asked.destination] = is_at_rest
         if is_at_rest:
@@ -414,13 +412,11 @@ class Agent:
         rules = self._rules
         return health(age_s, self._period_s, rules.degraded_after_periods, rules.detached_after_periods)
 
-    def _blame_clock(self, link: _OutgoingLink, peer: int, fidelity: LinkHealth, age_s: float, now_s: float) -> None:
+    def _blame_clock(self, peer: int, fidelity: LinkHealth, age_s: float, now_s: float) -> None:
         """Report a link that begins to be reduced because a descriptor was too old when it came."""
-        heard_ago_s, before = self.memory.heard_ago_s(peer, now_s), link.by_clock
-        link.by_clock = fidelity != _FRESH and age_s - heard_ago_s > self.memory.clocks.delay_s
-        if link.by_clock != before:
-            self._blamed[peer] = link.by_clock
-        if link.by_clock and not before:
+        heard_ago_s, before = self.memory.heard_ago_s(peer, now_s), self._blamed[peer]
+        self._blamed[peer] = is_blamed = fidelity != _FRESH and age_s - heard_ago_s > self.memory.clocks.delay_s
+        if is_blamed and not before:
             text = (
                 f"link to {peer} {fidelity.name.lower()}: its descriptor came {heard_ago_s:.2f} s ago and is {age_s:.2f} s "
                 "old by its stamp, so a clock is wrong"
