@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Mapping
 from math import acos, copysign, pi, sqrt
 from typing import NamedTuple
@@ -57,15 +56,9 @@ def rank_by_overlap(ego: int, overlap: Mapping[int, float]) -> list[int]:
     Policies in flight and the evaluation of recorded frames both rank peers by this function.
 
     Args:
-        ego: the id of the drone that receives.
+        ego: the id of the drone that receives, 0 … 255.
         overlap: by peer, the share of the ego's footprint that the peer's footprint covers, 0 … 1.
     """
-    steps = [(-round(o / OVERLAP_STEP), (p - ego) % AGENT_IDS, p) for p, o in overlap.items() if o]
-    near = sorted([each for each in steps if each[0]])
-    far = sorted([p for p, o in overlap.items() if not o] + [p for step, _, p in steps if not step])
-    if far and (far[0] < 0 or far[-1] >= AGENT_IDS or not 0 <= ego < AGENT_IDS):
-        far.sort(key=lambda p: ((p - ego) % AGENT_IDS, p))
-    else:  # ids ascend from the ego's on and begin anew
-        at = bisect_left(far, ego)
-        far = far[at:] + far[:at]
-    return [p for _, _, p in near] + far
+    # the step and the way round in one number, from which the id can be read again; most peers of a large fleet have 0
+    places = [(p - ego) % AGENT_IDS - AGENT_IDS * (round(o / OVERLAP_STEP) if o else 0) for p, o in overlap.items()]
+    return [(ego + place) % AGENT_IDS for place in sorted(places)]
