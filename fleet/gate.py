@@ -112,11 +112,10 @@ def make_payload(
     content_bytes = budget.content_bytes(
         NAME_OF[rung], cells=cells, boxes=boxes, classes=classes, code_bytes=code_bytes
     )  # fmt: skip
-    payload = Payload(
+    return Payload(
         rung, rho, roi, weight, cells, boxes, index_bytes, HEADER_BYTES + DIRECTIVE_BYTES + content_bytes,
-        tracks=tracks, people=people,
+        tracks=tracks, people=people, code_bytes=code_bytes if rung == _CODES else 0,
     )  # fmt: skip
-    return payload._replace(code_bytes=code_bytes) if rung == _CODES else payload
 
 
 class Gate:

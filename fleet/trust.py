@@ -146,7 +146,7 @@ def judge(
     after = {i: s if i in known else s.unheard_of() for i, s in standings.items()}
     peers = [i for i in known if i != ego] if math.isfinite(form.blur_m) else []
     cells = dict(
-        zip(peers, count_cells([known[i] for i in peers], form.blur_m, [cameras(i) for i in peers]), strict=True)
+        zip(peers, _count_cells([known[i] for i in peers], form.blur_m, [cameras(i) for i in peers]), strict=True)
     )
     goodput_step_mbps, soc_step = form.goodput_step_mbps, form.soc_step
     for peer, claim in known.items():
@@ -212,10 +212,10 @@ def coverage_doubt(d: Descriptor, blur_m: float = 0.0, looks: bool = False, came
         looks: whether the drone is known to look.
         cameras: the drone's.
     """
-    return _coverage_doubt(count_cells([d], blur_m, [cameras])[0], looks)
+    return _coverage_doubt(_count_cells([d], blur_m, [cameras])[0], looks)
 
 
-def _coverage_doubt(cells: Cells, looks: bool) -> str:
+def _coverage_doubt(cells: _Cells, looks: bool) -> str:
     if cells.impossible >= FALSE_CELLS:
         return f"coverage: {cells.impossible} cells seen well that its cameras cannot show so"
     if looks and cells.seen < FALSE_CELLS:
@@ -223,7 +223,7 @@ def _coverage_doubt(cells: Cells, looks: bool) -> str:
     return ""
 
 
-class Cells(NamedTuple):
+class _Cells(NamedTuple):
     """What a coverage grid claims, in cells."""
 
     impossible: int
@@ -231,11 +231,11 @@ class Cells(NamedTuple):
     seen: int
 
 
-_COUNTED: dict[tuple[object, ...], Cells] = {}
+_COUNTED: dict[tuple[object, ...], _Cells] = {}
 _MOST_COUNTED = 4096
 
 
-def count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[Cameras]) -> list[Cells]:
+def _count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[Cameras]) -> list[_Cells]:
     """The cells that claims see, and those that they cannot; claims that are judged by several drones are counted once.
 
     Args:
@@ -257,7 +257,7 @@ def count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[C
     return [_COUNTED[key] for key in keys]
 
 
-def _count(claims: Sequence[Descriptor], blur_m: float, cameras: Cameras) -> list[Cells]:
+def _count(claims: Sequence[Descriptor], blur_m: float, cameras: Cameras) -> list[_Cells]:
     states = np.stack([unpack_grid(d.coverage_grid) for d in claims])
     half, position_m = COVERAGE_CELLS // 2, np.array([d.position_m for d in claims])
     corner = np.array([d.coverage_corner for d in claims], np.float64)
@@ -270,12 +270,10 @@ def _count(claims: Sequence[Descriptor], blur_m: float, cameras: Cameras) -> lis
         impossible = int(np.count_nonzero(claimed & ~possible))
         if impossible >= FALSE_CELLS:  # else no leave that is given can matter
             flown_m = math.hypot(*d.velocity_mps) * LOOK_STANDS_S + blur_m
-            reach = 1 + math.ceil(
-                flown_m / COVERAGE_CELL_M
-            )  # and a cell, since the drone may have turned since it looked
+            reach = 1 + math.ceil(flown_m / COVERAGE_CELL_M)  # a cell more: it may have turned since it looked
             near = binary_dilation(possible, np.ones((3, 3)), iterations=reach)
             impossible = int(np.count_nonzero(claimed & ~near))
-        found.append(Cells(impossible, int(seen)))
+        found.append(_Cells(impossible, int(seen)))
     return found
 
 

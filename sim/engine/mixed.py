@@ -83,19 +83,16 @@ class Mixed:
     def _with_foreign_boxes(self, moments: Sequence[Sequence[Job]]) -> Sequence[Sequence[Job]]:
         """The same jobs; detections that another network made bring their boxes."""
         wanted: list[dict[Capture, None]] = [{} for _ in self._detectors]
-        for moment in moments:
-            for ego, shares in moment:
-                for share in shares:
-                    if self._is_foreign(ego, share):
-                        wanted[self._of[share.capture.drone]][share.capture] = None
-        boxes: dict[Capture, Boxes] = {}
         errors: dict[int, BoxErrors] = {}
         for moment in moments:
             for ego, shares in moment:
                 for share in shares:
-                    k = self._of[share.capture.drone]
-                    if share.representation == "uncertain_boxes" and k not in errors and self._is_foreign(ego, share):
-                        errors[k] = box_errors_of(self._detectors[k])
+                    if self._is_foreign(ego, share):
+                        k = self._of[share.capture.drone]
+                        wanted[k][share.capture] = None
+                        if share.representation == "uncertain_boxes" and k not in errors:
+                            errors[k] = box_errors_of(self._detectors[k])
+        boxes: dict[Capture, Boxes] = {}
         for detector, sends, captures in zip(self._detectors, self._sends, wanted, strict=True):
             made = _run(detector, [[(c, ())] for c in captures])
             boxes |= zip(captures, made if sends is None else map(sends, made), strict=True)
