@@ -19,7 +19,7 @@ RATES_HZ = (2.0, 5.0, 10.0)
 CHOICES = (len(RUNGS), len(RHOS), len(RATES_HZ), 2)
 """Choices of an action for each link: representation, ρ (the share of the feature cells), rate, and whether it is confined to the region."""
 ROW = 25
-"""Numbers of one drone in an observation; `_row` says which."""
+"""Numbers of one drone in an observation; `observe` says which."""
 LIMIT = 10.0
 
 Obs = np.ndarray[Any, np.dtype[np.float32]]

@@ -127,8 +127,8 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         Raises:
             ValueError: no such agent, or an action outside its space; nothing has been flown, the step may be tried again.
         """
-        flight = self._resumed()
-        if flight is None or not self.agents:
+        flight = self._resumed() if self.agents else None
+        if flight is None:
             return {}, {}, {}, {}, {}
         taken = {agent: self._checked(agent, action) for agent, action in actions.items()}
         step = {int(agent.removeprefix("drone_")): action for agent, action in taken.items()}, self.agents
