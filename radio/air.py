@@ -232,7 +232,7 @@ class Air:
             sender: who; nothing happens if it has been silenced.
             payload_bytes: 1 … 2200.
             on_heard: called once, at the frame's end, with the ids of the drones that received it, ascending
-                (none if it collided); in fleets of more than 32 an array.
+                (none if it collided).
 
         Raises:
             ValueError: if an argument is out of its bounds.

@@ -84,7 +84,7 @@ class Broadcasts:
             found = alive[fates == _HEARD]
             if len(found) < living:
                 self._miss(fates, living - len(found))
-            heard = found.tolist() if self._as_lists else found
+            heard = found.tolist()
         counters.receptions += len(heard)
         frame.on_heard(heard)
 

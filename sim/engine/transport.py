@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-import numpy as np
 import simpy
 
 from sortie.fleet.gate import Payload
@@ -79,8 +78,7 @@ class Transport:
 
     def hand_over(self, opened: Opened | Dropped, heard: Sequence[int]) -> None:
         """Give an opened datagram to those that heard it; a refused one is counted and changes nothing."""
-        listed = heard.tolist() if isinstance(heard, np.ndarray) else heard
-        now_s, memories = self._env.now, [self._receivers[receiver] for receiver in listed]
+        now_s, memories = self._env.now, [self._receivers[receiver] for receiver in heard]
         for receiver, reason in hear([m for m in memories if m.status.airborne], opened, now_s):
             self._recorder.rows["drops"].append((now_s, receiver, reason.value))
 
