@@ -28,12 +28,11 @@ class OwnState:
         """Args: `zero_s`: what a perfect clock shows at time 0."""
         self._status, self._oscillator, self._zero_s = status, oscillator, zero_s
         self._clock = oscillator.at_start(gnss)
-        self._start(0.0)
+        self.read(0.0)
 
     def read(self, now_s: float) -> None:
         """Bring the drone's clock to the present."""
-        if self._is_running:
-            self._status.clock_skew_s = self._zero_s + self._clock.error_s(now_s)
+        self._status.clock_skew_s = self._zero_s + self._clock.error_s(now_s)
 
     def begin(self, event: OwnEvent, index: int, now_s: float) -> Told:
         """An event begins; `index` is its place among the scenario's."""
@@ -64,13 +63,7 @@ class OwnState:
 
     def _set(self, now_s: float, **changes: float) -> None:
         self._clock = self._clock.at(now_s)._replace(**changes)
-        self._start(now_s)
-
-    def _start(self, now_s: float) -> None:
-        """The clock is another one; the error of one that runs at its right rate stays as it is."""
-        self._is_running = True
         self.read(now_s)
-        self._is_running = bool(self._clock.rate_ppm or self._clock.growth_ppm_per_min)
 
 
 def whom(event: Event, drones: int) -> Sequence[int]:
