@@ -29,6 +29,8 @@ MAX_DRONES = 20
 LARGEST: int = next(bound.le for bound in Fleet.model_fields["drones"].metadata if hasattr(bound, "le"))
 """The largest fleet that a scenario may have."""
 GONE = "detached_after_periods"
+OTHER_CODEBOOK = "0" * 14
+"""A digest that is not the fleet's common one: 7 bytes, as a descriptor has them."""
 
 _SPECIAL_SOC = (0.0, 0.05, 0.2999, 0.3, 0.5, 0.5999, 0.6, 1.0)
 _SPECIAL_GOODPUT_MBPS = (0.0, SILENT_MBPS, PROBED_MBPS, 0.01, 4.99, 5.0, 50.0, 600.0, 1e5)
@@ -70,7 +72,7 @@ def draw_view(seed: int, number: int, drones: int | None = None) -> FleetView:
         members = tuple(i for i in range(n) if i in descriptors or rng.random() < 0.5)
         descriptors = {i: d.with_roster(Roster(int(rng.integers(9)), members)) for i, d in descriptors.items()}
     if rng.random() < 0.25:  # and some codes are of another codebook
-        descriptors = {i: d._replace(codebook=str(rng.choice(["", "0" * 14]))) for i, d in descriptors.items()}
+        descriptors = {i: d._replace(codebook=str(rng.choice(["", OTHER_CODEBOOK]))) for i, d in descriptors.items()}
     return FleetView(ego, period_s, descriptors, age_s)
 
 
