@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import weakref
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -65,6 +66,9 @@ def _reachable(start: object) -> list[object]:
     seen, waiting = {id(start): start}, [start]
     while waiting:
         for held in gc.get_referents(waiting.pop()):
+            # a weak proxy holds nothing, and asked for its class after its object has gone it raises
+            if isinstance(held, weakref.ProxyTypes):
+                continue
             if isinstance(held, type | ModuleType | FunctionType | simpy.Environment | simpy.Event):
                 continue
             if id(held) not in seen:
