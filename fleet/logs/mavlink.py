@@ -14,13 +14,13 @@ import struct
 import tempfile
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink2
 
 from sortie.fleet.flight.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, yaw_rad
-from sortie.fleet.logs.geodesy import Origin, Vector, geodetic
+from sortie.fleet.logs.geodesy import Origin, geodetic
+from sortie.fleet.logs.telemetry import KEY_BYTES, Telemetry
 
 _GNSS = mavlink2.MAV_SYS_STATUS_SENSOR_GPS
 _SENSORS = (
@@ -43,31 +43,6 @@ SIGNING_EPOCH_US = 1_420_070_400_000_000
 """2015-01-01, from which the clocks of signed frames count."""
 _BAD_SIGNATURE = "Invalid signature"
 """pymavlink's reason."""
-
-
-@dataclass(frozen=True, slots=True)
-class Telemetry:
-    """One drone at one time; ENU, FLU, x y z w."""
-
-    time_s: float
-    """Since the sortie's begin."""
-    position_m: tuple[float, float, float]
-    orientation_xyzw: tuple[float, float, float, float]
-    velocity_mps: tuple[float, float, float]
-    body_rates_radps: tuple[float, float, float]
-    soc: float
-    voltage_v: float
-    current_a: float
-    energy_used_j: float
-    cpu_load: float
-    """0 … 1."""
-    landed: bool
-    ground_station: bool = False
-    """Whether it is no vehicle."""
-    home_m: Vector = (0.0, 0.0, 0.0)
-    """Where on the ground it took off."""
-    fixed: bool = True
-    """Whether it has GNSS."""
 
 
 def messages(state: Telemetry, origin: Origin) -> list[mavlink2.MAVLink_message]:
@@ -193,7 +168,6 @@ def _pack_voltage_mv(voltage_v: float) -> list[int]:
 
 STATUS = frozenset({"HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "BATTERY_STATUS", "GPS_RAW_INT", "HOME_POSITION"})
 """Messages of `messages` that an autopilot sends once a second; the others go at the telemetry's own rate."""
-KEY_BYTES = 32
 
 
 def _sign(mav: mavlink2.MAVLink, key: bytes, now_us: int) -> None:

@@ -10,8 +10,11 @@ import typer
 
 from sortie.scenarios.traces import TraceError
 from sortie.sim.cli.console import out
+from sortie.sim.export.endpoint import read_key
+from sortie.sim.export.origin import parse_origin
 from sortie.sim.folders import RunError, ensure_folder
 from sortie.sim.results import run_folder
+from sortie.sim.user_errors import missing
 
 BAG, TLOG, PCAP = "bag", "sortie.tlog", "sortie.pcap"
 BEGIN = "2026-01-01T00:00:00"
@@ -60,11 +63,11 @@ def export(
     # ROS counts seconds in 32 bits, signatures from 2015 on; beyond 2096 a log's stamps are no times
     first, end = (1970, 2038) if mcap or pcap else (2015 if key is not None else 1970, 2096)
     began_us = (moment(begin, first, end) - EPOCH) // timedelta(microseconds=1)
-    from sortie.sim.export.telemetry import parse_origin, read_key, save_tlog
-
+    where = None if origin is None else parse_origin(origin)
     if tlog:
+        from sortie.sim.export.telemetry import save_tlog
+
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
-        where = None if origin is None else parse_origin(origin)
         try:
             frames = save_tlog(run_folder.load(run), path, began_us, where, secret, drone)
         except TraceError as error:
@@ -84,14 +87,13 @@ def export(
     path = out_path or run / BAG
     path = path if path.name.strip(".") else path.resolve()  # the bag is called as its folder is
     ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap", LAYOUT})
-    where = None if origin is None else parse_origin(origin)
     record = run_folder.load(run)
     try:
         from sortie.sim.export.bag import write_bag
 
         counts = write_bag(record, path, began_us * 1000, where)
     except ImportError as error:
-        raise RunError("rosbags is missing: pip install 'sortie-sim[ros2]'") from error
+        raise missing(error) from error
     except TraceError as error:
         raise RunError(f"{error}; the bag's origin is in it, or --origin names one") from error
     out.print(f"{sum(counts.values())} messages on {len(counts)} topics, in [bold]{path}[/bold]", soft_wrap=True)

@@ -134,7 +134,8 @@ def _watching(live: bool, mavlink: str | None, pace: float, key: Path | None) ->
 
         watchers.append(LiveViewer())
     if mavlink is not None:
-        from sortie.sim.export.telemetry import MavlinkEndpoint, read_key
+        from sortie.sim.export.endpoint import read_key
+        from sortie.sim.export.telemetry import MavlinkEndpoint
 
         watchers.append(MavlinkEndpoint(mavlink, pace or None, key=None if key is None else read_key(key)))
     return Watchers(watchers)

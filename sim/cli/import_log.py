@@ -18,6 +18,7 @@ from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Battery
 from sortie.sim.cli.console import out
+from sortie.sim.export.origin import parse_origin
 from sortie.sim.folders import RunError, ensure_folder, replacing, write_text
 from sortie.sim.user_errors import user_errors
 
@@ -185,8 +186,6 @@ def _zero(flights: Sequence[FlightLog], lifted_m: float) -> Origin | None:
 
 def _with_stations(columns: dict[str, Array], places: Sequence[str], zero: Origin) -> dict[str, Array]:
     """The columns with a row for each ground station, which are the last drones."""
-    from sortie.sim.export.telemetry import parse_origin
-
     first = int(columns["drone"].max()) + 1
     rows = []
     for number, text in enumerate(places):

@@ -95,7 +95,7 @@ def live(
     )
     flown = loaded(scenario, set_, policy)
     with user_errors():
-        from sortie.sim.export.telemetry import given_origin, parse_origin
+        from sortie.sim.export.origin import given_origin, parse_origin
         from sortie.sim.live.seals import find_key, read_own_key
         from sortie.sim.live.session import fly_live
         from sortie.sim.live.watchdog import parse_fallback

@@ -39,8 +39,9 @@ from sortie.fleet.messages.wire import (
 )
 from sortie.sim.export.foxglove import LAYOUT, layout
 from sortie.sim.export.messages import descriptors, directives
+from sortie.sim.export.origin import origin_of
 from sortie.sim.export.scene_markers import MARKERS, TOWN, SceneMarkers, Timed
-from sortie.sim.export.telemetry import Telemeter, origin_of
+from sortie.sim.export.telemeter import Telemeter
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import replacing
 from sortie.sim.results.outcome import transitions
@@ -76,7 +77,7 @@ def write_bag(record: SortieRecord, path: Path, begin_ns: int, origin: Origin | 
         record: the sortie.
         path: the bag's folder; an older one there is replaced.
         begin_ns: when the sortie is said to have begun, ns since 1970.
-        origin: where on the globe ENU (0, 0, 0) lies; None: as in `sortie.sim.export.telemetry.origin_of`.
+        origin: where on the globe ENU (0, 0, 0) lies; None: as in `sortie.sim.export.origin.origin_of`.
 
     Returns:
         How many messages each topic has.

@@ -6,51 +6,30 @@ import heapq
 import select
 import socket
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from sortie.fleet.energy.cell import MEAN_CELL_V
 from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.logs.ground_station import answers, parameter_values, status_texts
-from sortie.fleet.logs.mavlink import KEY_BYTES, STATUS, Listener, Telemetry, Transmitter, messages, write_tlog
-from sortie.fleet.traces import flown_at
+from sortie.fleet.logs.mavlink import STATUS, Listener, Transmitter, messages, write_tlog
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.scenarios.schema import Fleet, Scenario
+from sortie.scenarios.schema import Scenario
+from sortie.sim.export.endpoint import parse_address
+from sortie.sim.export.origin import origin_of
+from sortie.sim.export.telemeter import Telemeter
 from sortie.sim.folders import RunError
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words, event_in_words
 
-ORIGIN = Origin(47.397742, 8.545594, 488.0)
-"""Where ENU (0, 0, 0) lies where nobody says otherwise: the field in Zurich at which PX4's simulators start."""
-
-
 DATAGRAM_BYTES = 1400
 """At most, with which a datagram passes Ethernet whole."""
-_GNSS = {"gnss_loss": False, "gnss_back": True}
-"""Kinds of events, and whether there is GNSS afterwards."""
-
-
-def origin_of(fleet: Fleet) -> Origin:
-    """Where a fleet flies: at `fleet.origin`, else where its trace in latitude and longitude begins, else at `ORIGIN`.
-
-    Raises:
-        TraceError: its trace cannot be read.
-    """
-    at = flown_at(fleet)
-    return ORIGIN if at is None else Origin(**at.model_dump())
-
-
-def given_origin(fleet: Fleet) -> Origin | None:
-    """`fleet.origin`, if there is one."""
-    return None if fleet.origin is None else Origin(**fleet.origin.model_dump())
 
 
 def parameters_of(scenario: Scenario) -> list[dict[str, float]]:
@@ -60,57 +39,6 @@ def parameters_of(scenario: Scenario) -> list[dict[str, float]]:
         {"SYSID_THISMAV": drone + 1.0, "BATT_CAPACITY": 1000 * pack.capacity_wh / (pack.cells * MEAN_CELL_V)}
         for drone, pack in packs
     ]
-
-
-class Telemeter:
-    """Turns rows of the record into telemetry; load, home and GNSS are kept from slice to slice."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._frame_s = scenario.frame_s
-        self._load = np.zeros(scenario.fleet.drones)
-        self._stations = {station.drone for station in scenario.fleet.ground}
-        self._home_m: dict[int, tuple[float, float, float]] = {}
-        self._fixed = [True] * scenario.fleet.drones
-
-    def add(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[int, Telemetry]]:
-        """Each drone's state in each frame of the tables `states`, `descriptors` and `events`, in order of time."""
-        happened = deque(row for row in new["events"].to_pylist() if row["kind"] in _GNSS)
-        descriptors = new["descriptors"]
-        published = iter(zip(*(descriptors[k].to_pylist() for k in ("t_s", "drone", "cpu_headroom")), strict=True))
-        said = next(published, None)
-        for row in new["states"].to_pylist():
-            while said is not None and said[0] <= row["t_s"] + self._frame_s / 2:
-                self._load[said[1]] = 1.0 - said[2]
-                said = next(published, None)
-            while happened and happened[0]["t_s"] <= row["t_s"]:
-                event = happened.popleft()
-                self._fixed[event["drone"]] = _GNSS[event["kind"]]
-            yield row["drone"], self._telemetry(row)
-        while said is not None:
-            self._load[said[1]] = 1.0 - said[2]
-            said = next(published, None)
-        for event in happened:
-            self._fixed[event["drone"]] = _GNSS[event["kind"]]
-
-    def _telemetry(self, row: dict[str, Any]) -> Telemetry:
-        drone, landed = row["drone"], not row["airborne"]
-        still = (0.0, 0.0, 0.0)
-        return Telemetry(
-            time_s=row["t_s"],
-            position_m=(row["x_m"], row["y_m"], row["z_m"]),
-            orientation_xyzw=(row["qx"], row["qy"], row["qz"], row["qw"]),
-            velocity_mps=still if landed else (row["vx_mps"], row["vy_mps"], row["vz_mps"]),
-            body_rates_radps=still if landed else (row["p_radps"], row["q_radps"], row["r_radps"]),
-            soc=row["soc"],
-            voltage_v=row["voltage_v"],
-            current_a=row["current_a"],
-            energy_used_j=row["spent_j"],
-            cpu_load=float(np.clip(self._load[drone], 0.0, 1.0)),
-            landed=landed,
-            ground_station=drone in self._stations,
-            home_m=self._home_m.setdefault(drone, (row["x_m"], row["y_m"], 0.0)),
-            fixed=self._fixed[drone],
-        )
 
 
 class Stream:
@@ -294,51 +222,3 @@ class MavlinkEndpoint:
             with suppress(OSError):  # best effort, as on any telemetry radio
                 self._socket.sendto(self._datagram, self._peer)
             self._datagram = b""
-
-
-def parse_address(address: str) -> tuple[bool, str, int]:
-    """Whether to wait for a peer, and host and port."""
-    kind, _, rest = address.partition(":")
-    host, _, port = rest.rpartition(":")
-    least = int(kind == "udpout")  # any free port may be waited at, none sent to
-    if kind not in ("udpout", "udpin") or not host or not port.isdecimal() or not least <= int(port) <= 65_535:
-        raise RunError(f"{address!r} is no MAVLink address, must be as udpout:127.0.0.1:14550 or udpin:127.0.0.1:14550")
-    return kind == "udpin", host, int(port)
-
-
-def parse_origin(text: str) -> Origin:
-    """`latitude,longitude[,altitude]` in degrees and metres.
-
-    Raises:
-        RunError: it is none, naming it.
-    """
-    try:
-        numbers = [float(part) for part in text.split(",")]
-        if len(numbers) not in (2, 3):
-            raise ValueError(f"{len(numbers)} numbers")
-        return Origin(*numbers)
-    except ValueError as error:
-        raise RunError(
-            f"origin is {text!r}, must be latitude,longitude or latitude,longitude,altitude: {error}"
-        ) from error
-
-
-def read_key(path: Path) -> bytes:
-    """A signing key out of a file: 64 hexadecimal digits, or 32 B as they are. It is told to nobody.
-
-    Raises:
-        RunError: the file cannot be read or holds neither.
-    """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise RunError(f"{path}: {error.strerror}") from error
-    if len(content) == KEY_BYTES:
-        return content
-    try:
-        key = bytes.fromhex(content.decode("ascii"))
-    except ValueError:  # includes what is no ASCII
-        key = b""
-    if len(key) != KEY_BYTES:
-        raise RunError(f"{path}: no signing key, must hold {2 * KEY_BYTES} hexadecimal digits or {KEY_BYTES} bytes")
-    return key

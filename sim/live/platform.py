@@ -15,13 +15,12 @@ from sortie.fleet.agent import Platform, Task
 from sortie.fleet.coverage import Poses, footprint_radius_m, views
 from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.logs.geodesy import Origin
-from sortie.fleet.logs.mavlink import Companion, Listener
 from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
 from sortie.fleet.plane import PlaneRules
 from sortie.fleet.senses import Sensed
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Disc, TaskPhase
-from sortie.sim.export.telemetry import parse_address
+from sortie.sim.export.endpoint import parse_address
 from sortie.sim.folders import RunError
 from sortie.sim.live.context import ReplaySenses
 
@@ -45,6 +44,11 @@ class MavlinkLink:
         Raises:
             RunError: an address that is none, or one that is taken.
         """
+        from sortie.fleet.logs.mavlink import (  # pymavlink is loaded for a drone with a vehicle alone
+            Companion,
+            Listener,
+        )
+
         waits, host, port = parse_address(address)
         self.address, self._origin = address, origin
         self.state = VehicleState()

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sortie.fleet.messages.auth import Dropped, DropReason, Opened, Sealer, open_datagram, unseal
-from sortie.sim.export.telemetry import read_key
+from sortie.sim.export.endpoint import read_key
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import RunError
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
@@ -17,7 +18,7 @@ from sortie.fleet import chart, peers
 from sortie.fleet.logs.geodesy import Origin
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
-from sortie.sim.export.telemetry import parse_address
+from sortie.sim.export.endpoint import parse_address
 from sortie.sim.folders import RunError
 from sortie.sim.live.bench import Bench, FleetReports
 from sortie.sim.live.bus import Bus
@@ -28,6 +29,7 @@ from sortie.sim.live.result import LiveResult, Lost, summarise
 from sortie.sim.live.scope import left_out
 from sortie.sim.live.seals import secrets_of
 from sortie.sim.live.watchdog import DETECTIONS, Fallback
+from sortie.sim.user_errors import user_errors
 
 MAX_DRONES = 20
 """The most processes that this starts on one host."""
@@ -192,6 +194,9 @@ def _check(
         raise RunError(f"there are {len(mavlink)} MAVLink addresses, must be at most {drones}, one for each drone")
     for address in mavlink:
         parse_address(address)
+    if mavlink:
+        with user_errors():  # here, before a process of a drone finds pymavlink missing
+            import_module("sortie.fleet.logs.mavlink")
     if not 0 <= loss <= 1:
         raise RunError(f"loss is {loss:g}, must be in [0, 1]")
     if kill is not None and not (0 <= kill[0] < drones and begin_s < kill[1] < end_s):

@@ -15,8 +15,10 @@ from typing import Annotated
 import typer
 
 from sortie.fleet.logs.geodesy import Origin
-from sortie.fleet.logs.mavlink import STATUS, Telemetry, Transmitter, messages
-from sortie.sim.export.telemetry import ORIGIN, parse_address
+from sortie.fleet.logs.mavlink import STATUS, Transmitter, messages
+from sortie.fleet.logs.telemetry import Telemetry
+from sortie.sim.export.endpoint import parse_address
+from sortie.sim.export.origin import ORIGIN
 from sortie.sim.live.seals import read_own_key
 
 TELEMETRY_HZ = 20.0

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from missing_libraries import path_without
 
-BLOCKED = """
+from sortie.sim.export.foxglove import LAYOUT
+
+RUN = """
 import sys
 
-
-class Missing:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in LIBRARIES:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-
-sys.meta_path.insert(0, Missing())
 from sortie.__main__ import main
 
 for words in COMMANDS:
@@ -33,6 +29,7 @@ for words in COMMANDS:
 """
 SURROGATE = ("--set", "perception.detector=surrogate", "--set", "duration_s=2")
 VIEW = "error: rerun is missing: pip install 'sortie-sim[view]'\n"
+ROS = "error: rosbags is missing: pip install 'sortie-sim[ros2]'\n"
 MAVLINK = "error: pymavlink is missing: pip install 'sortie-sim[mavlink]'\n"
 
 
@@ -40,17 +37,18 @@ def _sortie(
     folder: Path, *commands: tuple[str, ...], without: tuple[str, ...] = ("torch", "rerun", "pymavlink")
 ) -> tuple[str, str]:
     """Output and errors of commands one after another in one process; each ends with a line `exit CODE`."""
-    code = f"LIBRARIES = {without!r}\nCOMMANDS = {commands!r}\n{BLOCKED}"
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
+    code, env = f"COMMANDS = {commands!r}\n{RUN}", {**os.environ, "PYTHONPATH": path_without(folder, *without)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=env, capture_output=True, text=True, check=True)
     return done.stdout, done.stderr
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A folder with the run `a`, flown by the surrogate without any extra, and what was printed."""
+    """A folder with the run `a` and its bag, flown by the surrogate without extras, and what was printed."""
     folder = tmp_path_factory.mktemp("slim")
-    printed, errors = _sortie(folder, ("fly", "track_target", *SURROGATE, "--out", "a"), ("report", "a"))
-    assert errors == "exit 0\nexit 0\n"
+    commands = ("fly", "track_target", *SURROGATE, "--out", "a"), ("report", "a"), ("export", "a", "--mcap")
+    printed, errors = _sortie(folder, *commands)
+    assert errors == "exit 0\n" * 3
     return folder, printed
 
 
@@ -74,6 +72,7 @@ NEEDY = {
     ("fly", "track_target", *SURROGATE, "--mavlink", "udpout:127.0.0.1:14550", "--out", "b"): MAVLINK,
     ("export", "a", "--tlog"): MAVLINK,
     ("import", "flown.tlog"): MAVLINK,
+    ("export", "a", "--mcap"): ROS,
     ("live", "track_target", "--mavlink", "udpin:127.0.0.1:14550"): MAVLINK,
     ("paper",): "error: torch is missing: pip install 'sortie-sim[torch]'\n",
     ("fly", "track_target", "--out", "b"): "error: perception.detector is torch, which is not installed: "
@@ -84,13 +83,19 @@ NEEDY = {
 def test_what_needs_an_extra_says_so_before_it_flies(flown: tuple[Path, str]) -> None:
     folder, _ = flown
     (folder / "flown.tlog").write_bytes(struct.pack(">Q", 1_700_000_000_000_000) + b"\xfd" + bytes(40))
-    _, errors = _sortie(folder, *NEEDY)
+    _, errors = _sortie(folder, *NEEDY, without=("torch", "rerun", "pymavlink", "rosbags"))
     assert errors == "".join(f"{told}exit 2\n" for told in NEEDY.values())
     assert not (folder / "b").exists()
 
 
-def test_a_log_that_is_no_telemetry_needs_no_mavlink(tmp_path: Path) -> None:
+def test_a_run_becomes_a_bag(flown: tuple[Path, str]) -> None:
+    folder, _ = flown
+    assert {file.name for file in (folder / "a/bag").iterdir()} == {"metadata.yaml", "bag.mcap", LAYOUT}
+
+
+def test_what_needs_no_mavlink_runs_without_it(tmp_path: Path) -> None:
     (tmp_path / "a.ulg").write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8))
-    _, errors = _sortie(tmp_path, ("import", "a.ulg"), without=("pymavlink",))
+    _, errors = _sortie(tmp_path, ("import", "a.ulg"), ("live", "track_target", "--set", "fleet.drones=21"))
     assert "a.ulg" in errors
+    assert "live flights have at most 20" in errors
     assert "pymavlink" not in errors

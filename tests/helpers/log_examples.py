@@ -7,7 +7,8 @@ import struct
 import numpy as np
 
 from sortie.fleet.logs.geodesy import Origin, geodetic
-from sortie.fleet.logs.mavlink import Telemetry, Transmitter, messages
+from sortie.fleet.logs.mavlink import Transmitter, messages
+from sortie.fleet.logs.telemetry import Telemetry
 
 ORIGIN = Origin(47.0, 8.0, 400.0)
 STEPS = 100

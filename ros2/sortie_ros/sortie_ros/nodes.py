@@ -12,7 +12,7 @@ from rclpy.node import Node
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
-from sortie.sim.export.telemetry import parse_origin
+from sortie.sim.export.origin import parse_origin
 from sortie.sim.export.topics import TopicKind
 from sortie.sim.live.bench import Bench
 from sortie.sim.live.node import Role

@@ -15,7 +15,8 @@ from sortie.fleet.logs.dataflash import read_dataflash
 from sortie.fleet.logs.flightlog import LogError, read_log, read_logs
 from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.logs.logtrace import context_trace
-from sortie.fleet.logs.mavlink import Telemetry, Transmitter, messages
+from sortie.fleet.logs.mavlink import Transmitter, messages
+from sortie.fleet.logs.telemetry import Telemetry
 from sortie.fleet.logs.ulog import read_ulog
 
 FLIGHT = examples.ulog(20)

@@ -13,7 +13,8 @@ from pymavlink.dialects.v20 import common as mavlink2
 from scipy.spatial.transform import Rotation
 
 from sortie.fleet.logs.geodesy import Origin, geodetic
-from sortie.fleet.logs.mavlink import Telemetry, Transmitter, messages, write_tlog
+from sortie.fleet.logs.mavlink import Transmitter, messages, write_tlog
+from sortie.fleet.logs.telemetry import Telemetry
 
 ZURICH = Origin(47.0, 8.5, 400.0)
 # flies north-west at 5 m/s, nose 10° up, yaws left at 0.2 rad/s, climbs at 1 m/s

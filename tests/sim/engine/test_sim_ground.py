@@ -12,7 +12,8 @@ from sortie.fleet.logs.mavlink import mavlink2
 from sortie.scenarios.errors import SortieError
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build, run_sortie
-from sortie.sim.export.telemetry import ORIGIN, Stream
+from sortie.sim.export.origin import ORIGIN
+from sortie.sim.export.telemetry import Stream
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report import page

@@ -30,10 +30,13 @@ from typer.testing import CliRunner
 
 from sortie.fleet.energy.cell import MEAN_CELL_V
 from sortie.fleet.logs.flightlog import read_logs
-from sortie.fleet.logs.mavlink import KEY_BYTES, Listener, Transmitter
+from sortie.fleet.logs.mavlink import Listener, Transmitter
+from sortie.fleet.logs.telemetry import KEY_BYTES
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.export.telemetry import DATAGRAM_BYTES, ORIGIN, MavlinkEndpoint, parse_origin, read_key, save_tlog
+from sortie.sim.export.endpoint import read_key
+from sortie.sim.export.origin import ORIGIN, parse_origin
+from sortie.sim.export.telemetry import DATAGRAM_BYTES, MavlinkEndpoint, save_tlog
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import transitions

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import dds_peer
 import pytest
+from missing_libraries import path_without
 from places import ROOT
 from sim_examples import BASE, example
 from typer.testing import CliRunner
@@ -289,7 +290,8 @@ def test_the_bench_counts_every_topic(flown: Flown) -> None:
 # --- loss, interruption, options ---------------------------------------------------------------------
 
 
-def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path) -> None:
+def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", path_without(tmp_path, "pymavlink"))  # no drone has a vehicle
     scenario, told = tmp_path / "s.yaml", tmp_path / "told" / "live.json"
     scenario.write_text(BASE)
     done = CliRunner().invoke(

@@ -21,7 +21,7 @@ from sortie.fleet.logs.mavlink import Companion, Listener, Transmitter, messages
 from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
 from sortie.policies.contract import TaskPhase
 from sortie.sim.cli.app import app
-from sortie.sim.export.telemetry import ORIGIN
+from sortie.sim.export.origin import ORIGIN
 from sortie.sim.folders import RunError
 from sortie.sim.live import platform
 from sortie.sim.live.context import ReplaySenses, traces

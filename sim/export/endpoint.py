@@ -1,0 +1,39 @@
+"""Where MAVLink goes, and the key that signs it, as users write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sortie.fleet.logs.telemetry import KEY_BYTES
+from sortie.sim.folders import RunError
+
+
+def parse_address(address: str) -> tuple[bool, str, int]:
+    """Whether to wait for a peer, and host and port."""
+    kind, _, rest = address.partition(":")
+    host, _, port = rest.rpartition(":")
+    least = int(kind == "udpout")  # any free port may be waited at, none sent to
+    if kind not in ("udpout", "udpin") or not host or not port.isdecimal() or not least <= int(port) <= 65_535:
+        raise RunError(f"{address!r} is no MAVLink address, must be as udpout:127.0.0.1:14550 or udpin:127.0.0.1:14550")
+    return kind == "udpin", host, int(port)
+
+
+def read_key(path: Path) -> bytes:
+    """A signing key out of a file: 64 hexadecimal digits, or 32 B as they are. It is told to nobody.
+
+    Raises:
+        RunError: the file cannot be read or holds neither.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror}") from error
+    if len(content) == KEY_BYTES:
+        return content
+    try:
+        key = bytes.fromhex(content.decode("ascii"))
+    except ValueError:  # includes what is no ASCII
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise RunError(f"{path}: no signing key, must hold {2 * KEY_BYTES} hexadecimal digits or {KEY_BYTES} bytes")
+    return key
