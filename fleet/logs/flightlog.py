@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from sortie.fleet.logs.dataflash import RawLog, is_dataflash, read_dataflash
 from sortie.fleet.logs.fields import Found, from_dataflash, from_tlog, from_ulog, utc_at_zero_s, with_fields
+from sortie.fleet.logs.geodesy import metres_per_radian
 from sortie.fleet.logs.ulog import is_ulog, read_ulog
 from sortie.scenarios.errors import SortieError
 
@@ -246,9 +247,8 @@ def local_m(fixes: Array) -> Array:
     On the plane tangent to the WGS-84 ellipsoid at the first, with its two radii of curvature: the inverse of
     `sortie.fleet.logs.geodesy.geodetic`.
     """
-    a, e2 = 6378137.0, 6.69437999014e-3
-    lat, lon, alt = (math.radians(fixes[0, 0]), fixes[0, 1], fixes[0, 2])
-    w = math.sqrt(1 - e2 * math.sin(lat) ** 2)
-    north = np.radians(fixes[:, 0] - fixes[0, 0]) * (a * (1 - e2) / w**3 + alt)
-    east = np.radians((fixes[:, 1] - lon + 180) % 360 - 180) * (a / w + alt) * math.cos(lat)
+    lat, lon, alt = fixes[0].tolist()
+    east_m, north_m = metres_per_radian(lat, alt)  # not by an `Origin`: a damaged first fix may lie anywhere
+    east = np.radians((fixes[:, 1] - lon + 180) % 360 - 180) * east_m
+    north = np.radians(fixes[:, 0] - lat) * north_m
     return np.stack([east, north, fixes[:, 2] - alt], axis=-1)

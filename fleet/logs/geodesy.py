@@ -35,7 +35,7 @@ class Origin:
 
 def geodetic(position_m: tuple[float, float, float], origin: Origin) -> tuple[float, float, float]:
     """ENU metres to latitude and longitude in degrees and altitude in metres."""
-    east_m, north_m = _metres_per_radian(origin)
+    east_m, north_m = metres_per_radian(origin.latitude_deg, origin.altitude_m)
     east, north, up = position_m
     latitude = origin.latitude_deg + math.degrees(north / north_m)
     longitude = origin.longitude_deg + math.degrees(east / east_m)
@@ -44,17 +44,17 @@ def geodetic(position_m: tuple[float, float, float], origin: Origin) -> tuple[fl
 
 def local_enu(latitude_deg: float, longitude_deg: float, altitude_m: float, origin: Origin) -> Vector:
     """The inverse of `geodetic`: ENU metres."""
-    east_m, north_m = _metres_per_radian(origin)
+    east_m, north_m = metres_per_radian(origin.latitude_deg, origin.altitude_m)
     east_deg = (longitude_deg - origin.longitude_deg + 180) % 360 - 180
     north_deg = latitude_deg - origin.latitude_deg
     return math.radians(east_deg) * east_m, math.radians(north_deg) * north_m, altitude_m - origin.altitude_m
 
 
-def _metres_per_radian(origin: Origin) -> tuple[float, float]:
+def metres_per_radian(latitude_deg: float, altitude_m: float) -> tuple[float, float]:
     """Metres eastward per radian of longitude and northward per radian of latitude, on the WGS-84 ellipsoid."""
     a, e2 = 6378137.0, 6.69437999014e-3
-    phi = math.radians(origin.latitude_deg)
+    phi = math.radians(latitude_deg)
     w = math.sqrt(1 - e2 * math.sin(phi) ** 2)
-    meridian_m = a * (1 - e2) / w**3 + origin.altitude_m
-    normal_m = a / w + origin.altitude_m
+    meridian_m = a * (1 - e2) / w**3 + altitude_m
+    normal_m = a / w + altitude_m
     return normal_m * math.cos(phi), meridian_m
