@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sortie.sim.folders import write_text
+from sortie.sim.results.html_page import figures_html, html_page
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.results.report import STYLE
 from sortie.sim.results.report_figures import (
     accuracy_points,
     colour,
@@ -56,7 +56,6 @@ def comparison_page(flown: Flown, precision: Precision | None = None) -> str:
         flown: the sorties; figures over time need the first seed's records, and are left out without them.
         precision: of a comparison to a half-width, what it flew.
     """
-    title, of = "Policies compared", heading(flown)
     labels = list(dict.fromkeys(s.policy for s in flown.sorties))
     head = "".join(f"<th>{escape(label)}</th>" for label in labels)
     rows = "".join(
@@ -66,27 +65,14 @@ def comparison_page(flown: Flown, precision: Precision | None = None) -> str:
     told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
     why = "".join(f"<li>{_bold(line)}</li>" for line in told)
     figures = drawn([*_dots(flown, labels), *_over_time(flown)])
-    shown = "".join(f"<figure><figcaption>{escape(name)}</figcaption>{svg}</figure>" for name, svg in figures.items())
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>{STYLE}</style>
-</head>
-<body><main>
-<h1>{escape(title)}</h1>
-<p class="of">{escape(of)}</p>
-<h2>In numbers</h2>
+    body = f"""<h2>In numbers</h2>
 <table><tr><th></th>{head}</tr>{rows}</table>
 <ul>{why}</ul>
 <h2>In figures</h2>
 <p>A small dot is one sortie, a large one the mean of a policy's sorties. Figures over time show the first seed's sorties.</p>
-{shown}
-</main></body>
-</html>
+{figures_html(figures)}
 """
+    return html_page("Policies compared", heading(flown), body)
 
 
 def _bold(line: str) -> str:
