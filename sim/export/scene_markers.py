@@ -25,7 +25,7 @@ from sortie.perception.scene.traffic import Cars
 from sortie.perception.types import Boxes
 from sortie.scenarios.schema.events import Jam
 from sortie.sim.results import palette as c
-from sortie.sim.results.flown_scene import scene_of
+from sortie.sim.results.flown_scene import BOX_HEIGHT_M, CIRCLE, cars_near, houses, jamming, scene_of, vehicles
 from sortie.sim.results.link_traffic import LinkTraffic
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
@@ -35,15 +35,10 @@ MARKERS = "visualization_msgs/msg/MarkerArray"
 TOWN, CARS, MISSION, LINKS = "/scene/town", "/scene/cars", "/scene/mission", "/scene/links"
 SCENE_HZ = 5.0
 """Cars, regions and links are drawn so often, in whole frames."""
-CARS_WITHIN_M = 160.0
-"""Of the middle of the fleet."""
-BOX_HEIGHT_M = 1.8
 LINK_WIDTH_M, RING_WIDTH_M = 0.4, 1.0
 BUILDING = (170, 160, 150, 255)
-JAMMER = (255, 60, 40, 255)
 _CUBE, _SPHERE, _LINE_STRIP, _LINE_LIST, _TEXT, _CYLINDER, _ARROW = 1, 2, 4, 5, 9, 3, 0
 _DELETE_ALL = 3
-_RING = [(float(np.cos(a)), float(np.sin(a))) for a in np.linspace(0, 2 * np.pi, 49)]
 
 Timed = tuple[float, str, Any]
 """Time in s, topic and message."""
@@ -72,24 +67,22 @@ class SceneMarkers:
 
     def messages(self) -> list[Iterator[Timed]]:
         """Streams of messages, each in order of time."""
-        return [self._town(), self._cars(), self._mission(), self._links(), self._boxes()]
+        return [self._town(), self._cars(), self._mission(), self._links(), self._boxes(), self._landed()]
 
     # --- streams ---------------------------------------------------------------------------------
 
     def _town(self) -> Iterator[Timed]:
-        x0, y0, x1, y1 = self._scene.rect
-        houses = np.concatenate([block.buildings for block in self._scene.town.blocks(x0, y0, x1, y1)])
         markers = [
             self._marker("buildings", _CUBE, 0.0, ((x + u) / 2, (y + v) / 2, top / 2), (u - x, v - y, top), BUILDING)
-            for x, y, u, v, top in houses[:, :5].tolist()
+            for x, y, u, v, top in houses(self._scene)[:, :5].tolist()
         ]
         yield 0.0, TOWN, self._array(0.0, [*markers, *self._car_markers("parked", 0.0, self._scene.parked_cars)])
 
     def _cars(self) -> Iterator[Timed]:
+        flying = vehicles(self._record.scenario.fleet)
         for k in self._drawn:
-            t_s, (x, y) = float(self._t_s[k]), self._position[k, :, :2].mean(axis=0).tolist()
-            cars = self._scene.moving_cars(t_s)
-            near = cars.where((cars.x_m - x) ** 2 + (cars.y_m - y) ** 2 <= CARS_WITHIN_M**2)
+            t_s, (x, y) = float(self._t_s[k]), self._position[k, flying, :2].mean(axis=0).tolist()
+            near = cars_near(self._scene, t_s, x, y)
             yield t_s, CARS, self._array(t_s, self._car_markers("moving", t_s, near))
 
     def _mission(self) -> Iterator[Timed]:
@@ -103,20 +96,19 @@ class SceneMarkers:
                 if radius == radius:  # NaN where there is none
                     size = (2 * radius, 2 * radius, 0.2)
                     markers.append(self._marker("region", _CYLINDER, t_s, (x, y, 0.3), size, (*c.MISSION[:3], 60)))
-                    ring = [(x + radius * a, y + radius * b, 0.6) for a, b in _RING]
+                    ring = [(x + radius * a, y + radius * b, 0.6) for a, b in CIRCLE.tolist()]
                     markers.append(self._lines("region", _LINE_STRIP, t_s, ring, RING_WIDTH_M, c.MISSION))
             for path in targets:
                 x, y = path.pose(t_s)[:2]
                 arrow = self._lines("target", _ARROW, t_s, [(x, y, 15.0), (x, y, 3.0)], 0.6, c.TARGET)
                 arrow.scale = self._make.Vector3(0.6, 1.8, 3.0)
                 markers.append(arrow)
-            for jam in jams:
-                if jam.at_s <= t_s < (np.inf if jam.until_s is None else jam.until_s):
-                    markers.append(self._marker("jammer", _SPHERE, t_s, jam.position_m, (4.0, 4.0, 4.0), JAMMER))
-                    above = (*jam.position_m[:2], jam.position_m[2] + 6.0)
-                    words = self._marker("jammer", _TEXT, t_s, above, (0.0, 0.0, 5.0), JAMMER)
-                    words.text = f"jammer {jam.power_dbm:g} dBm"
-                    markers.append(words)
+            for jam in jamming(jams, t_s):
+                markers.append(self._marker("jammer", _SPHERE, t_s, jam.position_m, (4.0, 4.0, 4.0), c.JAMMER))
+                above = (*jam.position_m[:2], jam.position_m[2] + 6.0)
+                words = self._marker("jammer", _TEXT, t_s, above, (0.0, 0.0, 5.0), c.JAMMER)
+                words.text = f"jammer {jam.power_dbm:g} dBm"
+                markers.append(words)
             yield t_s, MISSION, self._array(t_s, markers)
 
     def _links(self) -> Iterator[Timed]:
@@ -149,6 +141,12 @@ class SceneMarkers:
             ):  # fmt: skip
                 markers += self._box_markers(name, seen.t_s, boxes, colours)
             yield seen.t_s, f"/drone_{seen.drone}/boxes", self._array(seen.t_s, markers)
+
+    def _landed(self) -> Iterator[Timed]:
+        """Who comes down sees nothing from then on."""
+        for k, drone in np.argwhere(self._airborne[:-1] & ~self._airborne[1:]).tolist():
+            t_s = float(self._t_s[k + 1])
+            yield t_s, f"/drone_{drone}/boxes", self._array(t_s, [])
 
     # --- markers ---------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from sortie.perception.scene.scene_model import MARGIN_M, SceneModel
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback.canvas import Canvas
 from sortie.sim.results import palette
+from sortie.sim.results.flown_scene import CIRCLE
 from sortie.sim.results.palette import Floats
 
 TRAIL_S = 60
@@ -23,7 +24,6 @@ STEP_S = 0.5
 """Regions and targets are drawn anew so often."""
 SCALE_M = 100.0
 HOUSE = (128, 124, 120)
-_CIRCLE = np.array([(np.cos(a), np.sin(a)) for a in np.linspace(0, 2 * np.pi, 49)])
 
 
 class GroundMap:
@@ -103,7 +103,7 @@ class GroundMap:
         for t_s in drawn.tolist():
             now = np.flatnonzero((np.abs(rows["t_s"] - t_s) < 1e-6) & ~np.isnan(rows["region_radius_m"]))
             rings = [
-                self._flat((rows["region_x_m"][k], rows["region_y_m"][k]) + rows["region_radius_m"][k] * _CIRCLE)
+                self._flat((rows["region_x_m"][k], rows["region_y_m"][k]) + rows["region_radius_m"][k] * CIRCLE)
                 for k in now.tolist()
             ]
             columns = rr.LineStrips2D.columns(strips=rings).partition([len(rings)])

@@ -32,17 +32,15 @@ from sortie.sim.playback.ground_map import GroundMap
 from sortie.sim.playback.links import LinkArrows
 from sortie.sim.playback.received import ReceivedCells
 from sortie.sim.results import palette
+from sortie.sim.results.flown_scene import BOX_HEIGHT_M, CIRCLE, cars_near, houses, inside, jamming, vehicles
 from sortie.sim.results.palette import Floats
 from sortie.sim.results.sightings import Sighting
 
 TRAIL_S, TRAIL_STEP_S = 10.0, 0.5
-CARS_WITHIN_M = 160.0
-"""Moving cars are drawn up to this far from the middle of the fleet."""
 GROUND_M = 1.0
-BOX_HEIGHT_M = 1.8
 PERSON_DRAWN_M = 1.5
 """People and their boxes are drawn this wide, so that they can be seen."""
-CIRCLE = np.array([(np.cos(a), np.sin(a), 0.0) for a in np.linspace(0, 2 * np.pi, 49)])
+_RING = np.pad(CIRCLE, ((0, 0), (0, 1)))
 
 
 class Drawing:
@@ -54,7 +52,7 @@ class Drawing:
         self._groups = range(len(scenario.mission.phases_of))
         self._cameras = cameras_of(scenario.fleet)
         self._stations = {station.drone: station for station in scenario.fleet.ground}
-        self._flying = [i for i in range(scenario.fleet.drones) if i not in self._stations] or [0]
+        self._flying = vehicles(scenario.fleet)
         n = self._n
         self._links, self._received = LinkArrows(canvas, n, scenario.context.rate_hz), ReceivedCells(canvas, n)
         self._history: NDArray[np.float64] = np.zeros((0, n, 3))
@@ -81,7 +79,7 @@ class Drawing:
                 _drone(canvas, f"world/drones/{i}", colour)
                 canvas.static(f"world/trails/{i}", rr.Points3D.from_fields(radii=[-1.6], colors=[colour]))
             if i not in self._stations or self._stations[i].camera:
-                ring = rr.LineStrips3D([CIRCLE], colors=[(*colour[:3], 200)], radii=[-1.5])
+                ring = rr.LineStrips3D([_RING], colors=[(*colour[:3], 200)], radii=[-1.5])
                 canvas.static(f"world/footprints/{i}", ring)
             for name, width in (("found", 2.0), ("missed", 1.5), ("false", 1.5)):
                 canvas.static(f"world/seen/{i}/{name}", rr.Boxes3D.from_fields(radii=[-width]))
@@ -117,14 +115,12 @@ class Drawing:
                 translation=[x0, y0, 0.0],
             ),
         )
-        blocks = self._scene.town.blocks(x0, y0, x1, y1)
-        houses = np.concatenate([b.buildings for b in blocks])
-        houses = houses[_inside(houses[:, :2], self._scene.rect) & _inside(houses[:, 2:4], self._scene.rect)]
-        self._map.begin(ground, houses)
-        self._roofs_m = float(houses[:, 4].max()) if len(houses) else 0.0
-        if len(houses):
-            low, high, top = houses[:, :2], houses[:, 2:4], houses[:, 4]
-            tone = _mix((150, 112, 98), (186, 184, 180), houses[:, 5])
+        built = houses(self._scene)
+        self._map.begin(ground, built)
+        self._roofs_m = float(built[:, 4].max()) if len(built) else 0.0
+        if len(built):
+            low, high, top = built[:, :2], built[:, 2:4], built[:, 4]
+            tone = _mix((150, 112, 98), (186, 184, 180), built[:, 5])
             canvas.static(
                 "world/town/buildings",
                 rr.Boxes3D(
@@ -133,8 +129,8 @@ class Drawing:
                     colors=tone, fill_mode="solid",
                 ),
             )  # fmt: skip
-        trees = np.concatenate([b.trees for b in blocks])
-        trees = trees[_inside(trees[:, :2], self._scene.rect)]
+        trees = np.concatenate([b.trees for b in self._scene.town.blocks(x0, y0, x1, y1)])
+        trees = trees[inside(trees[:, :2], self._scene.rect)]
         if len(trees):
             crowns = np.column_stack([trees[:, :2], np.maximum(trees[:, 3] - trees[:, 2], trees[:, 2])])
             tone = _mix((48, 92, 44), (86, 122, 56), trees[:, 4])
@@ -233,8 +229,7 @@ class Drawing:
     def _cars(self, t_s: Floats, position: Floats) -> None:
         near, lengths = [], []
         for t, (x, y) in zip(t_s.tolist(), position[:, self._flying, :2].mean(axis=1).tolist(), strict=True):
-            cars = self._scene.moving_cars(t)
-            cars = cars.where((cars.x_m - x) ** 2 + (cars.y_m - y) ** 2 <= CARS_WITHIN_M**2)
+            cars = cars_near(self._scene, t, x, y)
             near.append(cars)
             lengths.append(len(cars))
         if near:
@@ -266,14 +261,14 @@ class Drawing:
 
     def _cage(self) -> list[Floats]:
         """A region of radius 1: a ring on the ground and one over the roofs, which no house hides, on posts."""
-        over = CIRCLE + np.array((0.0, 0.0, self._roofs_m + 1.0))
-        posts = [np.stack([CIRCLE[k], over[k]]) for k in range(0, len(CIRCLE) - 1, 6)]
-        return [CIRCLE, over, *posts]
+        over = _RING + np.array((0.0, 0.0, self._roofs_m + 1.0))
+        posts = [np.stack([_RING[k], over[k]]) for k in range(0, len(_RING) - 1, 6)]
+        return [_RING, over, *posts]
 
     def _jammers(self, t_s: Floats) -> None:
         """Show the jammers that are on, from the frame in which one begins or ends."""
         for t in t_s.tolist():
-            on = [jam for jam in self._jams if jam.at_s <= t < (np.inf if jam.until_s is None else jam.until_s)]
+            on = jamming(self._jams, t)
             if on != self._jamming:
                 self._jamming = on
                 places = np.array([jam.position_m for jam in on]).reshape(-1, 3)
@@ -392,11 +387,6 @@ def _flat_boxes(boxes: Boxes) -> dict[str, Any]:
         "half_sizes": half,
         "quaternions": c.about_z(boxes.yaw_rad),
     }
-
-
-def _inside(xy: Floats, rect: tuple[float, float, float, float]) -> NDArray[np.bool_]:
-    x0, y0, x1, y1 = rect
-    return np.asarray((xy[:, 0] >= x0) & (xy[:, 0] <= x1) & (xy[:, 1] >= y0) & (xy[:, 1] <= y1))
 
 
 def _mix(a: tuple[int, int, int], b: tuple[int, int, int], part: Floats) -> NDArray[np.uint8]:

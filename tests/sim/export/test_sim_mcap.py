@@ -27,7 +27,7 @@ from sortie.sim.export.bag import write_bag
 from sortie.sim.export.foxglove import layout
 from sortie.sim.export.messages import descriptors
 from sortie.sim.results import run_folder
-from sortie.sim.results.flown_scene import scene_of
+from sortie.sim.results.flown_scene import houses, scene_of
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words
@@ -210,8 +210,10 @@ def test_the_scene_shows_cars_region_links_and_boxes(bag: Bag, record: SortieRec
         assert all(len({m.id for m in rest}) == len(rest) for _, (_, *rest) in each)
         assert all(m.header.frame_id == "world" for _, all_of in each for m in all_of)
     ((town_s, town),) = markers["/scene/town"]
-    parked = scene_of(record).parked_cars
+    scene = scene_of(record)
+    parked, built = scene.parked_cars, houses(scene)
     assert (town_s, sum(m.ns == "parked" for m in town)) == (0.0, len(parked))
+    assert [m.scale.z for m in town if m.ns == "buildings"] == pytest.approx(built[:, 4].tolist())
     first = next(m for m in town if m.ns == "parked")
     assert (first.pose.position.x, first.scale.x, first.scale.y) == (
         parked.x_m[0],
@@ -243,6 +245,17 @@ def test_a_jammer_is_shown_while_it_is_on(tmp_path: Path) -> None:
     shown = [(t, m.markers) for t, m in read_bag(tmp_path / "jam" / "jam.mcap")["/scene/mission"]]
     on = [t * 1e-9 for t, markers in shown if any(m.ns == "jammer" for m in markers)]
     assert (on[0], on[-1], len(on)) == (1.0, 1.8, 5)
+
+
+def test_the_boxes_of_a_drone_that_is_down_are_cleared(tmp_path: Path) -> None:
+    down = "events=[{kind: drone_lost, at_s: 1, drone: 2}]"
+    lost = run_sortie(example("duration_s=2", "perception.detector=surrogate", down))
+    write_bag(lost, tmp_path / "lost", BEGIN_NS)
+    shown = read_bag(tmp_path / "lost" / "lost.mcap")["/drone_2/boxes"]
+    states = lost.tables["states"].to_pylist()
+    down_s = next(s["t_s"] for s in states if s["drone"] == 2 and not s["airborne"])
+    assert len(shown[-2][1].markers) > 1
+    assert (shown[-1][0] * 1e-9, len(shown[-1][1].markers)) == (pytest.approx(down_s), 1)
 
 
 def test_the_layout_names_topics_of_the_bag_alone(bag: Bag, path: Path) -> None:
