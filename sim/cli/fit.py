@@ -87,26 +87,27 @@ def fit_errors(
 
     with user_errors():
         if boxes is Boxes.surrogate:
-            from sortie.perception.surrogate.errors import moments
             from sortie.perception.surrogate.model import SHIPPED
+        else:
+            from sortie.perception.network.detector import SHIPPED_WEIGHTS as SHIPPED
+        path = weights or SHIPPED
+        target = out_file or beside(path)
+        ensure_files(target)
+        if boxes is Boxes.surrogate:
+            from sortie.perception.surrogate.errors import moments
 
-            path = weights or SHIPPED
             found = moments(path, "fit", towns)
             made = {"command": f"sortie fit errors surrogate --towns {towns}", "boxes_of": path.name}
         else:
             from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
             from sortie.perception.network.checkpoint import load_weights
-            from sortie.perception.network.detector import SHIPPED_WEIGHTS
             from sortie.perception.training.boxes_alone import THRESHOLD, boxes_alone, moments_of
 
-            path = weights or SHIPPED_WEIGHTS
             net = load_weights(path)
             split = make_split(Benchmark(bench_seed, geometry=net.config.geometry), "validation", bench_dir)
             frames = load_frames(split)
             found = moments_of(frames, boxes_alone(net, frames, THRESHOLD))
             made = {"command": f"sortie fit errors torch --bench-seed {bench_seed}", "boxes_of": path.name}
-        target = out_file or beside(path)
-        ensure_files(target)
         model = box_errors.fit(found)
         fitted = box_errors.calibration(model, found)
         write_text(target, errors_text(model, made | {"boxes": fitted.boxes}))

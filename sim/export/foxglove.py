@@ -11,18 +11,13 @@ from sortie.sim.results.palette import drone_colour
 LAYOUT = "foxglove_layout.json"
 
 
-def layout(drones: int, *, boxes_of: int = 0) -> dict[str, Any]:
-    """The layout for a fleet of so many drones; import it in Foxglove by *Import from file*.
-
-    Args:
-        drones: how many there are, 1 at least.
-        boxes_of: whose detections the 3-D panel shows at first.
-    """
+def layout(drones: int) -> dict[str, Any]:
+    """The layout for a fleet of so many drones; import it in Foxglove by *Import from file*. It shows the boxes of drone 0."""
     made: dict[str, Any] = json.loads((files("sortie.sim") / "export" / LAYOUT).read_text("utf-8"))
     panels = made["configById"]
     for i in range(drones):
         colour = "#{:02x}{:02x}{:02x}".format(*drone_colour(i)[:3])
-        panels["3D!fleet"]["topics"][f"/drone_{i}/boxes"] = {"visible": i == boxes_of}
+        panels["3D!fleet"]["topics"][f"/drone_{i}/boxes"] = {"visible": i == 0}
         panels["3D!fleet"]["topics"][f"/drone_{i}/pose"] = {"visible": False}
         panels["map!fleet"]["topicColors"][f"/drone_{i}/fix"] = colour
         panels["Plot!battery"]["paths"].append(

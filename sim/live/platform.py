@@ -44,10 +44,8 @@ class MavlinkLink:
         Raises:
             RunError: an address that is none, or one that is taken.
         """
-        from sortie.fleet.logs.mavlink import (  # pymavlink is loaded for a drone with a vehicle alone
-            Companion,
-            Listener,
-        )
+        # pymavlink is loaded for a drone with a vehicle alone
+        from sortie.fleet.logs.mavlink import Companion, Listener
 
         waits, host, port = parse_address(address)
         self.address, self._origin = address, origin

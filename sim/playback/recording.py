@@ -23,7 +23,7 @@ from sortie.sim.playback.charts import Charts
 from sortie.sim.playback.comparison import comparison, roots
 from sortie.sim.playback.layout import blueprint, legend
 from sortie.sim.playback.scene import Drawing
-from sortie.sim.results.flown_scene import scene_of
+from sortie.sim.results.flown_scene import scene_of, vehicles
 from sortie.sim.results.record import Recorder, SortieRecord
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.sightings import sightings
@@ -136,8 +136,7 @@ def new_file(path: Path, layout: rrb.Blueprint, application: str = APPLICATION) 
 
 def spread_m(record: SortieRecord) -> float:
     """How far the farthest drone flies from the middle of those in the air, in 19 of 20 frames."""
-    n, stations = record.scenario.fleet.drones, {station.drone for station in record.scenario.fleet.ground}
-    flying = [i for i in range(n) if i not in stations]
+    n, flying = record.scenario.fleet.drones, vehicles(record.scenario.fleet)
     farthest = []
     for batch in batches(record.tables, "states", ["x_m", "y_m", "airborne"]):
         x, y, up = (column.to_numpy(zero_copy_only=False).reshape(-1, n)[:, flying] for column in batch.columns)

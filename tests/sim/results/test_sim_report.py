@@ -252,6 +252,14 @@ def test_what_arrived_is_told_second_by_second(eventful: SortieRecord) -> None:
     assert (3, 7) not in told  # it is lost by then
 
 
+def test_what_is_delivered_in_all_seconds_is_the_outcome_s_also_of_payloads_that_came_in_part() -> None:
+    weak = ["radio.framing=tiles", "radio.tx_power_dbm=-4", "radio.bandwidth_mhz=20"]
+    flown = run_sortie(example("duration_s=3.5", "perception.detector=none", *weak))
+    result, (until_s, mbps) = outcome(flown), report_figures.delivered_mbps(flown).T
+    assert any(fate.startswith("partial") for fate in result["payload_fates"])
+    assert (mbps * np.diff(until_s, prepend=0.0)).sum() / 8e-6 == pytest.approx(result["bytes"]["data_delivered"])
+
+
 def test_the_command_writes_it_into_the_run(record: SortieRecord, tmp_path: Path) -> None:
     run_folder.save(record, tmp_path / "run")
     said = CliRunner().invoke(app, ["report", str(tmp_path / "run")])
