@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import doctest
 import gc
 import json
 import re
@@ -21,7 +20,6 @@ from threadpoolctl import threadpool_info
 from typer.testing import CliRunner
 
 import sortie
-from sortie import _api, _run
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
@@ -75,15 +73,6 @@ def test_everything_public_is_there_documented_and_listed() -> None:
         assert getattr(sortie, name).__doc__ or name == "__version__"
     with pytest.raises(AttributeError, match="module 'sortie' has no attribute 'fyl'"):
         sortie.fyl  # noqa: B018
-
-
-@pytest.mark.parametrize("module", [_api, _run], ids=lambda m: m.__name__)
-def test_the_examples_of_the_docstrings_run(module: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    names = {"sortie": sortie, "folder": tmp_path}
-    failed, tried = doctest.testmod(module, extraglobs=names, verbose=False)  # type: ignore[arg-type]
-    assert tried
-    assert not failed
 
 
 # --- what it gives -------------------------------------------------------------------------------

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import doctest
 from dataclasses import asdict
 
 import pytest
 
-from sortie.radio import AirSettings, BurstSettings, air
+from sortie.radio import AirSettings, BurstSettings
 from sortie.scenarios.schema import Radio
 
 ELSEWHERE = {"framing", "path_loss_params", "link_params"}
@@ -45,7 +44,3 @@ def test_choices_of_the_schema_are_those_of_the_settings() -> None:
 def test_an_unknown_choice_is_refused(values: dict[str, object], what: str) -> None:
     with pytest.raises(ValueError, match=what):
         AirSettings.of(values)
-
-
-def test_the_example_of_air_runs() -> None:
-    assert doctest.testmod(air).failed == 0
