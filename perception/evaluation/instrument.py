@@ -15,7 +15,6 @@ from sortie.perception.evaluation.condition import CellsBy
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
 from sortie.perception.geometry import Geometry
 from sortie.perception.network.checkpoint import load_weights
-from sortie.perception.network.codebook import Codebook
 from sortie.perception.network.decode import decode
 from sortie.perception.network.fusion.base import Fusion, PerCell
 from sortie.perception.network.fusion.disconet import DiscoNet
@@ -32,24 +31,11 @@ BATCH = 5
 class CarNetInstrument:
     """A network on frames that carry `images` uint8 [n, d, 4, 256, 256]."""
 
-    def __init__(
-        self,
-        net: CarNet,
-        device: torch.device = CPU,
-        fusion_params: Params | None = None,
-        codebook: Codebook | None = None,
-        code_bytes: int = 0,
-    ) -> None:
-        """Args:
-        fusion_params: change how the network's fusion mixes (`Fusion.tune`).
-        codebook: peers send cells as its codes of `code_bytes` bytes; None sends features.
-        """
+    def __init__(self, net: CarNet, device: torch.device = CPU, fusion_params: Params | None = None) -> None:
+        """Args: `fusion_params` change how the network's fusion mixes (`Fusion.tune`)."""
         params = fusion_params or {}
         net.fusion.tune(**params)
         self.fingerprint = fingerprint(net) + "".join(f" {k}={v!r}" for k, v in sorted(params.items()))
-        if codebook is not None:
-            self.fingerprint += f" codes {codebook.digest} {code_bytes}"
-        self._codebook, self._code_bytes = codebook, code_bytes
         self.geometry: Geometry = net.config.geometry
         self.fused_cells = net.config.fused_cells
         """Cells along a side of the maps that are fused."""
@@ -70,11 +56,9 @@ class CarNetInstrument:
     def look(self, frames: FleetFrames, frame: int) -> CarNetView:
         images = torch.from_numpy(np.ascontiguousarray(frames.images[frame]))  # type: ignore[attr-defined]
         est = frames.est_pose[frame] - np.array([*frames.est_pose[frame].mean(axis=0)[:2], 0.0])
-        features = self._net.encoder(images.to(self._device))
-        read = None
-        if self._codebook is not None:
-            read = torch.stack([self._codebook.read(one.cpu(), self._code_bytes) for one in features]).to(self._device)
-        return CarNetView(self._net, features, torch.from_numpy(est).float().to(self._device), read)
+        return CarNetView(
+            self._net, self._net.encoder(images.to(self._device)), torch.from_numpy(est).float().to(self._device)
+        )
 
 
 def fingerprint(net: CarNet) -> str:

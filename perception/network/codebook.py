@@ -48,13 +48,6 @@ class Codebook:
         """The most bytes that it gives a cell."""
         return len(self.stages)
 
-    @property
-    def digest(self) -> str:
-        """A hash of all of it."""
-        whole = hashlib.blake2b(self.encoder.encode(), digest_size=8)
-        whole.update(self.stages.contiguous().numpy().tobytes())
-        return whole.hexdigest()
-
     def encode(self, cells: Tensor, length: int) -> Tensor:
         """Codes uint8 [n, length] of cells float32 [n, 80].
 

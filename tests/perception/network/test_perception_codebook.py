@@ -97,7 +97,6 @@ def test_the_file_is_read_as_it_was_written_and_belongs_to_its_network(tmp_path:
     read = load_codebook(path, net)
     torch.testing.assert_close(read.stages, codebook.stages)
     assert (read.encoder, read.rectified, read.longest) == (codebook.encoder, True, 3)
-    assert read.digest == codebook.digest != drawn(seed=1).digest
     other = CarNet(ModelConfig()).eval()
     with pytest.raises(InputError, match="fitted to another encoder than the weights'"):
         load_codebook(path, other)
