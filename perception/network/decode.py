@@ -7,6 +7,9 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.geometry import FULL, HEAD_PX, Geometry
+from sortie.perception.joining import NMS_IOU, Pose
+from sortie.perception.metrics.ap import suppress
+from sortie.perception.types import Boxes
 
 REFERENCE_SIZE_M = (4.5, 1.85)
 """Length and width for which the size head says 0."""
@@ -38,3 +41,8 @@ def decode(out: Tensor, threshold: float, geometry: Geometry = FULL, limit: int 
     size = [REFERENCE_SIZE_M[i] * values[2 + i].clamp(-1, 1).exp() for i in (0, 1)]
     yaw = 0.5 * torch.atan2(values[4], values[5])
     return torch.stack([x, y, *size, yaw, score], dim=1)
+
+
+def placed_boxes(out: Tensor, pose: Pose, threshold: float, geometry: Geometry = FULL) -> Boxes:
+    """The boxes of one head output in the world by its drone's pose, suppressed, best first; as `decode`."""
+    return suppress(Boxes.placed(decode(out, threshold, geometry).numpy(), pose), NMS_IOU)

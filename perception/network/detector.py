@@ -24,14 +24,13 @@ from sortie.perception import budget
 from sortie.perception.errors import InputError
 from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.ground_truth import ground_truth
-from sortie.perception.joining import NMS_IOU, EgoSources, Pose, SourceBoxes, joined_many, sendable, source_of
+from sortie.perception.joining import EgoSources, Pose, SourceBoxes, joined_many, sendable, source_of
 from sortie.perception.lateness import weighed
-from sortie.perception.metrics.ap import suppress
 from sortie.perception.network.bev import lift
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.codebook import Codebook, load_codebook
 from sortie.perception.network.codebook import beside as codebook_beside
-from sortie.perception.network.decode import decode
+from sortie.perception.network.decode import placed_boxes
 from sortie.perception.network.fusion.base import Shares, takes_part
 from sortie.perception.network.fusion.own import OwnFusion
 from sortie.perception.network.fusion.registry import FUSIONS
@@ -276,8 +275,7 @@ class TorchDetector:
 
     def _place(self, out: Tensor, pose: Pose) -> Boxes:
         """The boxes of a head's output [planes, 128, 128] in the world, suppressed."""
-        local = decode(out, self._config.score_threshold).numpy()
-        return suppress(Boxes.placed(local, pose), NMS_IOU)
+        return placed_boxes(out, pose, self._config.score_threshold)
 
     def _sent(self, share: Share, known: Known) -> Tensor:
         """[1, 64, 64] bool: the cells of the share's capture that its budget let through."""

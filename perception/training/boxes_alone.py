@@ -7,16 +7,12 @@ from collections.abc import Sequence
 import torch
 
 from sortie.perception.benchmark.dataset import Frames
-from sortie.perception.joining import NMS_IOU, Pose
-from sortie.perception.metrics.ap import suppress
-from sortie.perception.network.decode import decode
+from sortie.perception.joining import Pose
+from sortie.perception.network.decode import placed_boxes
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
 from sortie.perception.training.box_errors import Moment, errors_of
 from sortie.perception.types import Boxes
-
-THRESHOLD = 0.1
-"""The score from which a sortie's boxes count (`perception.score_threshold`)."""
 
 
 def boxes_alone(net: CarNet, frames: Frames, threshold: float) -> list[list[Boxes]]:
@@ -25,8 +21,9 @@ def boxes_alone(net: CarNet, frames: Frames, threshold: float) -> list[list[Boxe
     with torch.inference_mode():
         for images, poses in zip(frames.images, frames.est_pose, strict=True):
             heads = net.head(net.spread(net.encoder(torch.from_numpy(images))))
-            local = [decode(head, threshold, geometry).numpy() for head in heads]
-            out.append([suppress(Boxes.placed(b, _pose(p)), NMS_IOU) for b, p in zip(local, poses.tolist(), strict=True)])  # fmt: skip
+            out.append(
+                [placed_boxes(h, _pose(p), threshold, geometry) for h, p in zip(heads, poses.tolist(), strict=True)]
+            )
     return out
 
 

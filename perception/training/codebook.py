@@ -15,6 +15,7 @@ from scipy.cluster.vq import kmeans2
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_split
+from sortie.perception.budget import payload_bytes
 from sortie.perception.files import replacing
 from sortie.perception.geometry import CHANNELS
 from sortie.perception.network.codebook import ENTRIES, Codebook, encoder_digest, save_codebook
@@ -122,11 +123,12 @@ def card(name: str, facts: dict[str, Any]) -> str:
         f"sortie fit codebook --weights {facts['weights']} --out {name} --stages {facts['stages']} "
         f"--scenes {facts['scenes']} --iterations {facts['iterations']} --seed {facts['seed']}"
     )
-    rows = "\n".join(f"| {k} | {160 / k:.0f} | {100 * left:.1f} % |" for k, left in facts["unexplained"].items())
+    whole = payload_bytes(1)
+    rows = "\n".join(f"| {k} | {whole / k:.0f} | {100 * left:.1f} % |" for k, left in facts["unexplained"].items())
     return f"""# {name}
 
 Codebook of the features of `{facts["weights"]}`: {facts["stages"]} stages of {ENTRIES} entries with {CHANNELS} numbers (float16).
-A cell of 160 B becomes one byte a stage; the first bytes alone are a coarser code of the same cell.
+A cell of {whole} B becomes one byte a stage; the first bytes alone are a coarser code of the same cell.
 
 Made by `{command}`.
 

@@ -101,12 +101,13 @@ def fit_errors(
         else:
             from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
             from sortie.perception.network.checkpoint import load_weights
-            from sortie.perception.training.boxes_alone import THRESHOLD, boxes_alone, moments_of
+            from sortie.perception.training.boxes_alone import boxes_alone, moments_of
+            from sortie.scenarios.schema import Perception
 
             net = load_weights(path)
             split = make_split(Benchmark(bench_seed, geometry=net.config.geometry), "validation", bench_dir)
             frames = load_frames(split)
-            found = moments_of(frames, boxes_alone(net, frames, THRESHOLD))
+            found = moments_of(frames, boxes_alone(net, frames, Perception().score_threshold))
             made = {"command": f"sortie fit errors torch --bench-seed {bench_seed}", "boxes_of": path.name}
         model = box_errors.fit(found)
         fitted = box_errors.calibration(model, found)

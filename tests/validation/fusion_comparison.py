@@ -16,10 +16,9 @@ from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.evaluation.selection import link_bytes
-from sortie.perception.joining import NMS_IOU, Pose, Rule, SourceBoxes, joined, sendable
-from sortie.perception.metrics.ap import suppress
+from sortie.perception.joining import Pose, Rule, SourceBoxes, joined, sendable
 from sortie.perception.metrics.bootstrap import Difference, compare
-from sortie.perception.network.decode import decode
+from sortie.perception.network.decode import placed_boxes
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.fusion.traffic import boxes_of
 from sortie.perception.network.inference import folded
@@ -60,10 +59,7 @@ class LateInstrument:
             images = torch.from_numpy(np.ascontiguousarray(frames.images[frame]))  # type: ignore[attr-defined]
             outs = self._net.head(self._net.encoder(images))
         poses = [(float(x), float(y), float(yaw)) for x, y, yaw in frames.est_pose[frame]]
-        found = [
-            suppress(Boxes.placed(decode(out, 0.01, self.geometry).numpy(), pose), NMS_IOU)
-            for out, pose in zip(outs, poses, strict=True)
-        ]
+        found = [placed_boxes(out, pose, 0.01, self.geometry) for out, pose in zip(outs, poses, strict=True)]
         self.sent.append(sum(len(sendable(boxes)) for boxes in found) * (len(found) - 1))
         return LateView(found, poses, self._rule)
 

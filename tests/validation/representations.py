@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import stats
 from stored import Column, Table
 
 from sortie.perception import budget
@@ -23,25 +24,25 @@ from sortie.perception.evaluation.evaluate import Settings, exchanges, frame_key
 from sortie.perception.evaluation.instrument import CarNetView
 from sortie.perception.geometry import CELLS, Geometry
 from sortie.perception.ground_truth import ground_truth
-from sortie.perception.joining import NMS_IOU, EgoSources, Rule, joined_many, source_of
-from sortie.perception.metrics.ap import Matched, average_precision, match, suppress
+from sortie.perception.joining import EgoSources, Rule, joined_many, source_of
+from sortie.perception.metrics.ap import Matched, average_precision, match
 from sortie.perception.metrics.bootstrap import rank
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.codebook import Codebook, beside, load_codebook
-from sortie.perception.network.decode import decode
+from sortie.perception.network.decode import placed_boxes
 from sortie.perception.network.detector import SHIPPED_WEIGHTS
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
 from sortie.perception.training.box_errors import Calibration, Errors, Moment, calibration
 from sortie.perception.training.boxes_alone import boxes_alone, moments_of
-from sortie.perception.types import Boxes, Capture, Share
+from sortie.perception.types import Capture, Share
 from sortie.perception.uncertainty import BoxErrors, load_errors
 from sortie.perception.uncertainty import beside as errors_beside
 from sortie.scenarios.intervals import percentile_interval, resamples
+from sortie.scenarios.schema import Perception
 
 PLAN = Path(__file__).with_name("representations.toml")
-TAU = 0.1
-"""`perception.score_threshold`."""
+TAU = Perception().score_threshold
 Unit = list[Matched]
 """One for each ego of each frame."""
 
@@ -147,10 +148,7 @@ def _boxes(
 ) -> Iterator[tuple[Way, Unit, float]]:
     """Every way to share boxes: what each ego of a frame is scored by, and the bytes that an ego receives on average."""
     captures = [_capture(d, *pair) for d, pair in enumerate(zip(frames.true_pose[f], frames.est_pose[f], strict=True))]
-    found = [
-        suppress(Boxes.placed(decode(head, TAU, geometry).numpy(), c.est_pose), NMS_IOU)
-        for head, c in zip(heads, captures, strict=True)
-    ]
+    found = [placed_boxes(head, c.est_pose, TAU, geometry) for head, c in zip(heads, captures, strict=True)]
     truths = [ground_truth(frames.cars[f], frames.true_pose[f, c.drone]) for c in captures]
     for way in (SILENCE, *BOX_WAYS):
         sent, units = 0, []
@@ -289,7 +287,8 @@ def calibration_table(found: Mapping[str, tuple[BoxErrors, Sequence[Moment]]], a
     return Table([Column("boxes of"), Column("which"), Column("boxes", ",d"), *shares], rows, about)
 
 
-NORMAL = (0.6827, 0.9545, 0.3935, 0.8647)
+NORMAL = [float(stats.chi2.cdf(deviations**2, axes)) for axes in (1, 2) for deviations in (1, 2)]
+"""Of normal errors, the shares that `Calibration` has."""
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
@@ -343,7 +342,7 @@ def tables(picture: Path, root: Path) -> dict[str, Table]:
     of_surrogate = load_errors(errors_beside(SHIPPED), SHIPPED.name), moments(SHIPPED, "held-out", 40)
     about = f"{len(frames)} frames of the test split of benchmark seed {plan.bench_seed}, five egos each"
     losses = [
-        [r.way.label, r.way.rho, 160.0 / r.way.code_bytes, difference(rows, r.way.label, f"features, ρ = {r.way.rho:g}")]
+        [r.way.label, r.way.rho, budget.payload_bytes(1) / r.way.code_bytes, difference(rows, r.way.label, f"features, ρ = {r.way.rho:g}")]
         for r in rows
         if r.way.code_bytes
     ]  # fmt: skip
