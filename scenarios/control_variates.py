@@ -126,7 +126,8 @@ def widened(found: Estimate) -> Estimate:
     """An interval as it is read where flying stops as soon as it is narrow enough.
 
     Such a stop comes too early where the spread happens to be small, so that plain intervals cover less than they say, by an
-    amount that falls as 1 / units. The factor was chosen by simulation (`docs/results/price.md` shows the cover).
+    amount that falls as 1 / units. The factor was chosen by simulation; `make figures FIGURE=half_width` measures the cover with
+    it, by other random numbers (`docs/results/price.md`).
 
     Example:
         >>> widened(Estimate(0.0, -1.0, 1.0, 12)).half_width

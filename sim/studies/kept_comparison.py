@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sortie.policies.registry import resolve
-from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError, ensure_files
 from sortie.sim.identity import code_version, name_of, own_files
 from sortie.sim.studies.compare import Compared, Contender, Gain
@@ -41,12 +40,8 @@ def identity(contenders: Sequence[Contender], pilot: int) -> str:
     parts = [FORMAT, code_version(), pilot]
     for label, scenario, function in contenders:
         named = None if function is None else name_of(function)
-        parts += [label, named, _plain(scenario), sorted(own_files(scenario, function).items())]
+        parts += [label, named, scenario.model_dump_json(), sorted(own_files(scenario, function).items())]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
-
-
-def _plain(scenario: Scenario) -> str:
-    return scenario.model_dump_json()
 
 
 @contextmanager
