@@ -141,10 +141,12 @@ def rank(
     resolved = {p: _policy(asked, p) if f is None else f for p, f in decides.items()}
     flights: Flights = {}
     verified: dict[str, Verified] = {}
-    taken = tuple(p for p in decides if decides[p] is None and p in stored.flights) if stored is not None else ()
+    taken = () if stored is None else tuple(p for p in decides if decides[p] is None and p in stored.flights)
     if stored is not None:
         flights |= {p: stored.flights[p] for p in taken}
         verified |= {p: stored.verified[p] for p in taken}
+    if not taken:
+        stored = None  # nothing of it is shown, so that it need not be this version's
     named = [p for p, f in decides.items() if f is None and p not in flights]
     count = len(asked.conditions)
     if named:

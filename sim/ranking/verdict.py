@@ -22,7 +22,7 @@ class Verified:
     broken: tuple[str, ...]
     """The names of the rules that do not hold."""
     contract: str
-    """Whether the decisions keep the contract: `proved`, `searched` (some of all views), `drawn` (random views) or `refuted`."""
+    """Whether the decisions keep the contract: one of `WORDS`; `searched` were some of all views, `drawn` random ones."""
     monotone: str
     """Whether older descriptors never raise what is sent: likewise."""
 

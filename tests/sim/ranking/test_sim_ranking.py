@@ -314,12 +314,12 @@ def test_own_flights_are_all_that_a_ranking_costs(
     assert ranking.ranked.stale
     assert "flies otherwise" in str(ranking.summary())
     slower = ranking.ranked.speed
-    assert slower == pytest.approx(1e3 * (worked.values["policy_eval_us.p50"] or 0), rel=9), (
-        "as this machine's own flight"
-    )
+    assert 0.1 < slower / (1e3 * (worked.values["policy_eval_us.p50"] or 0)) < 10, "as this machine's own flight"
     assert ranking.ranked.decision_us("silence") == pytest.approx(
         slower * ranking.ranked.row("silence").figures["policy_eval_us.p50"].mean
     )
+    alone = sortie.rank("mine.py:boxes", suite="small.yaml", against=[], folder="out")
+    assert (alone.ranked.stored, alone.ranked.stale) == (None, False), "stored results of which nothing is shown"
 
 
 def test_the_command_prints_keeps_and_says_by_its_exit_code_what_failed(here: list[int]) -> None:
