@@ -141,10 +141,8 @@ def compare(
                 if first is None:
                     continue
                 pairs = pair_up([first], [record], mission=mission)
-                if not all(any(m.truths for m in arm) for arm in pairs[:2]):
-                    continue
-                gains[name] = average_precision(pairs[1]) - average_precision(pairs[0])
-                if len(seeds) == 1:
+                gains[name] = gain_between(pairs[0], pairs[1])
+                if gains[name] is not None and len(seeds) == 1:
                     d = bootstrap(*pairs)
                     count = len(set(pairs[2]))
                     within.append(Gain(label, f"ap50.{name}", d.delta, d.low, d.high, "instants of one sortie", count))
@@ -173,6 +171,13 @@ def _blind(its: Compared, first: Compared, area: str) -> float | None:
     """AP minus the first policy's, with drones that left the air counted as blind under both."""
     ap, before = (f.outcome["ap50"]["grounded_blind"][area] for f in (its, first))
     return None if ap is None or before is None else ap - before
+
+
+def gain_between(first: Sequence[Matched], other: Sequence[Matched]) -> float | None:
+    """AP@0.5 of one arm's fusions minus that of the first arm's; None where there was nothing to find."""
+    if not all(any(m.truths for m in arm) for arm in (first, other)):
+        return None
+    return average_precision(other) - average_precision(first)
 
 
 def over_sorties(gains: Sequence[float]) -> Estimate:
