@@ -31,12 +31,12 @@ from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.codebook import Codebook, load_codebook
 from sortie.perception.network.codebook import beside as codebook_beside
 from sortie.perception.network.decode import placed_boxes
-from sortie.perception.network.fusion.base import Shares, takes_part
+from sortie.perception.network.fused import Peer, fused_map
+from sortie.perception.network.fusion.base import Shares
 from sortie.perception.network.fusion.own import OwnFusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.inference import folded
 from sortie.perception.network.memory import keep_freed
-from sortie.perception.network.warp import arriving, rows, support
 from sortie.perception.scene.render import Renderer, views_shape
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Bytes
@@ -335,56 +335,13 @@ class TorchDetector:
         known: Known,
     ) -> Tensor | None:
         """The head's output after fusion; None where no peer takes part in any cell."""
-        # relative to the ego, so that float32 keeps millimetres kilometres from the origin
-        x, y, yaw = ego.est_pose
-        poses = [*(self._map_pose(s, now) for s in maps), *(c.est_pose for c in silent)]
-        there = torch.tensor([(px - x, py - y, pyaw) for px, py, pyaw in poses])
-        config = self._net.config
-        under = support(torch.tensor((0.0, 0.0, yaw)), there, config.fused_cell_m, config.fused_cells)
-        nothing = torch.zeros(CELLS**2, dtype=torch.bool)
-        sent = self._net.sent(torch.stack([*(self._sent(s, known).flatten() for s in maps), *[nothing] * len(silent)]))
-        weights, arrived = arriving(under, sent)
-        weight = torch.tensor([[*(s.weight for s in maps), *[1.0] * len(silent)]])
-        part = takes_part(arrived[None], under.inside[None], weight, self._config.unsent_cells)
-        if not bool(part[:, 1:].any()):
-            return None
-        theirs = [self._map(s, known).result() for s in maps]
-        theirs += [torch.zeros(config.fused_channels, config.fused_cells, config.fused_cells)] * len(silent)
-        tables = [each.permute(1, 2, 0).flatten(0, 1) for each in theirs]
-        taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), strict=True))
-
-        def said(at: Tensor) -> Tensor:
-            moved = torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
-            return self._net.aligned(moved, under.offset.flatten(1, 2)[:, at], under.turn)
-
-        if not ego.looked:
-            return self._head(self._fuse_without_own(said, part[0, 1:], arrived, weight[0]))
-        own = known[ego].maps.result()
-        weight = self._net.fusion.weigh(own[None], torch.stack(theirs)[None], weight)
-        fused = self._net.fusion.fuse(own, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
-        return self._head(fused)
-
-    def _fuse_without_own(
-        self, said: Callable[[Tensor], Tensor], part: Tensor, arrived: Tensor, weight: Tensor
-    ) -> Tensor:
-        """The fused map [1, c, h, w] of peers alone: in each cell the one that counts most takes the ego's place.
-
-        Args:
-            said: as `features` of `Fusion.fuse`.
-            part, arrived: [k, h, w] which peer takes part in which cell, and which cells it sent; weight: [k].
-        """
-        k, height, width = part.shape
-        lead = (weight[:, None, None] * arrived).argmax(dim=0)  # of equals the first
-        own = said(torch.arange(height * width)).view(k, height, width, -1)
-        own = own.gather(0, lead[None, ..., None].expand(1, -1, -1, own.shape[-1]))[0].permute(2, 0, 1)
-        own = own * arrived.any(dim=0)
-        follows = part & (torch.arange(k)[:, None, None] != lead)
-        if not bool(follows.any()):
-            return own[None]
-        there = torch.cat([torch.ones_like(part[:1]), follows])
-        weights = F.pad(weight / weight.max(), (1, 0), value=1.0)
-        fused: Tensor = self._net.fusion.fuse(own, said, there, weights)
-        return fused
+        peers = [
+            Peer(self._map_pose(s, now), s.weight, self._map(s, known).result(), self._sent(s, known)) for s in maps
+        ]
+        peers += [Peer(capture.est_pose, 1.0) for capture in silent]
+        own = known[ego].maps.result() if ego.looked else None
+        fused = fused_map(self._net, ego.est_pose, own, peers, self._config.unsent_cells)
+        return None if fused is None else self._head(fused)
 
     def _map(self, share: Share, known: Known) -> Future[Tensor]:
         """The map of a share as it is fused."""

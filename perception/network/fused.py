@@ -1,0 +1,85 @@
+"""One ego's fused map from its own map and its peers': a function of tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from sortie.perception.geometry import CELLS
+from sortie.perception.joining import Pose
+from sortie.perception.network.fusion.base import UnsentCells, takes_part
+from sortie.perception.network.model import CarNet
+from sortie.perception.network.warp import arriving, rows, support
+
+
+class Peer(NamedTuple):
+    """What is there of one peer."""
+
+    pose: Pose
+    """x, y, yaw that place its map in the world."""
+    weight: float
+    """Of the link, 0 … 1."""
+    map: Tensor | None = None
+    """[channels, n, n] on its own grid, as it is fused; None of a peer that sent none: zeros."""
+    sent: Tensor | None = None
+    """[64, 64] bool: the cells that came; None with a `map` of None."""
+
+
+def fused_map(net: CarNet, pose: Pose, own: Tensor | None, peers: Sequence[Peer], unsent: UnsentCells) -> Tensor | None:
+    """The fused map [1, channels, n, n] on the ego's grid; None where no peer takes part in any cell.
+
+    Args:
+        pose: x, y, yaw of the ego, ENU.
+        own: [channels, n, n]; None of an ego without a look of its own, whose peers are fused alone.
+        peers: one or more.
+        unsent: as for `takes_part`.
+    """
+    # relative to the ego, so that float32 keeps millimetres kilometres from the origin
+    x, y, yaw = pose
+    there = torch.tensor([(px - x, py - y, pyaw) for (px, py, pyaw), *_ in peers])
+    config, nothing = net.config, torch.zeros(CELLS**2, dtype=torch.bool)
+    under = support(torch.tensor((0.0, 0.0, yaw)), there, config.fused_cell_m, config.fused_cells)
+    sent = net.sent(torch.stack([nothing if p.sent is None else p.sent.flatten() for p in peers]))
+    weights, arrived = arriving(under, sent)
+    weight = torch.tensor([[p.weight for p in peers]])
+    part = takes_part(arrived[None], under.inside[None], weight, unsent)
+    if not bool(part[:, 1:].any()):
+        return None
+    zeros = torch.zeros(config.fused_channels, config.fused_cells, config.fused_cells)
+    theirs = [zeros if p.map is None else p.map for p in peers]
+    tables = [each.permute(1, 2, 0).flatten(0, 1) for each in theirs]
+    taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), strict=True))
+
+    def said(at: Tensor) -> Tensor:
+        moved = torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
+        return net.aligned(moved, under.offset.flatten(1, 2)[:, at], under.turn)
+
+    if own is None:
+        return _without_own(net, said, part[0, 1:], arrived, weight[0])
+    weight = net.fusion.weigh(own[None], torch.stack(theirs)[None], weight)
+    return net.fusion.fuse(own, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
+
+
+def _without_own(
+    net: CarNet, said: Callable[[Tensor], Tensor], part: Tensor, arrived: Tensor, weight: Tensor
+) -> Tensor:
+    """Peers alone: in each cell the one that counts most takes the ego's place.
+
+    Args:
+        said: as `features` of `Fusion.fuse`.
+        part, arrived: [k, h, w] which peer takes part in which cell, and which cells it sent; weight: [k].
+    """
+    k, height, width = part.shape
+    lead = (weight[:, None, None] * arrived).argmax(dim=0)  # of equals the first
+    own = said(torch.arange(height * width)).view(k, height, width, -1)
+    own = own.gather(0, lead[None, ..., None].expand(1, -1, -1, own.shape[-1]))[0].permute(2, 0, 1)
+    own = own * arrived.any(dim=0)
+    follows = part & (torch.arange(k)[:, None, None] != lead)
+    if not bool(follows.any()):
+        return own[None]
+    there = torch.cat([torch.ones_like(part[:1]), follows])
+    return net.fusion.fuse(own, said, there, F.pad(weight / weight.max(), (1, 0), value=1.0))
