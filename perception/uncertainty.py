@@ -22,7 +22,6 @@ Floats = NDArray[np.float64]
 Pose = tuple[float, float, float]
 TERMS = 5
 _FARTHEST_M = 150.0
-_SUFFIX = ".errors.json"
 _LEAST_M, _MOST_M = 0.05, 5.0
 """Bounds of a standard deviation, for scores and distances at which nothing was fitted."""
 
@@ -80,16 +79,6 @@ def terms(score: NDArray[np.floating], distance_m: NDArray[np.floating]) -> Floa
     p = np.clip(np.asarray(score, np.float64), 0.02, 0.98)
     logit, far = np.log(p / (1.0 - p)), np.minimum(np.asarray(distance_m, np.float64), _FARTHEST_M) / 100.0
     return np.stack([np.ones_like(logit), logit, logit * logit, far, far * far], axis=1)
-
-
-def beside(weights: Path) -> Path:
-    """Where the errors of a weights file, or of a calibration, lie.
-
-    Example:
-        >>> beside(Path("runs/train/disconet.safetensors")).as_posix()
-        'runs/train/disconet.errors.json'
-    """
-    return weights.with_name(weights.name.removesuffix(".safetensors") + _SUFFIX)
 
 
 def errors_text(errors: BoxErrors, facts: dict[str, Any]) -> str:

@@ -29,7 +29,6 @@ from sortie.perception.network.model import CarNet
 
 ENTRIES = 256
 """Of a stage: one byte names one of them."""
-_SUFFIX = ".codebook.safetensors"
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,16 +89,6 @@ def encoder_digest(net: CarNet) -> str:
         if tensor.dtype.is_floating_point:
             digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
-
-
-def beside(weights: Path) -> Path:
-    """Where the codebook of a weights file lies.
-
-    Example:
-        >>> beside(Path("runs/train/disconet.safetensors")).as_posix()
-        'runs/train/disconet.codebook.safetensors'
-    """
-    return weights.with_name(weights.name.removesuffix(".safetensors") + _SUFFIX)
 
 
 def save_codebook(codebook: Codebook, path: Path, facts: dict[str, Any]) -> None:

@@ -22,6 +22,7 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception import budget
 from sortie.perception.errors import InputError
+from sortie.perception.files import CODEBOOK, ERRORS, beside
 from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import EgoSources, Pose, SourceBoxes, joined_many, sendable, source_of
@@ -29,7 +30,6 @@ from sortie.perception.lateness import weighed
 from sortie.perception.network.bev import lift
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.codebook import Codebook, load_codebook
-from sortie.perception.network.codebook import beside as codebook_beside
 from sortie.perception.network.decode import placed_boxes
 from sortie.perception.network.fused import Peer, fused_map
 from sortie.perception.network.fusion.base import Shares
@@ -42,7 +42,6 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Bytes
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.perception.uncertainty import BoxErrors, load_errors
-from sortie.perception.uncertainty import beside as errors_beside
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import CELL_NAMES
 from sortie.scenarios.schema import Perception
@@ -369,7 +368,7 @@ class TorchDetector:
             InputError: a codebook that is missing, or of another network, or that has no codes of this length.
         """
         named = self._config.codebook
-        path = codebook_beside(self._weights) if named is None else Path(named)
+        path = beside(self._weights, CODEBOOK) if named is None else Path(named)
         found = load_codebook(path, self._loaded)
         if self._config.code_bytes > found.longest:
             raise InputError(
@@ -384,7 +383,7 @@ class TorchDetector:
         Raises:
             InputError: nobody fitted it for these weights.
         """
-        return load_errors(errors_beside(self._weights), self._weights.name)
+        return load_errors(beside(self._weights, ERRORS), self._weights.name)
 
     def _map_pose(self, share: Share, now: Mapping[int, Capture]) -> Pose:
         """The pose that places a share's map in the world."""

@@ -13,6 +13,7 @@ from scipy.special import ndtri
 
 from sortie.perception import budget
 from sortie.perception.errors import InputError
+from sortie.perception.files import ERRORS, beside
 from sortie.perception.geometry import FULL
 from sortie.perception.joining import EgoSources, joined_many, source_of
 from sortie.perception.lateness import weighed
@@ -35,7 +36,7 @@ from sortie.perception.surrogate.hashing import mixed, uniform
 from sortie.perception.surrogate.model import SHIPPED, SQUARE, Parameters, load, rank_covariates
 from sortie.perception.surrogate.shared_false_positives import SharedFalsePositives
 from sortie.perception.types import Boxes, Capture, Share
-from sortie.perception.uncertainty import BoxErrors, beside, load_errors
+from sortie.perception.uncertainty import BoxErrors, load_errors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
@@ -134,7 +135,7 @@ class SurrogateDetector:
         Raises:
             InputError: nobody fitted it for this calibration.
         """
-        return load_errors(beside(self._path), self._path.name)
+        return load_errors(beside(self._path, ERRORS), self._path.name)
 
     def detect(self, jobs: Sequence[Job]) -> list[Boxes]:
         """Each ego's boxes from its own look and the shares it received, ENU, best first."""

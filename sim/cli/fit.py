@@ -42,13 +42,13 @@ def fit_codebook(
 ) -> None:
     """Fit a codebook to a network's features: cells become codes of one byte a stage. Takes about two minutes."""
     from sortie.perception.benchmark.dataset import Benchmark  # here: torch takes a second to import
+    from sortie.perception.files import CODEBOOK, beside
     from sortie.perception.network.checkpoint import load_weights
-    from sortie.perception.network.codebook import beside
     from sortie.perception.network.detector import SHIPPED_WEIGHTS
     from sortie.perception.training.codebook import CodebookRecipe, make_codebook
 
     path = weights or SHIPPED_WEIGHTS
-    target = out_file or beside(path)
+    target = out_file or beside(path, CODEBOOK)
     recipe = CodebookRecipe(stages_, scenes, iterations, seed)
     with user_errors():
         net = load_weights(path)
@@ -82,8 +82,9 @@ def fit_errors(
     bench_dir: BenchOption = Path("runs/bench"),
 ) -> None:
     """Fit how uncertain the places of boxes are, by score and distance, so that drones can send covariances."""
+    from sortie.perception.files import ERRORS, beside
     from sortie.perception.training import box_errors
-    from sortie.perception.uncertainty import beside, errors_text
+    from sortie.perception.uncertainty import errors_text
 
     with user_errors():
         if boxes is Boxes.surrogate:
@@ -91,7 +92,7 @@ def fit_errors(
         else:
             from sortie.perception.network.detector import SHIPPED_WEIGHTS as SHIPPED
         path = weights or SHIPPED
-        target = out_file or beside(path)
+        target = out_file or beside(path, ERRORS)
         ensure_files(target)
         if boxes is Boxes.surrogate:
             from sortie.perception.surrogate.errors import moments

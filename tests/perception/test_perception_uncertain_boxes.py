@@ -11,12 +11,13 @@ from perception_examples import cross
 
 from sortie.perception.budget import content_bytes
 from sortie.perception.errors import InputError
+from sortie.perception.files import ERRORS, beside
 from sortie.perception.intersection import intersect, inverse
 from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
 from sortie.perception.lateness import MOVING, SPEED_MPS
 from sortie.perception.training.box_errors import Errors, calibration, common, errors_of, fit
 from sortie.perception.types import Boxes, Share
-from sortie.perception.uncertainty import BoxErrors, beside, errors_text, load_errors, terms
+from sortie.perception.uncertainty import BoxErrors, errors_text, load_errors, terms
 
 HERE = (0.0, 0.0, 0.0)
 FLAT = BoxErrors((np.log(0.6), 0, 0, 0, 0), (np.log(0.3), 0, 0, 0, 0), common=0.2)
@@ -95,7 +96,7 @@ def test_errors_are_those_of_boxes_that_lie_on_a_car_each_car_once() -> None:
 
 
 def test_the_file_is_read_as_it_was_written_and_faults_name_it(tmp_path: Path) -> None:
-    path = beside(tmp_path / "net.safetensors")
+    path = beside(tmp_path / "net.safetensors", ERRORS)
     with pytest.raises(InputError, match=r"net.errors.json: nobody fitted how uncertain the boxes of net are"):
         load_errors(path, "net")
     path.write_text(errors_text(FITTED, {"command": "none"}))

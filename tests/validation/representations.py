@@ -22,13 +22,14 @@ from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, 
 from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.evaluation.evaluate import Settings, exchanges, frame_keys, match_all
 from sortie.perception.evaluation.instrument import CarNetView
+from sortie.perception.files import CODEBOOK, ERRORS, beside
 from sortie.perception.geometry import CELLS, Geometry
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import EgoSources, Rule, joined_many, source_of
 from sortie.perception.metrics.ap import Matched, average_precision, match
 from sortie.perception.metrics.bootstrap import rank
 from sortie.perception.network.checkpoint import load_weights
-from sortie.perception.network.codebook import Codebook, beside, load_codebook
+from sortie.perception.network.codebook import Codebook, load_codebook
 from sortie.perception.network.decode import placed_boxes
 from sortie.perception.network.detector import SHIPPED_WEIGHTS
 from sortie.perception.network.inference import folded
@@ -37,7 +38,6 @@ from sortie.perception.training.box_errors import Calibration, Errors, Moment, c
 from sortie.perception.training.boxes_alone import boxes_alone, moments_of
 from sortie.perception.types import Capture, Share
 from sortie.perception.uncertainty import BoxErrors, load_errors
-from sortie.perception.uncertainty import beside as errors_beside
 from sortie.scenarios.intervals import percentile_interval, resamples
 from sortie.scenarios.schema import Perception
 
@@ -118,7 +118,7 @@ def measure(
         code_bytes: of a cell.
     """
     net = load_weights(weights)
-    errors, codebook = load_errors(errors_beside(weights), weights.name), load_codebook(beside(weights), net)
+    errors, codebook = load_errors(beside(weights, ERRORS), weights.name), load_codebook(beside(weights, CODEBOOK), net)
     net = folded(net)
     units: dict[Way, Unit] = {}
     received: dict[Way, float] = {}
@@ -335,11 +335,11 @@ def tables(picture: Path, root: Path) -> dict[str, Table]:
     plan = read_plan()
     frames = load_frames(make_split(Benchmark(plan.bench_seed), "test", root, scenes=plan.frames))
     weights = SHIPPED_WEIGHTS
-    model = load_errors(errors_beside(weights), weights.name)
+    model = load_errors(beside(weights, ERRORS), weights.name)
     found = moments_of(frames, boxes_alone(load_weights(weights), frames, TAU))
     rows = measure(frames, weights, plan.rho, plan.code_bytes)
     draw(rows, picture)
-    of_surrogate = load_errors(errors_beside(SHIPPED), SHIPPED.name), moments(SHIPPED, "held-out", 40)
+    of_surrogate = load_errors(beside(SHIPPED, ERRORS), SHIPPED.name), moments(SHIPPED, "held-out", 40)
     about = f"{len(frames)} frames of the test split of benchmark seed {plan.bench_seed}, five egos each"
     losses = [
         [r.way.label, r.way.rho, budget.payload_bytes(1) / r.way.code_bytes, difference(rows, r.way.label, f"features, ρ = {r.way.rho:g}")]

@@ -14,12 +14,11 @@ from sortie.perception.budget import cells_in, content_bytes
 from sortie.perception.errors import InputError
 from sortie.perception.evaluation.contract import Exchange
 from sortie.perception.evaluation.instrument import CarNetView
-from sortie.perception.files import codebook_digest
+from sortie.perception.files import CODEBOOK, beside, codebook_digest
 from sortie.perception.network.checkpoint import load_weights, save_weights
 from sortie.perception.network.codebook import (
     ENTRIES,
     Codebook,
-    beside,
     encoder_digest,
     load_codebook,
     save_codebook,
@@ -90,7 +89,7 @@ def test_the_fit_finds_clusters_stage_by_stage_and_repeats() -> None:
 
 def test_the_file_is_read_as_it_was_written_and_belongs_to_its_network(tmp_path: Path) -> None:
     net = load_weights(SHIPPED_WEIGHTS)
-    path = beside(tmp_path / "net.safetensors")
+    path = beside(tmp_path / "net.safetensors", CODEBOOK)
     made = drawn()
     codebook = Codebook(made.stages, encoder_digest(net), rectified=True)
     save_codebook(codebook, path, {})
@@ -111,10 +110,10 @@ def test_the_file_is_read_as_it_was_written_and_belongs_to_its_network(tmp_path:
 
 
 def test_the_shipped_codebook_belongs_to_the_shipped_network_and_has_every_length() -> None:
-    codebook = load_codebook(beside(SHIPPED_WEIGHTS), load_weights(SHIPPED_WEIGHTS))
+    codebook = load_codebook(beside(SHIPPED_WEIGHTS, CODEBOOK), load_weights(SHIPPED_WEIGHTS))
     assert codebook.longest == 20
     assert codebook.rectified
-    assert len(codebook_digest(beside(SHIPPED_WEIGHTS))) == 14
+    assert len(codebook_digest(beside(SHIPPED_WEIGHTS, CODEBOOK))) == 14
 
 
 def test_a_cell_of_codes_has_so_many_bytes_beside_index_and_codebook() -> None:
@@ -155,7 +154,7 @@ def test_a_detector_fuses_what_is_read_from_codes(scene: SceneModel, fleet: list
     assert not same(plain, coarse)
     known = detector._encode(fleet)
     shares = [codes(c) for c in fleet[1:]]
-    book = load_codebook(beside(SHIPPED_WEIGHTS), load_weights(SHIPPED_WEIGHTS))
+    book = load_codebook(beside(SHIPPED_WEIGHTS, CODEBOOK), load_weights(SHIPPED_WEIGHTS))
     features = torch.stack([known[c].features.result() for c in fleet])
     sent = np.stack([detector._sent(s, known)[0].numpy() for s in shares])
     assert sent.sum() == 2 * cells_in(0.05)
@@ -173,7 +172,7 @@ def test_a_detector_fuses_what_is_read_from_codes(scene: SceneModel, fleet: list
 
 def test_longer_codes_come_nearer_to_features(scene: SceneModel, fleet: list[Capture]) -> None:
     net = load_weights(SHIPPED_WEIGHTS)
-    book = load_codebook(beside(SHIPPED_WEIGHTS), net)
+    book = load_codebook(beside(SHIPPED_WEIGHTS, CODEBOOK), net)
     detector = TorchDetector(scene, Perception(), 1)
     features = detector._encode(fleet[:1])[fleet[0]].features.result()
     lost = [float(((features - book.read(features, k)) ** 2).mean() / features.var()) for k in (1, 5, 20)]
