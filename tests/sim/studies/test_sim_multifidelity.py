@@ -103,6 +103,11 @@ def test_a_correlated_surrogate_takes_the_place_of_torch() -> None:
             assert before != after
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.95])
+def test_a_batch_at_most_doubles_what_a_plan_stands_on(correlation: float) -> None:
+    assert [b.paired for b in planned(correlation, Settings(0.003))][:2] == [12, 24]
+
+
 def test_a_useless_surrogate_is_named_and_left_out() -> None:
     settings = Settings(0.01)
     plans = planned(0.0, settings)
@@ -315,6 +320,15 @@ def test_another_version_policy_or_pilot_is_another_comparison(monkeypatch: pyte
     monkeypatch.setattr(kept_comparison, "code_version", lambda: "another")
     known.add(kept_comparison.identity(base, 12))
     assert len(known) == 6
+
+
+def test_a_changed_file_of_ones_own_is_another_comparison(tmp_path: Path) -> None:
+    own, known = tmp_path / "mine.py", set()
+    for text in ("first", "second"):
+        own.write_text(f"def decide(view):\n    return []  # {text}\n")
+        mine = sortie.load("track_target", {**SHORT, "policy.name": f"{own}:decide", "policy.params": {}})
+        known.add(kept_comparison.identity([Contender("mine", mine)], 12))
+    assert len(known) == 2
 
 
 def test_without_torch_the_first_seed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
