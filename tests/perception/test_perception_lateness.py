@@ -63,6 +63,14 @@ def test_a_box_near_a_later_one_tells_that_its_car_stands() -> None:
     assert np.isfinite(stands(np.array([0.0, 1e3]), np.array([60.0, 60.0]))).all()
 
 
+def test_the_chance_that_a_car_stands_is_that_of_bayes() -> None:
+    """From the densities of the distance between two of its boxes, each off by σ0 along each axis."""
+    off_m, apart_s = np.array([0.0, 0.3, 0.8, 1.5, 2.5]), np.array([0.1, 0.1, 0.3, 0.3, 1.0])
+    still = (1 - MOVING) * rayleigh.pdf(off_m + 1e-9, scale=np.sqrt(2) * SIGMA0_M)
+    moves = MOVING * rayleigh.pdf(off_m + 1e-9, scale=np.sqrt(2 * SIGMA0_M**2 + (SPEED_MPS * apart_s) ** 2))
+    np.testing.assert_allclose(stands(off_m, apart_s), still / (still + moves), rtol=1e-6)
+
+
 def test_only_late_maps_lose_weight_and_beside_the_freshest_look() -> None:
     now, old = cross(10.0, 20.0, 0.3, 10.0), cross(9.0, 20.0, 0.3, 9.7)
     late = Share(old[1], "features", 0.25, None, 0.8, (), 0.395)
