@@ -24,15 +24,13 @@ Both = dict[str, dict[Key, Matched]]
 FULL_SCENE, MISSION = "full_scene", "mission"
 
 
-def matched(
-    record: SortieRecord, *, mission: bool, begin_s: float = 0.0, end_s: float = float("inf")
-) -> dict[Key, Matched]:
-    """The cars of every scored fusion from `begin_s` (inclusive) to `end_s` (exclusive), by (time, ego), matched to the truth.
+def matched(record: SortieRecord, *, mission: bool, begin_s: float = 0.0) -> dict[Key, Matched]:
+    """The cars of every scored fusion from `begin_s` on, by (time, ego), matched to the truth.
 
     Args:
         mission: count the mission disc alone, and only fusions made while there is one.
     """
-    return score(record, [CAR], begin_s, end_s).pools[CAR, MISSION if mission else FULL_SCENE].by_fusion()
+    return score(record, [CAR], begin_s).pools[CAR, MISSION if mission else FULL_SCENE].by_fusion()
 
 
 def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
@@ -98,13 +96,11 @@ class Scored:
         return blind
 
 
-def score(
-    record: SortieRecord, kinds: Sequence[TargetClass], begin_s: float = 0.0, end_s: float = float("inf")
-) -> Scored:
-    """Match the boxes of some classes in every scored fusion from `begin_s` to before `end_s`."""
+def score(record: SortieRecord, kinds: Sequence[TargetClass], begin_s: float = 0.0) -> Scored:
+    """Match the boxes of some classes in every scored fusion from `begin_s` on."""
     fusions = record.tables["fusions"]
     t_s, drone = fusions["t_s"].to_numpy(), fusions["drone"].to_numpy()
-    within = (begin_s <= t_s) & (t_s < end_s)
+    within = begin_s <= t_s
     t_s, drone = t_s[within], drone[within]
     regions = Regions(record.tables["mission"], record.scenario.mission)
     found, truth = InTime(record.tables, "detections"), InTime(record.tables, "truths")

@@ -156,6 +156,7 @@ def test_what_is_sent_are_the_best_twelve_confirmed_tracks_of_the_region_at_the_
     assert len(content(tracker.tracks, None, (0.0, 0.0), 1.5)) == budget.MAX_TRACKS == 12
     near = content(tracker.tracks, (0.0, 0.0, 25.0), (0.0, 0.0), 1.5)
     assert sorted(near.xy_m[:, 0].round().tolist()) == [0.0, 10.0, 20.0]
+    assert len(content(tracker.tracks, (0.0, 80.0, 5.0), (0.0, 0.0), 1.5)) == 0
     moved = content(driving(), None, (0.0, 0.0), 4.0)
     assert moved.xy_m[moved.xy_m[:, 1] < 10.0, 0] == pytest.approx(32.0, abs=0.3)
 
