@@ -65,6 +65,15 @@ def test_a_planner_flies_to_places_returns_and_lands() -> None:
     assert speed.max() <= 4 + 1e-9
 
 
+def test_a_drone_that_goes_home_no_longer_follows_its_planner() -> None:
+    leaves = "events=[{kind: drone_leaves, at_s: 1, drone: 0}]"
+    record = flown(GOES, params(do='"GoTo Return"', x_m=-50, y_m=-10, only=0), leaves, "mission.descent_mps=10")
+    assert texts(record, 0)[-2:] == ["goes home: told to", "went home"]
+    z_m = states(record, "z_m")[:, 0, 0]
+    assert z_m[10] > 50
+    assert z_m[80] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_a_place_is_reached_in_spite_of_what_the_drone_believes() -> None:
     """It believes to be 5 m further east, so it stops 5 m further west than it was told."""
     settings = (GOES, params(x_m=-30, only=2), "fleet.drones=3", "fleet.formation.shape=line", "duration_s=25")
