@@ -309,6 +309,17 @@ def parts(*sets: str) -> Parts:
     return build(scenario, plan_for(scenario), scenario.seed)
 
 
+def test_the_radio_costs_what_it_draws_while_it_sends() -> None:
+    flight = parts("duration_s=3", "policy.dwell_s=0")
+    fly(flight)
+    airtime_s = np.array(flight.world.air.airtime_s)
+    assert airtime_s.min() > 0.1
+    listens_w, more_w = 2.0, 4.0
+    np.testing.assert_allclose(
+        flight.world.batteries.energy_j["radio"], listens_w * 3.0 + more_w * airtime_s, atol=more_w * 0.01
+    )
+
+
 def test_a_link_that_comes_back_takes_only_its_own_loss_back() -> None:
     """Both ways, link by link, while another event holds all links of one end."""
     flight = parts(
