@@ -218,6 +218,20 @@ def test_the_longest_of_several_gaps_counts_and_the_share_all_of_them() -> None:
     assert early["target_longest_out_of_view_s"] == pytest.approx(first, abs=0.11)
 
 
+def test_a_target_counts_while_any_group_tracks_it() -> None:
+    """One group tracks it for four seconds, then another one; it leaves the view as above."""
+    away = "mission.target={waypoints_m: [[0, 0], [0, 400]], speed_mps: 20}"
+    first = "{drones: [0], phases: [{at_s: 0, phase: track}, {at_s: 4, phase: search}]}"
+    then = "{drones: [1], phases: [{at_s: 0, phase: search}, {at_s: 4, phase: track}]}"
+    together = "fleet.formation={shape: line, spacing_m: 1}"
+    sets = (*STILL, "fleet.drones=2", together, "duration_s=8", away)
+    figures = mission(*sets, f"mission.groups=[{first}, {then}]")
+    alone = mission(*sets, TRACK)
+    for name in ("target_in_view_share", "target_longest_out_of_view_s"):
+        assert figures[name] == pytest.approx(alone[name])
+    assert 0.6 < alone["target_in_view_share"] < 0.7
+
+
 class Clairvoyant:
     """Finds every car, until a time."""
 
