@@ -56,6 +56,8 @@ def test_a_station_on_mains_takes_part_and_spends_nothing() -> None:
     assert rows(sharing, "transmissions", peer=4, status="delivered")
     assert not rows(sharing, "transmissions", drone=4)  # without cameras it has nothing to send
     assert outcome(record)["mission"]["flown_share"] == 1.0
+    lost = run_sortie(example(STATION, "events=[{kind: drone_lost, at_s: 3, drone: 0}]"))
+    assert outcome(lost)["mission"]["flown_share"] == pytest.approx(1 - 0.5 / 4), "of the four that fly"
     world = build(record.scenario, plan_for(record.scenario), 1).world
     assert [sensed.footprint_radius_m > 0 for sensed in (world.sensed(i, 0) for i in (0, 4))] == [True, False]
 
