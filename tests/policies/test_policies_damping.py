@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sortie.policies.contract import Descriptor, Directive, Disc, LinkState, Representation, TaskPhase
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp, is_climb, is_switch
-from sortie.scenarios.link_state import SILENT_MBPS, state_of
+from sortie.scenarios.link_state import SILENT_MBPS, probed_mbps, state_of
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 HALF = FULL._replace(rate_hz=5.0, reason="half")
@@ -320,6 +320,10 @@ def test_the_band_is_the_play_operator(values: list[float], band: float) -> None
         if before <= u <= before * (1 + band) * (1 - 1e-12):
             assert v == before
     assert read([u for u in values for _ in range(3)], band=band)[::3] == seen
+
+
+def test_a_probed_link_is_read_as_heard_since_its_value_is_no_rate() -> None:
+    assert read([SILENT_MBPS, probed_mbps(0.6), probed_mbps(0.7)]) == [SILENT_MBPS, probed_mbps(0.6), probed_mbps(0.7)]
 
 
 @given(st.lists(st.sampled_from([0.0, SILENT_MBPS, 0.002, 4.0, 80.0]), min_size=1, max_size=20), st.floats(0, 3))

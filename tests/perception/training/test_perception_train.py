@@ -63,6 +63,23 @@ def test_turning_and_mirroring_keep_cars_on_their_pixels(frames: Frames) -> None
         assert busy(batch.images[0, 0].numpy(), cars * [-1, 1, 1, 1, 1]) < busy(batch.images[0, 0].numpy(), cars)
 
 
+def test_turning_and_mirroring_keep_headings_and_what_drones_believe(frames: Frames) -> None:
+    """Cars keep their heading in a drone's own frame, and a belief its error; a mirror changes the sign of both."""
+    seen = frames.true_pose
+    errors = frames.est_pose[..., 2] - seen[..., 2]
+    for step in range(8):
+        batch = draw_batch(frames, 3, step, 0)
+        error = batch.est[..., 2] - batch.pose[..., 2]
+        for k in range(len(batch.cars)):
+            near = np.abs(np.abs(error[k])[:, None] - np.abs(errors.ravel())).min(axis=1)
+            assert near.max() < 1e-9
+        cars, pose = batch.cars[0], batch.pose[0, 0]
+        local = local_cars(cars, pose)
+        turned = cars[:, 4] - pose[2]
+        assert len(local)
+        assert np.nanmin(np.abs(np.sin(local[:, 4][:, None] - turned)), axis=1).max() < 1e-6
+
+
 def test_batches_follow_from_seed_step_and_shard(frames: Frames) -> None:
     a, b = draw_batch(frames, 0, 4, 1), draw_batch(frames, 0, 4, 1)
     assert np.array_equal(a.images, b.images)
