@@ -39,9 +39,7 @@ def cheapest(cost: ArrayLike, max_hops: int) -> tuple[list[FloatArray], list[Int
     np.fill_diagonal(direct, np.inf)
     costs, following = [direct], [np.tile(np.arange(n), (n, 1))]
     for _ in range(1, max_hops):
-        before = costs[-1].copy()
-        np.fill_diagonal(before, np.inf)  # a route does not come back to where it goes
-        through = direct[:, :, None] + before[None, :, :]  # [sender, next, target]
+        through = direct[:, :, None] + costs[-1][None, :, :]  # [sender, next, target]
         via = through.argmin(axis=1)
         best = np.take_along_axis(through, via[:, None, :], axis=1)[:, 0]
         better = best < costs[-1]
