@@ -115,7 +115,7 @@ GOOD = [FEATURES, SMALL, FAST, 0] * 2
     "action",
     [
         [-1, *GOOD[1:]],
-        [3, *GOOD[1:]],
+        [4, *GOOD[1:]],
         [*GOOD[:-1], 2],
         [0.5, *GOOD[1:]],
         np.array(GOOD, float),
