@@ -176,7 +176,8 @@ def find_wrong_type(d: object) -> str | None:
     for name, (high, kind) in DIRECTIVE_BOUNDS.items():
         value = getattr(d, name)
         if not _is_honest(value) or not _compares(value, 0.0, high) or (kind != "a number" and not _is_whole(value)):
-            return f"{where}: {name} is {value!r}, must be in [0, {high:g}], {kind}"
+            bounds = "" if name == "representation" else f"in [0, {high:g}], "
+            return f"{where}: {name} is {value!r}, must be {bounds}{kind}"
     if not (d.roi is None or type(d.roi) is Disc):
         return f"{where}: roi is {d.roi!r}, must be a Disc or None"
     for name, value in () if d.roi is None else d.roi._asdict().items():

@@ -405,7 +405,9 @@ class DirectiveBound(NamedTuple):
 
 
 DIRECTIVE_BOUNDS: dict[str, DirectiveBound] = {
-    "representation": DirectiveBound(int(max(Representation)), "a Representation"),
+    "representation": DirectiveBound(
+        int(max(Representation)), "a Representation, such as sortie.Representation.DETECTIONS"
+    ),
     "rho": DirectiveBound(1.0, "a number"),
     "rate_hz": DirectiveBound(30.0, "a number"),
     "deadline_s": DirectiveBound(10.0, "a number"),

@@ -13,7 +13,8 @@ import numpy as np
 
 from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, LinkState, Representation, TaskPhase
 
-RUNGS = (Representation.NONE, Representation.DETECTIONS, Representation.FEATURES)
+RUNGS = (Representation.NONE, Representation.DETECTIONS, Representation.FEATURES, Representation.UNCERTAIN_BOXES)
+"""Nothing, boxes, feature maps, boxes with uncertainty: 0 to 3 in an action, and by no means in order of fidelity."""
 RHOS = (0.02, 0.1, 0.25, 1.0)
 RATES_HZ = (2.0, 5.0, 10.0)
 CHOICES = (len(RUNGS), len(RHOS), len(RATES_HZ), 2)

@@ -332,13 +332,16 @@ def _rise(old: Directive | None, d: Directive) -> str | None:
     return None
 
 
+_SENDS_BOXES = "put @sortie.boxes_across_networks above the policy, which sends boxes there"
+
+
 def _sends_maps_where_they_are_fused(policy: Policy, view: FleetView) -> str | None:
     """A drone with another network cannot fuse the ego's feature maps, so their bytes would be spent in vain."""
     for d in _decide(policy, view):
         if d.representation == Representation.FEATURES and not view.shares_features_with(d.destination):
-            return f"directive {d.source}→{d.destination}: features, must be boxes: the peer has another network"
+            return f"directive {d.source}→{d.destination}: features, must be boxes: the peer has another network; {_SENDS_BOXES}"
         if d.representation == Representation.CODES and not view.shares_codes_with(d.destination):
-            return f"directive {d.source}→{d.destination}: codes, must be boxes: the peer has another codebook"
+            return f"directive {d.source}→{d.destination}: codes, must be boxes: the peer has another codebook; {_SENDS_BOXES}"
     return None
 
 

@@ -295,7 +295,7 @@ class _Drawn:
     def text(self) -> str:
         """How many views were tried, in words."""
         own = f", {self._own} at the policy's own constants" if self._own else ""
-        return f"{self._count} drawn views of up to {MAX_DRONES} drones{own} and {self._large} of {LARGEST} keep it"
+        return f"{self._count} drawn views of up to {MAX_DRONES} drones{own} and {self._large} views of {LARGEST} drones keep it"
 
     def first_fault(self, prop: Property) -> FleetView | None:
         """The first view on which a property fails, made smaller; None if all keep it."""

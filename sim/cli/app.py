@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
@@ -47,12 +49,29 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            with _notes_once():
+                return super().invoke(ctx)
         except KeyboardInterrupt:
             err.print("interrupted; what was not finished was not written")
             raise typer.Exit(130) from None
         except ImportError as error:
             raise missing(error) from error
+
+
+@contextmanager
+def _notes_once() -> Iterator[None]:
+    """Print each note of a command once: a scenario is read for each policy that flies it."""
+    log, said = logging.getLogger("sortie"), set[str]()
+
+    def first(record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        return text not in said and not said.add(text)  # type: ignore[func-returns-value]
+
+    log.addFilter(first)
+    try:
+        yield
+    finally:
+        log.removeFilter(first)
 
 
 app = typer.Typer(

@@ -70,9 +70,11 @@ def compare_conditions(
         )  # fmt: skip
     out.print(table)
     flown = ", ".join(p for p in policies if p in FIXED)
+    first = f"the best fixed policy ({flown})" if flown else "the first policy, as no fixed one flew"
     out.print(
-        f"[dim]over {fixed}: AP points over the best fixed policy ({flown}), conditions resampled in pairs; oracle: of the AP of "
-        "the best fixed policy of each condition; data and energy of a sortie; missed: payloads past their deadline[/dim]"
+        f"[dim]over {fixed}: AP points over {first}, and the interval of their mean over conditions; oracle: of the AP of "
+        f"{'the best fixed policy of each condition' if flown else 'the first policy'}; data and energy of a sortie; missed: "
+        "payloads past their deadline[/dim]"
     )
     if out_file is not None:
         found = {

@@ -115,7 +115,7 @@ GOOD = [FEATURES, SMALL, FAST, 0] * 2
     "action",
     [
         [-1, *GOOD[1:]],
-        [3, *GOOD[1:]],
+        [4, *GOOD[1:]],
         [*GOOD[:-1], 2],
         [0.5, *GOOD[1:]],
         np.array(GOOD, float),
@@ -136,7 +136,7 @@ def test_an_action_outside_its_space_flies_nothing_and_the_step_may_be_tried_aga
     for each in (e, untouched):
         each.reset(seed=3)
         each.step({"drone_1": np.zeros(8, int)})
-    with pytest.raises(ValueError, match=r"^drone_0: action .*, must be 8 whole numbers: .* 0 and at most 2, 3, 2, 1$"):
+    with pytest.raises(ValueError, match=r"^drone_0: action .*, must be 8 whole numbers: .* 0 and at most 3, 3, 2, 1$"):
         e.step({"drone_1": np.array(GOOD), "drone_0": action})
     for steps in range(1, 4):
         tried, other = (each.step({"drone_0": GOOD}) for each in (e, untouched))

@@ -331,6 +331,12 @@ def _ranking() -> Tables:
     return ranking.measure(WORK / "ranking")
 
 
+def _learned_example() -> Tables:
+    import learned_example
+
+    return learned_example.measure(WORK / "learned_example")
+
+
 def _arms() -> Tables:
     """As `sortie learn --by-torch`."""
     from sortie.policies.catalogue.adaptive import ARMS
@@ -632,6 +638,7 @@ FIGURES: dict[str, Figure] = {
     "survey": Figure(1, _survey),
     "views_cost": Figure(0.5, _views_cost, timed=True),
     "disagreement": Figure(2, _disagreement),
+    "learned_example": Figure(10, _learned_example),
     "compare": Figure(2, _compare),
     "coverage": Figure(0.5, _coverage),
     "price": Figure(0.2, _price, timed=True),

@@ -162,10 +162,18 @@ PLANTED: list[tuple[Callable[[FleetView], Sequence[Directive]], str, str]] = [
     (gives_nothing, "returns directives", "returns NoneType, must be a list or a tuple of directives"),
     (gives_text, "bounds kept", "a policy returns a list or a tuple of directives, got str"),
     (rate_as_text, "bounds kept", "rate_hz is '10', must be in [0, 30], a number"),
-    (rung_as_text, "bounds kept", "representation is 'features', must be in [0, 4], a Representation"),
+    (
+        rung_as_text,
+        "bounds kept",
+        "representation is 'features', must be a Representation, such as sortie.Representation.DETECTIONS",
+    ),
     (weighs_by_none, "bounds kept", "fusion_weight is None, must be in [0, 1], a number"),
     (links_in_lists, "bounds kept", "must be a drone's id, a whole number"),
-    (forgets_networks, "maps within one network", "features, must be boxes: the peer has another network"),
+    (
+        forgets_networks,
+        "maps within one network",
+        "another network; put @sortie.boxes_across_networks above the policy",
+    ),
     (gives_reasons_as_numbers, "bounds kept", "reason is 5, must be text"),
 ]
 

@@ -76,7 +76,8 @@ def test_cost_grows_no_faster_than_the_fleet(name: str) -> None:
 @pytest.mark.parametrize("value", [-1e-9, 1e6, float("nan"), float("inf")])
 def test_no_directive_passes_its_bounds(field: str, value: float) -> None:
     directives = [d._replace(**{field: value}) for d in share(FLEET)]
-    with pytest.raises(PolicyError, match=rf"directive 0→1: {field} is {value!r}, must be in \["):
+    allowed = "a Representation" if field == "representation" else r"in \["
+    with pytest.raises(PolicyError, match=rf"directive 0→1: {field} is {value!r}, must be {allowed}"):
         check_directives(directives, FLEET)
 
 
@@ -87,8 +88,16 @@ def test_no_directive_passes_its_bounds(field: str, value: float) -> None:
         ("destination", 1.0, "destination is 1.0, must be a drone's id, a whole number"),
         ("destination", [1], "destination is [1], must be a drone's id, a whole number"),
         ("destination", "1", "destination is '1', must be a drone's id, a whole number"),
-        ("representation", "features", "representation is 'features', must be in [0, 4], a Representation"),
-        ("representation", 2.0, "representation is 2.0, must be in [0, 4], a Representation"),
+        (
+            "representation",
+            "features",
+            "representation is 'features', must be a Representation, such as sortie.Representation.DETECTIONS",
+        ),
+        (
+            "representation",
+            2.0,
+            "representation is 2.0, must be a Representation, such as sortie.Representation.DETECTIONS",
+        ),
         ("rho", None, "rho is None, must be in [0, 1], a number"),
         ("rho", 0.5j, "rho is 0.5j, must be in [0, 1], a number"),
         ("rate_hz", "10", "rate_hz is '10', must be in [0, 30], a number"),

@@ -147,3 +147,12 @@ def test_a_file_with_an_event_after_its_own_end_is_an_error(here: Path) -> None:
 def test_there_is_a_schema_for_each_kind_of_file(what: str, model: type[BaseModel]) -> None:
     code, text = say("list", what)
     assert (code, json.loads(text)["title"]) == (0, model.__name__)
+
+
+def test_a_note_is_printed_once_however_many_policies_fly(caplog: pytest.LogCaptureFixture) -> None:
+    """The next command prints it again."""
+    flights = ["compare", "paper_replay", "--policies", "boxes,silence", "--seeds", "1", "--set", "duration_s=1"]
+    for times in (1, 2):
+        done = CliRunner().invoke(app, [*flights, "--set", "perception.detector=none"])
+        assert done.exit_code == 0, done.output
+        assert sum("are left out" in text for text in caplog.messages) == times

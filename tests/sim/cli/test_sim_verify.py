@@ -179,7 +179,7 @@ def quits(view):
         ("text", "a policy returns Directive, got str"),
         ("texts", "rate_hz is '10', must be in [0, 30], a number"),
         ("texts_when_old", "rate_hz is '10', must be in [0, 30], a number"),
-        ("rung", "representation is 'features', must be in [0, 4], a Representation"),
+        ("rung", "representation is 'features', must be a Representation, such as sortie.Representation.DETECTIONS"),
         ("leaves", "raises ProgramExitError: exit code 0, must return"),
         ("quits", "raises ProgramExitError: exit code 0, must return"),
     ],
