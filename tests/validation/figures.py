@@ -332,14 +332,14 @@ def _held_out() -> Tables:
 def _conditions_first() -> Tables:
     policies = ["all-4", "adaptive", "boxes"]
     return {
-        "first_by_torch": _over_conditions("conditions", policies, SLOWLY, SUPPRESSED, by_torch=True),
-        "first_by_surrogate": _over_conditions("conditions", policies, SUPPRESSED),
+        "first_by_torch": _over_conditions("conditions", policies, SLOWLY, by_torch=True),
+        "first_by_surrogate": _over_conditions("conditions", policies),
     }
 
 
 def _where_boxes_average() -> Tables:
     policies = ["all-4", "boxes", "adaptive", "learned"]
-    return {"where_boxes_average": _over_conditions("conditions_third", policies, "perception.join=average")}
+    return {"where_boxes_average": _over_conditions("conditions_third", policies)}
 
 
 def _half_width() -> Tables:
