@@ -143,8 +143,8 @@ def adaptive(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
 
     A region is small, so even a small budget carries its important cells. Of the whole scene, boxes find more under every
     budget (by the torch detector, `sortie learn --by-torch`). A drone that sees nothing of the region has no cells of it
-    to send. The rules are older than the moving of late boxes; since then boxes are ahead in a region as well
-    (docs/results/policies.md).
+    to send. The rules are older than the moving and averaging of boxes; since then boxes are ahead in a region as
+    well (docs/results/policies.md).
     """
     me = view.me
     if me is None:

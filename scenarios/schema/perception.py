@@ -120,8 +120,8 @@ class Perception(Section):
         True, description="Late features lie where their sender was when it looked; false: where it is at fusion."
     )
     join: Literal["nms", "average"] = Field(
-        "nms",
-        description="How boxes of several drones become one list: the best of those that overlap, or their weighted mean.",
+        "average",
+        description="How boxes of several drones become one list: of those that overlap, their weighted mean (average), or only the best (nms).",
     )
     common_errors: Literal["fitted", "unknown"] = Field(
         "fitted",

@@ -19,6 +19,7 @@ from sortie.policies.registry import resolve
 from sortie.scenarios.report_text import number, points, size
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import bars, out
+from sortie.sim.cli.options import SetOption
 from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.studies.conditions import FIXED, Cell, best_fixed, fly_all, summarise
 from sortie.sim.studies.in_flight import torch_answers
@@ -127,20 +128,23 @@ def learn(
             "--by-torch", help="Fly with the surrogate, score with the torch detector; takes half an hour on one core."
         ),
     ] = False,
+    set_: SetOption = None,
     out_file: Annotated[
         Path,
         typer.Option("--out", help="File for the fit; `learned` flies with policies/catalogue/learned.json."),
     ] = Path("runs/learned.json"),
 ) -> None:
     """Fit the policy `learned`: fly each of its choices in random conditions, and fit the gain in AP."""
-    from sortie.sim.studies.learn import BUDGETS, fly_lessons, gains, save, thresholds
+    from sortie.sim.studies.learn import BUDGETS, draw_condition, fly_lessons, gains, save, thresholds
 
     ensure_files(out_file)
+    sets = tuple(set_ or ())
+    draw_condition(seed, 0, sets)  # a wrong override fails here, before anything is flown
     with bars() as bar:
         lessons = fly_lessons(
-            seed, conditions, by_torch=by_torch, workers=workers, progress=bar("conditions", conditions)
+            seed, conditions, sets=sets, by_torch=by_torch, workers=workers, progress=bar("conditions", conditions)
         )
-    save(out_file, lessons, seed, by_torch=by_torch)
+    save(out_file, lessons, seed, by_torch=by_torch, sets=sets)
     table = Table("arm", "mean AP", "best in")
     for k, arm in enumerate(ARMS):
         wins = sum(max(lesson.ap) == lesson.ap[k] for lesson in lessons)

@@ -105,6 +105,7 @@ description: >-
 base: track_target
 set:
   - perception.detector=surrogate
+  - perception.join=average
   - radio.preamble_detection_dbm=-95
   - duration_s={seconds}
   - fleet.route.waypoints_m=[[-60, 0], [60, 0]]

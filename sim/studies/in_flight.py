@@ -60,6 +60,7 @@ def flights(
     progress: Callable[[str, int, int], None] | None = None,
     towns: int = 1,
     leave_out: Collection[str] = (),
+    sets: Sequence[str] = (),
 ) -> Iterator[ConditionAp]:
     """Fly a scenario, or every condition of a set with its first seed, under some policies.
 
@@ -68,6 +69,7 @@ def flights(
         towns: each is flown in so many: its own, and others of its kind, whose seeds, and the sortie's, count on from
             its own. A condition's AP is that of all their fusions together: a mission's disc holds a handful of cars, and
             twenty discs say little.
+        sets: overrides of fields in every sortie, as `--set` takes them; a condition's own go before them.
 
     Raises:
         ScenarioError, PolicyError: what cannot be flown, before anything is.
@@ -77,8 +79,9 @@ def flights(
         conditions = ConditionSet(
             base=name, seeds=(load(name).seed,), conditions=(Condition(name="sortie", budget=1.0),)
         )
-        planned = [[(p, load(name, [f"policy.name={p}", "policy.params={}"])) for p in policies]]
+        planned = [[(p, load(name, [f"policy.name={p}", "policy.params={}", *sets])) for p in policies]]
     else:
+        conditions = conditions.model_copy(update={"set": (*conditions.set, *sets)})
         planned = [[(p, scenario_of(conditions, c, p)) for p in policies] for c in conditions.conditions]
     both = torch_answers(calibration, weights), _surrogate(calibration)
     count, flown = len(planned) * len(policies) * towns, 0

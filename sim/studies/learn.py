@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,14 +55,18 @@ class Lesson:
     condition: str
 
 
-def draw_condition(seed: int, number: int) -> tuple[Scenario, float]:
-    """Training condition `number` of a seed: a scenario and its budget (`sent_budget` of the arms)."""
+def draw_condition(seed: int, number: int, sets: Sequence[str] = ()) -> tuple[Scenario, float]:
+    """Training condition `number` of a seed: a scenario and its budget (`sent_budget` of the arms).
+
+    Args:
+        sets: overrides of fields that every condition has in common, as `--set` takes them.
+    """
     rng = stream(seed, number, (), "learn.context")
     budget = float(rng.choice(BUDGETS))
     tracking = bool(rng.random() < 0.5)
     region = f", region: {{radius_m: {rng.choice(RADII_M)}}}"
     phase = f"{{at_s: 0, phase: {'track' if tracking else 'search'}{region if tracking else ''}}}"
-    sets = [
+    drawn = [
         "perception.detector=surrogate",
         f"duration_s={SECONDS}",
         "fleet.route.waypoints_m=[[-60, 0], [20, 0]]",
@@ -75,12 +80,12 @@ def draw_condition(seed: int, number: int) -> tuple[Scenario, float]:
         f"seed={int(rng.integers(1, 10**6))}",
         *LINKS[int(rng.integers(len(LINKS)))],
     ]
-    return load("track_target", sets), budget
+    return load("track_target", [*drawn, *sets]), budget
 
 
-def fly_lesson(seed: int, number: int, by_torch: bool = False) -> Lesson:
+def fly_lesson(seed: int, number: int, by_torch: bool = False, sets: Sequence[str] = ()) -> Lesson:
     """Fly every arm in a training condition; `by_torch`: scored by the torch detector, at fewer moments."""
-    scenario, budget = draw_condition(seed, number)
+    scenario, budget = draw_condition(seed, number, sets)
     detector_of: DetectorMaker = make_detector
     if by_torch:
         perception = scenario.perception.model_copy(update={"sample_rate_hz": TORCH_RATE_HZ})
@@ -107,14 +112,16 @@ def fly_lessons(
     seed: int,
     count: int,
     *,
+    sets: Sequence[str] = (),
     by_torch: bool = False,
     workers: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> list[Lesson]:
-    """Lessons of so many conditions; those in which AP is undefined are left out."""
+    """Lessons of so many conditions, with overrides of fields (`sets`); those in which AP is undefined are left out."""
     with ProcessPoolExecutor(max_workers=workers) as pool:
         lessons = []
-        for k, lesson in enumerate(pool.map(fly_lesson, [seed] * count, range(count), [by_torch] * count)):
+        every = pool.map(fly_lesson, [seed] * count, range(count), [by_torch] * count, [sets] * count)
+        for k, lesson in enumerate(every):
             if progress is not None:
                 progress(k + 1)
             if np.isfinite(lesson.ap).all():
@@ -176,8 +183,9 @@ def _falls_through_zero(lessons: list[Lesson]) -> float:
     return flown[0][0] if flown[0][1] <= 0 else float("inf")
 
 
-def save(path: Path, lessons: list[Lesson], seed: int, *, by_torch: bool = False) -> None:
+def save(path: Path, lessons: list[Lesson], seed: int, *, by_torch: bool = False, sets: Sequence[str] = ()) -> None:
     """Write the fit, with how it was made."""
     fitted = fit(lessons)
-    about = f"sortie learn{' --by-torch' * by_torch}, {len(lessons)} conditions of seed {seed}, each under {len(ARMS)} arms, {SECONDS} s"
+    command = shlex.join(["sortie", "learn", *["--by-torch"] * by_torch, *(w for one in sets for w in ("--set", one))])
+    about = f"{command}, {len(lessons)} conditions of seed {seed}, each under {len(ARMS)} arms, {SECONDS} s"
     write_text(path, json.dumps({"about": about, **fitted}, indent=1) + "\n")

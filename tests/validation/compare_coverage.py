@@ -46,7 +46,7 @@ import sortie
 from sortie.sim.studies.compare import AREAS, SEEDS, over_sorties
 
 TABLE = Path(__file__).parent / "compare_coverage.csv"
-SHORT = {"duration_s": 10, "mission.phases.1.at_s": 3, "perception.detector": "surrogate"}
+SHORT = {"duration_s": 10, "mission.phases.1.at_s": 3, "perception.detector": "surrogate", "perception.join": "nms"}
 POLICIES = ("worked", "all-4", "silence")
 CONTRASTS = tuple(f"{policy} {area}" for policy in POLICIES[1:] for area in AREAS)
 REPETITIONS = 200

@@ -58,6 +58,7 @@ SHORT = {
     "duration_s": 10,
     "mission.phases": [{"at_s": 0, "phase": "search"}, {"at_s": 3, "phase": "track", "region": {"radius_m": 32}}],
     "perception.sample_rate_hz": 1,
+    "perception.join": "nms",  # the default when the stored seeds were flown
 }
 POINT = 0.01
 """One AP point."""

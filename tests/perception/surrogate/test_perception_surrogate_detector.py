@@ -45,6 +45,12 @@ def detector(scene: SceneModel) -> SurrogateDetector:
     return SurrogateDetector(scene, Perception(), seed=3)
 
 
+@pytest.fixture(scope="module")
+def suppressing(scene: SceneModel) -> SurrogateDetector:
+    """Its receivers keep boxes as they were sent."""
+    return SurrogateDetector(scene, Perception(join="nms"), seed=3)
+
+
 def shared(
     fleet: list[Capture], rho: float, weight: float = 1.0, kind: str = "features"
 ) -> list[tuple[Capture, list[Share]]]:
@@ -222,13 +228,13 @@ def test_truth_is_the_detectors(scene: SceneModel, detector: SurrogateDetector) 
     np.testing.assert_allclose(mine.size_m[order[0]], theirs.size_m[order[1]], atol=1e-5)
 
 
-def test_boxes_that_are_sent_are_the_peers_own(detector: SurrogateDetector) -> None:
+def test_boxes_that_are_sent_are_the_peers_own(suppressing: SurrogateDetector) -> None:
     """What is joined is the ego's or the peer's, of tracks the best 12; a box goes only where another lies on it."""
     fleet = cross(10.0, 20.0, 0.3)
-    own, theirs = detector.detect([(fleet[0], ()), (fleet[1], ())])
+    own, theirs = suppressing.detect([(fleet[0], ()), (fleet[1], ())])
     inside = in_square(theirs.xy_m, [fleet[0].est_pose])[:, 0]
     for kind, most in (("detections", len(theirs)), ("tracks", 12)):
-        joined = detector.detect(shared(fleet[:2], 1.0, kind=kind)[:1])[0]
+        joined = suppressing.detect(shared(fleet[:2], 1.0, kind=kind)[:1])[0]
         every = Boxes.join([own, theirs.take(np.flatnonzero(inside & (np.arange(len(theirs)) < most)))])
         kept = (every.xy_m[:, None] == joined.xy_m[None]).all(axis=-1)
         assert (kept.sum(axis=0) == 1).all()
@@ -386,14 +392,14 @@ def test_older_maps_than_any_that_was_fitted_give_no_more_false_alarms_than_the_
     assert expected(0.4).sum() < 100
 
 
-def test_a_drone_without_a_look_has_what_its_peers_sent(detector: SurrogateDetector) -> None:
+def test_a_drone_without_a_look_has_what_its_peers_sent(suppressing: SurrogateDetector) -> None:
     """A whole map, from where it was made, is that drone's own; of a part it has the cells that came."""
     fleet = cross(10.0, 20.0, 0.3)
     peer, other = fleet[1], fleet[2]
     blind = peer._replace(drone=0, looked=False)
     whole, part = Share(peer, "raw", 1.0, None, 0.5), Share(peer, "features", 0.003, None, 0.5)
     disc = Disc(*peer.position_m[:2], 30.0)
-    one, few, near, both, none, boxes, alone = detector.detect(
+    one, few, near, both, none, boxes, alone = suppressing.detect(
         [
             (blind, [whole]),
             (blind, [part]),
@@ -411,6 +417,6 @@ def test_a_drone_without_a_look_has_what_its_peers_sent(detector: SurrogateDetec
     assert 0 < len(few) < len(one)
     assert 0 < len(near) < len(one)
     assert (np.hypot(*(near.xy_m - disc[:2]).T) <= 32.0).all()
-    together = detector.detect([(peer, [Share(other, "raw", 1.0, None, 1.0)])])[0]
+    together = suppressing.detect([(peer, [Share(other, "raw", 1.0, None, 1.0)])])[0]
     same([both], [together.take(in_square(together.xy_m, [blind.est_pose])[:, 0])])
     assert len(none) == 0

@@ -107,6 +107,7 @@ def scenario(tmp_path: Path) -> Path:
         (("compare", "example.yaml", "--policies", "silence", "--readme", "c.md"), "c.md: No such file or directory"),
         (("compare", "example.yaml", "--policies", "silence", "--readme", "example.yaml"), "must hold <!-- compare"),
         (("learn", "--out", "."), ".: is a folder, must be a file"),
+        (("learn", "--set", "perception.jion=nms"), "perception.jion: unknown key, did you mean join?"),
         (("fit", "errors", "--weights", "w.safetensors", "--out", "."), ".: is a folder, must be a file"),
         (("live", "example.yaml", "--out", "."), ".: is a folder, must be a file"),
         (("train", "--fusion", "mean"), "unknown fusion 'mean', known: none, late,"),

@@ -315,7 +315,7 @@ CHANGED = {
     "perception.fusion_delay_s": "0.01",
     "perception.max_age_s": "0.2",
     "perception.motion_compensation": "false",
-    "perception.join": "average",
+    "perception.join": "nms",
     "perception.codebook": "other.safetensors",
     "perception.common_errors": "unknown",
     "perception.score_threshold": "0.5",

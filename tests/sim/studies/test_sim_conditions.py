@@ -248,6 +248,18 @@ def test_training_conditions_are_drawn_from_their_streams() -> None:
     assert rho in learn.BUDGETS
 
 
+def test_training_conditions_and_the_fit_name_what_is_overridden(tmp_path: Path) -> None:
+    plain, _ = draw_condition(0, 3)
+    changed, _ = draw_condition(0, 3, ["perception.join=nms"])
+    perception = plain.perception.model_copy(update={"join": "nms"})
+    assert plain.perception.join == "average"
+    assert changed == plain.model_copy(update={"perception": perception})
+    lessons = [planted(np.random.default_rng(k), 0.0) for k in range(9)]
+    save(tmp_path / "model.json", lessons, 5, by_torch=True, sets=["perception.join=nms"])
+    about = json.loads((tmp_path / "model.json").read_text())["about"]
+    assert about.startswith("sortie learn --by-torch --set perception.join=nms, 9 conditions of seed 5")
+
+
 def planted(rng: np.random.Generator, noise: float) -> Lesson:
     """The last arm gains with the first feature, arm 1 loses always."""
     x = rng.normal(size=len(FEATURES))

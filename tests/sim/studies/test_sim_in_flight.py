@@ -17,7 +17,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.accuracy import accuracy, both_matched
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.studies.in_flight import ConditionAp, flights, means, torch_answers
+from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means, torch_answers
 
 
 def levels(policy: str, torch: list[float], surrogate: list[float], region: str = "full_scene") -> list[ConditionAp]:
@@ -93,6 +93,24 @@ def test_a_set_is_flown_condition_by_condition_within_its_budgets(monkeypatch: p
     assert flown[2:4] == [("all-4", conditions.conditions[0].budget, conditions.seeds[0])] * 2
     assert {v.condition for v in found} == {c.name for c in conditions.conditions}
     assert all(v.torch == v.surrogate for v in found)
+
+
+@pytest.mark.parametrize("name", ["example.yaml", "conditions"])
+def test_what_is_overridden_is_overridden_in_every_sortie(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (path := tmp_path / "example.yaml").write_text(BASE)
+    joins = []
+
+    def fly(scenario: Scenario, policy: None, seed: int, *, detector_of: object) -> None:
+        joins.append(scenario.perception.join)
+
+    monkeypatch.setattr("sortie.sim.studies.in_flight.run_sortie", fly)
+    monkeypatch.setattr("sortie.sim.studies.in_flight.both_matched", lambda record: {region: {} for region in REGIONS})
+    flown = str(path) if name == "example.yaml" else name
+    list(flights(flown, SHIPPED, None, 2.0, ["silence"], sets=["perception.join=nms"]))
+    assert joins
+    assert set(joins) == {"nms"}
 
 
 def test_a_condition_is_flown_in_many_towns_and_judged_as_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
