@@ -7,7 +7,7 @@ SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
 
 
-.PHONY: help sortie screenshot test test-all lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks outputs fuzz docs
+.PHONY: help sortie screenshot test test-all lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks outputs fuzz docs test-lowest
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -33,6 +33,15 @@ test: $(STAMP) ## run the test suite but for its slow tests, a worker a core
 
 test-all: $(STAMP) ## run the whole test suite
 	$(BIN)/python -m pytest -n auto
+
+test-lowest: ## test the lowest versions that pyproject.toml allows, without torch, in .venv-lowest (Python 3.11)
+	$(PYTHON) -m venv --clear .venv-lowest
+	.venv-lowest/bin/python -m pip install --quiet uv
+	.venv-lowest/bin/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct \
+		-e '.[mavlink,ros2,verify]' 'pytest>=8.2' 'hypothesis>=6.100' 'pytest-benchmark>=5' 'pyulog>=1.1' 'shapely>=2.0.6'
+	.venv-lowest/bin/sortie fly track_target --set perception.detector=surrogate --set duration_s=5 --out .venv-lowest/run
+	@# the one left out counts the operations of the torch network
+	.venv-lowest/bin/python -m pytest -m 'not slow' tests/scenarios tests/policies tests/radio tests/fleet --ignore tests/fleet/test_fleet_computer.py
 
 lint: $(STAMP) ## style and types
 	$(BIN)/ruff check .

@@ -36,6 +36,7 @@ from sortie.radio.sample import Sample, Service, Use
 from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission
 from sortie.scenarios.link_state import SILENT_MBPS, WAITING_MBPS
+from sortie.scenarios.plain_sum import plain_sum
 
 # an enumeration's member costs a quarter of a microsecond to look up, and each sample needs some ten look-ups
 _DEADLINE_QUEUED, _DEADLINE_IN_SERVICE = End.DEADLINE_QUEUED, End.DEADLINE_IN_SERVICE
@@ -453,7 +454,7 @@ class Air:
                 path = self._routes.path(sender, target) if target != sender else [sender]
                 if len(path) > 2:
                     hops = [rows.setdefault(a, self._known_mbps(a))[b] for a, b in pairwise(path)]
-                    known[target] = 1.0 / sum(1.0 / mbps for mbps in hops) if min(hops) > 0.0 else 0.0
+                    known[target] = 1.0 / plain_sum(1.0 / mbps for mbps in hops) if min(hops) > 0.0 else 0.0
         del known[sender]
         return tuple(known)
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sortie.scenarios.intervals import LEVEL, Estimate, mean_interval
+from sortie.scenarios.plain_sum import plain_sum
 
 LEAST_PAIRS = 4
 """Below so many units with both measurements there is no coefficient; the expensive ones are averaged alone."""
@@ -111,10 +112,10 @@ def _welch(parts: tuple[float, float], degrees: tuple[float, float], level: floa
     """Half the interval of a sum of two independent means with these squared standard errors."""
     from scipy.special import stdtrit  # here: half of what this module takes to import
 
-    total = sum(parts)
+    total = plain_sum(parts)
     if total == 0:
         return 0.0
-    freedom = total**2 / sum(part**2 / of for part, of in zip(parts, degrees, strict=True))
+    freedom = total**2 / plain_sum(part**2 / of for part, of in zip(parts, degrees, strict=True))
     return float(stdtrit(freedom, 0.5 + level / 2)) * math.sqrt(total)
 
 

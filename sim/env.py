@@ -30,6 +30,7 @@ from pettingzoo import ParallelEnv
 from sortie.perception.metrics.ap import average_precision
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.observation import CHOICES, LIMIT, ROW, Obs, directives, observe
+from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import DroneJoins, Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.identity import code_version
@@ -339,10 +340,10 @@ class TeamEnv(gymnasium.Env[Obs, np.ndarray[Any, Any]]):
         given = {a: rows[int(a.removeprefix("drone_"))] for a in self.drones.agents}
         observations, rewards, _, over, infos = self.drones.step(given)
         seen = [i["ap50"] for i in infos.values() if i["ap50"] is not None]
-        info: dict[str, Any] = {name: sum(i[name] for i in infos.values()) for name in ("sent_bytes", "spent_j")}
+        info: dict[str, Any] = {name: plain_sum(i[name] for i in infos.values()) for name in ("sent_bytes", "spent_j")}
         if seen:
             info["ap50"] = float(np.mean(seen))
-        reward = sum(rewards.values()) / len(self.drones.possible_agents)
+        reward = plain_sum(rewards.values()) / len(self.drones.possible_agents)
         done = any(over.values())
         return self._stacked(observations), reward, not self.drones.agents and not done, done, info
 

@@ -46,16 +46,6 @@ def code_version() -> str:
     return f"{RELEASE}+{digest.hexdigest()[:16]}"
 
 
-def release_of(code: str) -> str:
-    """The release in a `code_version`.
-
-    Example:
-        >>> release_of("0.1.0+0123456789abcdef")
-        '0.1.0'
-    """
-    return code.partition("+")[0]
-
-
 def _argument(value: object) -> str:
     """An argument as text that is the same in every process: the repr of most objects holds an address."""
     plain = value is None or isinstance(value, str | int | float)
@@ -69,8 +59,8 @@ def name_of(thing: object) -> str:
     may do something else. Without one it is the module and the qualified name, with the arguments that a `partial` binds.
 
     Example:
-        >>> name_of(functools.partial(release_of, code="0.1.0+0"))
-        "sortie.sim.identity.release_of(code='0.1.0+0')"
+        >>> name_of(functools.partial(file_digest, path="a"))
+        "sortie.sim.identity.file_digest(path='a')"
     """
     if isinstance(thing, functools.partial):
         bound = [*map(_argument, thing.args), *(f"{key}={_argument(value)}" for key, value in thing.keywords.items())]

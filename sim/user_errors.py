@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,6 +17,8 @@ EXTRAS = {"matplotlib": "report", "SALib": "campaign", "threadpoolctl": "campaig
 def missing(error: ImportError) -> Exception:
     """The extra that an import lacks, as one line; what no extra brings is the error itself."""
     name = (error.name or "").partition(".")[0]
+    if name == "cyclonedds" and sys.version_info >= (3, 14):
+        return RunError("cyclonedds is missing: it has no wheels for Python 3.14; use Python 3.11 to 3.13")
     return RunError(f"{name} is missing: pip install 'sortie-sim[{EXTRAS[name]}]'") if name in EXTRAS else error
 
 

@@ -25,6 +25,7 @@ from sortie.fleet.energy.cell import (
     resistance_factor,
 )
 from sortie.fleet.energy.recorded import BatteryTrace
+from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import Battery, DroneOverride
 
 CAUSES = ("rotor", "avionics", "compute", "radio", "ohmic", "fault")
@@ -120,7 +121,7 @@ class FleetBatteries:
     @property
     def spent_j(self) -> list[float]:
         """Energy that left each drone's pack since take-off, J: the ledger's sum over all causes."""
-        return [sum(causes) for causes in zip(*self.energy_j.values(), strict=True)]
+        return [plain_sum(causes) for causes in zip(*self.energy_j.values(), strict=True)]
 
     def step(
         self, dt_s: float, rotor_w: Sequence[float], duty: Sequence[float], airtime_share: Sequence[float]

@@ -19,6 +19,7 @@ from sortie.perception.evaluation.condition import Unsent
 from sortie.perception.evaluation.measures import ApOf, Elsewhere, Region, Scores
 from sortie.perception.evaluation.verdict import ClaimVerdict, MeasuredValue
 from sortie.scenarios.intervals import benjamini_hochberg
+from sortie.scenarios.plain_sum import plain_sum
 
 INSTRUMENTS: dict[Unsent, str] = {"zero": "the paper's instrument", "masked": "masked fusion"}
 """How cells that were not sent count, and the heading of that column."""
@@ -140,7 +141,7 @@ def differ_by_chance(rows: Iterable[ClaimRow], claims: Sequence[Claim] = CLAIMS)
         claim, wide = by_id[row.id], (high - low) / (_NORMAL[-1] - _NORMAL[0])
         drawn = (MeasuredValue(value + d, low + d, high + d, low_90 + d, high_90 + d) for d in (wide * _DRAWS).tolist())
         count = Counter(claim.rule(claim.paper, m).verdict for m in drawn)
-        expected += 1.0 - sum((n / len(_DRAWS)) ** 2 for n in count.values())
+        expected += 1.0 - plain_sum((n / len(_DRAWS)) ** 2 for n in count.values())
     return expected
 
 

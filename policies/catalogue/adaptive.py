@@ -32,6 +32,7 @@ from sortie.policies.contract import (
     nothing,
 )
 from sortie.policies.geometry import footprint_overlap, peers_by_overlap
+from sortie.scenarios.plain_sum import plain_sum
 
 CARRIED = 0.5
 """A drone sends at most this share of its mean goodput, because the others send as well."""
@@ -124,8 +125,8 @@ def features(view: FleetView, sent_budget: float) -> tuple[float, ...]:
     if me is None:
         return (0.0,) * len(FEATURES)
     peers = view.peers
-    overlap = sum(footprint_overlap(me, view.descriptors[p]) for p in peers) / len(peers) if peers else 0.0
-    goodput_mbps = sum(me.goodput_to(p) for p in peers) / len(peers) if peers else 0.0
+    overlap = plain_sum(footprint_overlap(me, view.descriptors[p]) for p in peers) / len(peers) if peers else 0.0
+    goodput_mbps = plain_sum(me.goodput_to(p) for p in peers) / len(peers) if peers else 0.0
     tracking = me.task_phase == TaskPhase.TRACK and me.region is not None
     return log10(max(sent_budget, 1e-4)), float(tracking), overlap, log10(1.0 + max(0.0, goodput_mbps)), me.battery_soc
 
@@ -165,7 +166,7 @@ def learned(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
     """The arm with the largest predicted gain, by a model of simulated sorties (`sortie learn`); ties go to the earlier arm."""
     seen = features(view, sent_budget)
     z = [(x - m) / s for x, m, s in zip(seen, _MODEL.mean, _MODEL.scale, strict=True)]
-    gains = [w[0] + sum(a * b for a, b in zip(w[1:], z, strict=True)) for w in _MODEL.weights]
+    gains = [w[0] + plain_sum(a * b for a, b in zip(w[1:], z, strict=True)) for w in _MODEL.weights]
     best = max(range(len(ARMS)), key=lambda k: gains[k])
     return spend(view, ARMS[best], sent_budget, "learned")
 

@@ -24,6 +24,7 @@ from sortie.policies.verification.invariants import (
     walk,
 )
 from sortie.policies.verification.words import DECISIONS, WORDS
+from sortie.scenarios.plain_sum import plain_sum
 
 Ask = Callable[["Context", Directive], Any]
 """The value of an expression in a context, for one link."""
@@ -280,7 +281,7 @@ def _over_links(function: str, body: Ask) -> Ask:
         return lambda context, _: all(body(context, d) for d in context.directives)
     if function == "count_links":
         return lambda context, _: sum([1 if body(context, d) else 0 for d in context.directives])
-    return lambda context, _: sum([body(context, d) for d in context.directives])
+    return lambda context, _: plain_sum([body(context, d) for d in context.directives])
 
 
 def _other_links(body: Ask) -> Ask:

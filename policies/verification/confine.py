@@ -31,11 +31,12 @@ SHARED = frozenset(
     {
         "sortie.scenarios.disc",
         "sortie.scenarios.link_state",
+        "sortie.scenarios.plain_sum",
         "sortie.scenarios.representation",
         "sortie.scenarios.streams",
     }
 )
-"""Modules of another room that a policy may use: two types, and random draws that depend on their key alone."""
+"""Modules of another room that a policy may use: two types, a sum, and random draws that depend on their key alone."""
 FORBIDDEN = frozenset({
     "simpy", "sortie.fleet", "sortie.perception", "sortie.radio", "sortie.scenarios", "sortie.sim", "torch"
 })  # fmt: skip

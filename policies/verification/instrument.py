@@ -332,9 +332,12 @@ def _float(*args: Any) -> Any:
 
 def _sum(items: Any, /, start: Any = 0) -> Any:
     listed = list(_each(items))
-    if sys.version_info >= (3, 12) and any(isinstance(x, Ranged) and type(x).__name__ == "Ranged" for x in listed):
+    found = sum(listed, start)
+    floats = len(listed) + (type(start) is not int or start != 0)
+    # Two floats have the same sum either way, and the solver follows combined inputs without rounding.
+    if sys.version_info >= (3, 12) and floats > 2 and type(found).__name__ == "Ranged":
         _stop("adds up floats with sum(…), which compensates rounding")
-    return sum(listed, start)
+    return found
 
 
 def _plain_sorted(*args: Any, **kwargs: Any) -> Any:

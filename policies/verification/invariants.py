@@ -44,6 +44,7 @@ from sortie.policies.verification.words import (
     link_of,
 )
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.representation import NAME_OF
 
 
@@ -382,7 +383,7 @@ def evaluate(node: Node, scope: Scope) -> Any:
                 return any(links)
             if node.function == "every_link":
                 return all(links)
-            return sum(1 if v else 0 for v in links) if node.function == "count_links" else sum(links)
+            return sum(1 if v else 0 for v in links) if node.function == "count_links" else plain_sum(links)
 
 
 def just_heard(view: FleetView) -> FleetView:

@@ -28,6 +28,8 @@ _LEAVES = (
 _PYTHONS_OWN = {
     "__name__", "__doc__", "__package__", "__loader__", "__spec__", "__file__", "__cached__", "__builtins__", "__path__",
     "__annotations__", "__dataclass_fields__", "__dataclass_params__", "__match_args__", "__dict__", "__weakref__",
+    "__annotate__", "__annotate_func__", "__annotations_cache__", "__conditional_annotations__", "__firstlineno__",
+    "__static_attributes__",
 }  # fmt: skip
 """Names that Python itself gives to a module or a class."""
 

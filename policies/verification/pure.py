@@ -31,7 +31,7 @@ IMPURE = frozenset({
 })  # fmt: skip
 _TRUSTED = (
     "sortie.policies.contract", "sortie.policies.geometry", "sortie.policies.catalogue", "sortie.scenarios.disc",
-    "sortie.scenarios.link_state", "sortie.scenarios.representation",
+    "sortie.scenarios.link_state", "sortie.scenarios.plain_sum", "sortie.scenarios.representation",
 )  # fmt: skip
 _SEEDED = frozenset({"random.Random", "sortie.scenarios.streams.stream"})
 """Random draws that depend on their seed alone: allowed, but no search follows them."""

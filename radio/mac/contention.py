@@ -12,6 +12,8 @@ from functools import lru_cache
 
 from scipy.optimize import brentq
 
+from sortie.scenarios.plain_sum import plain_sum
+
 SLOT_S = 9e-6
 SIFS_S = 16e-6
 DIFS_S = 34e-6
@@ -48,7 +50,7 @@ def contention(senders: int) -> Contention:
     doublings = ((CW_MAX + 1) // window).bit_length() - 1
 
     def tau(p: float) -> float:
-        return 2.0 / (1.0 + window + p * window * sum((2.0 * p) ** i for i in range(doublings)))
+        return 2.0 / (1.0 + window + p * window * plain_sum((2.0 * p) ** i for i in range(doublings)))
 
     def excess(p: float) -> float:
         return p - (1.0 - (1.0 - tau(p)) ** (senders - 1))

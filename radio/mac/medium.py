@@ -27,6 +27,7 @@ from sortie.radio.mac.airtime import CONTROL_MBPS, ampdu_frames, frame_bytes
 from sortie.radio.mac.jobs import AirJob, End, GroupFrame
 from sortie.radio.rates import CURVES, LEGACY_CURVES, STANDARDS, group_curve
 from sortie.radio.settings import AirSettings, EdcaSettings
+from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.streams import stream
 
 J = TypeVar("J", bound=AirJob)
@@ -558,7 +559,7 @@ class Medium(Generic[J, F]):
     def utilisation(self) -> float:
         """Fraction of the time so far in which something was on the air."""
         elapsed = self._env.now - self._begin_s
-        return min(1.0, sum(self._busy_s()) / elapsed) if elapsed > 0 else 0.0
+        return min(1.0, plain_sum(self._busy_s()) / elapsed) if elapsed > 0 else 0.0
 
 
 _ENDS = {1: End.ARRIVED, 2: End.OVER, 3: End.UNREACHABLE}

@@ -6,7 +6,7 @@ from setuptools import setup
 
 setup(
     name="sortie_ros",
-    version="0.1.0",
+    version="0.2.0",
     packages=["sortie_ros"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/sortie_ros"]),

@@ -22,6 +22,7 @@ from sortie.fleet.trust import discounted
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, Representation, nothing
 from sortie.policies.damping import is_switch
 from sortie.policies.registry import describe_error
+from sortie.scenarios.plain_sum import plain_sum
 from sortie.sim.results.arrow_types import columns_of, from_table, to_table
 from sortie.sim.results.views import Decision
 
@@ -78,12 +79,12 @@ def pairs_of(table: pa.Table) -> list[Pair]:
 def figures(pairs: Iterable[Pair]) -> dict[str, Any]:
     """The outcome's figures (`sortie.sim.results.outcome_fields.Disagreement`); all null where nothing was compared."""
     pairs = list(pairs)
-    compared_s = sum(pair.compared_s for pair in pairs)
+    compared_s = plain_sum(pair.compared_s for pair in pairs)
     episodes = [episode for pair in pairs for episode in pair.episodes]
     lasted_s = np.array([e.duration_s for e in episodes])
 
     def share(chosen: Callable[[Episode], bool]) -> float | None:
-        return sum(e.duration_s for e in episodes if chosen(e)) / compared_s if compared_s else None
+        return plain_sum(e.duration_s for e in episodes if chosen(e)) / compared_s if compared_s else None
 
     return {
         "share": share(lambda e: True),

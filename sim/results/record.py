@@ -28,7 +28,6 @@ from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.scenarios import scratch
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
-from sortie.sim.identity import release_of
 from sortie.sim.results.rosters import RosterLog
 from sortie.sim.results.spool import BATCH_BYTES, FIRST_ROWS, Spool, SpooledTables, Unfold, batches, schema_of
 
@@ -37,6 +36,8 @@ DECISIONS_OF = "decisions_of "
 """Prefix of the totals that count each policy's decisions."""
 VIOLATIONS_OF = "violations_of "
 """Prefix of the totals that count violations by cause."""
+_FINGERPRINT = "0.1.0"
+"""The rule of the fingerprint, which hashes it first. It is named after the release that began it; later releases keep it."""
 HANDSHAKE = "handshake"
 """The `representation` of transmissions that carry a method's requests and answers, and no payload."""
 _LINKS = {link: link.name.lower() for link in LinkHealth}
@@ -165,11 +166,11 @@ class SortieRecord:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over release, policy, seed and every table's values; equal records have equal fingerprints.
+        """SHA-256 over policy, seed and every table's values; equal records have equal fingerprints.
 
-        The code's digest stays out of it: a change of code that leaves every value as it was leaves the fingerprint too.
+        The version stays out of it: a change of code that leaves every value as it was leaves the fingerprint too.
         """
-        digest = hashlib.sha256(f"{release_of(self.version)}/{self.policy}/{self.seed}/{self.replication}".encode())
+        digest = hashlib.sha256(f"{_FINGERPRINT}/{self.policy}/{self.seed}/{self.replication}".encode())
         for name in sorted(self.tables.keys() & TABLES.keys()):
             digest.update(name.encode())
             for column in schema_of(self.tables, name).names:

@@ -17,7 +17,7 @@ from places import ROOT
 from sortie.sim.identity import code_version
 
 NOT_SOURCES = shutil.ignore_patterns(
-    ".git", ".venv", ".*_cache", "__pycache__", "runs", "build", "dist", "*.egg-info", ".hypothesis"
+    ".git", ".venv*", ".*_cache", "__pycache__", "runs", "build", "dist", "*.egg-info", ".hypothesis"
 )
 OWN = ("sim", "policies", "scenarios", "fleet", "radio", "perception")
 """Names that a project may have for packages of its own."""

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 QUICK = ("-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--tb=line", "--no-header")
-LEFT_OUT = (".git", ".venv", "runs", "docs", "notebooks", "*.egg-info", ".mypy_cache", ".ruff_cache", ".pytest_cache")
+LEFT_OUT = (".git", ".venv*", "runs", "docs", "notebooks", "*.egg-info", ".mypy_cache", ".ruff_cache", ".pytest_cache")
 CACHES = {"lru_cache", "cache", "cached_property"}
 LOUD = ("BitOr", "BitAnd", "BitXor", "Shift")
 """Operators of whole numbers, which fail on the first float that they meet: a test that runs the line notices them."""

@@ -13,6 +13,7 @@ from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.prior.matching import scores_for
 from sortie.policies.contract import Directive, FleetView, boxes_across_networks, nothing
+from sortie.scenarios.plain_sum import plain_sum
 
 KEPT_ABOVE = 0.2
 """A link with more attention than this is kept; the method's value in tests."""
@@ -33,7 +34,7 @@ def when2com(
     directives = []
     for peer in view.peers:
         scores = scores_for(view, peer)
-        mass = 1.0 + sum(exp(sharpness * s) for s in scores.values())
+        mass = 1.0 + plain_sum(exp(sharpness * s) for s in scores.values())
         attention = exp(sharpness * scores[view.ego]) / mass
         why = f"attention {attention:.2f} " + (">" if attention > threshold else "≤") + f" {threshold:g}"
         kept = full_sharing(view.ego, peer, rho, why) if attention > threshold else nothing(view.ego, peer, why)

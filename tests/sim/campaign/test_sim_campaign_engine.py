@@ -24,6 +24,7 @@ from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import Task, fly_batch
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
+from sortie.sim.identity import RELEASE
 from sortie.sim.user_errors import user_errors
 
 pytest.importorskip("distributed")
@@ -203,7 +204,7 @@ def test_batches_are_about_a_second_long() -> None:
 
 def test_a_worker_with_other_code_flies_nothing(tmp_path: Path) -> None:
     p = plan(tmp_path)
-    with pytest.raises(RunError, match=r"this worker runs Sortie 0.1.0\+[0-9a-f]+, the campaign is of other"):
+    with pytest.raises(RunError, match=rf"this worker runs Sortie {RELEASE}\+[0-9a-f]+, the campaign is of other"):
         run_campaign(CampaignPlan({**p.spec, "code": "other"}), tmp_path / "a", InProcess())
 
 

@@ -28,6 +28,7 @@ from sortie.sim.campaign.store import FILE, CampaignStore
 from sortie.sim.campaign.table import TABLE
 from sortie.sim.campaign.work import RunResult, Task
 from sortie.sim.folders import RunError
+from sortie.sim.identity import RELEASE
 
 
 def flown(p: CampaignPlan, folder: Path, **how: object) -> dict[str, bytes]:
@@ -257,7 +258,9 @@ def test_folders_of_others_are_refused(tmp_path: Path) -> None:
         run_campaign(wider, folder, Pretended())
     with pytest.raises(RunError, match=r"holds results of another campaign, its base.duration_s differs"):
         run_campaign(plan(tmp_path, base=BASE.replace("0.5", "0.6")), folder, Pretended())
-    with pytest.raises(RunError, match=r"a: holds results of Sortie 0.1.0\+[0-9a-f]+, this is other; name another"):
+    with pytest.raises(
+        RunError, match=rf"a: holds results of Sortie {RELEASE}\+[0-9a-f]+, this is other; name another"
+    ):
         run_campaign(CampaignPlan({**p.spec, "code": "other"}), folder, Pretended())
     assert table_bytes(folder) == before
     change(folder, "UPDATE plan SET spec = replace(spec, '\"seed\": 5', '\"seed\": 7')")
