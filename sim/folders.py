@@ -35,13 +35,14 @@ def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = 
     Raises:
         RunError: it holds something else, or cannot be made.
     """
-    if path.exists() and not path.is_dir():
-        raise RunError(f"{path}: is a file, a {what} needs a folder")
-    if path.is_dir() and any(path.iterdir()) and not (path / holds).is_file():
-        raise RunError(f"{path}: holds files but no {holds}; a {what} would replace them, name another folder")
-    if written and path.is_dir() and (others := _others(path, written)):
-        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-        raise RunError(f"{path}: holds {others[0]}{more}, which no {what} wrote; choose another folder or move it")
+    with settled(path):
+        if path.exists() and not path.is_dir():
+            raise RunError(f"{path}: is a file, a {what} needs a folder")
+        if path.is_dir() and any(path.iterdir()) and not (path / holds).is_file():
+            raise RunError(f"{path}: holds files but no {holds}; a {what} would replace them, name another folder")
+        if written and path.is_dir() and (others := _others(path, written)):
+            more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+            raise RunError(f"{path}: holds {others[0]}{more}, which no {what} wrote; choose another folder or move it")
     _ensure_place(path)
 
 
@@ -89,6 +90,20 @@ def replacing(path: Path, check: Callable[[], None] = lambda: None) -> Iterator[
                 _replace(partial, place)
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+@contextmanager
+def settled(path: Path) -> Iterator[None]:
+    """A block in which nobody replaces a folder, so that what is read of it belongs together.
+
+    Not within `replacing` of the same folder, which would wait for itself.
+    """
+    place = path.resolve()
+    if not os.access(place.parent, os.W_OK):  # nobody can replace it
+        yield
+        return
+    with _alone(place):
+        yield
 
 
 def write_text(path: Path, text: str) -> None:

@@ -20,7 +20,7 @@ from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded
 from sortie.sim.cli.view import view
 from sortie.sim.engine.watchers import Watcher, Watchers
-from sortie.sim.folders import RunError
+from sortie.sim.folders import RunError, settled
 from sortie.sim.identity import own_files
 from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results import run_folder
@@ -100,7 +100,8 @@ def fly(
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = bar(flown.name, flown.duration_s)
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
-    other, note = run_folder.in_place_of(path, flight.fingerprint), ""
+    with settled(path):
+        other, note = run_folder.in_place_of(path, flight.fingerprint), ""
     try:
         flight.save(path, recording=recording, replace=replace)
         if other:

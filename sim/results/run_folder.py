@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from sortie.scenarios.reading.load import ScenarioError, dump, loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import models_of_the_past
-from sortie.sim.folders import RunError, ensure_folder, replacing
+from sortie.sim.folders import RunError, ensure_folder, replacing, settled
 from sortie.sim.results import beliefs, disagreement, rosters, views
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import TABLES, SortieRecord
@@ -84,8 +84,9 @@ def ensure_writable(path: Path) -> None:
         RunError: it holds something that is no run, or besides a run what is not of it; or it cannot be made.
     """
     ensure_folder(path, OUTCOME, "run", WRITTEN)
-    if (path / PAGE).is_file() and not _is_of_the_run(path / PAGE):
-        raise RunError(f"{path}: holds {PAGE}, which is not of the run there; choose another folder or move it")
+    with settled(path):
+        if (path / PAGE).is_file() and not _is_of_the_run(path / PAGE):
+            raise RunError(f"{path}: holds {PAGE}, which is not of the run there; choose another folder or move it")
 
 
 def ensure_same(path: Path, scenario: Scenario, seed: int, replication: int, files: Mapping[str, str]) -> None:
@@ -94,15 +95,16 @@ def ensure_same(path: Path, scenario: Scenario, seed: int, replication: int, fil
     Raises:
         OtherRunError: naming the first field that differs.
     """
-    if not (path / OUTCOME).is_file():
-        return
     new: dict[str, Any] = {"seed": seed, "replication": replication, "own_files": dict(files)}
-    try:
-        about = json.loads((path / RECORD).read_text())
-        old = {name: about[name] for name in new}
-        there = _scenario_of(path).model_dump(mode="json")
-    except (OSError, ValueError, TypeError, LookupError) as error:
-        raise OtherRunError(f"{path}: holds a run that cannot be read, {_INSTEAD}") from error
+    with settled(path):
+        if not (path / OUTCOME).is_file():
+            return
+        try:
+            about = json.loads((path / RECORD).read_text())
+            old = {name: about[name] for name in new}
+            there = _scenario_of(path).model_dump(mode="json")
+        except (OSError, ValueError, TypeError, LookupError) as error:
+            raise OtherRunError(f"{path}: holds a run that cannot be read, {_INSTEAD}") from error
     found = _difference(old, new) or _difference(there, scenario.model_dump(mode="json"))
     if found is not None:
         raise OtherRunError(f"{path}: holds another run: {found}; {_INSTEAD}")
@@ -130,7 +132,8 @@ def save(
             raise OtherRunError(f"{path}: holds {other}; {_INSTEAD}")
 
     ensure_writable(path)
-    check()
+    with settled(path):
+        check()
     result = outcome(record)
     with replacing(path, check) as partial:
         (partial / OUTCOME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")

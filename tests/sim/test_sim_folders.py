@@ -58,17 +58,17 @@ def test_of_many_writers_each_writes_whole(tmp_path: Path) -> None:
     """The same record saved by many threads at once: each succeeds, and one whole run is there."""
     record, path = run_sortie(example("duration_s=0.1")), tmp_path / "run"
     failed: list[Exception] = []
-    together = threading.Barrier(4)
+    together = threading.Barrier(6)
 
     def save() -> None:
         together.wait()
         try:
-            for _ in range(3):
+            for _ in range(10):
                 run_folder.save(record, path)
         except Exception as error:
             failed.append(error)
 
-    threads = [threading.Thread(target=save) for _ in range(4)]
+    threads = [threading.Thread(target=save) for _ in range(6)]
     for thread in threads:
         thread.start()
     for thread in threads:
