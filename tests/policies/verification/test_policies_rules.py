@@ -328,7 +328,7 @@ def uses_the_api(view: FleetView) -> list[Directive]:
 
 
 def flies_a_sortie(view: FleetView) -> list[Directive]:
-    sortie.fly("track_target", {"duration_s": 1})
+    sortie.fly("track_target", {"duration_s": 1, "perception.detector": "none"})
     return []
 
 
