@@ -99,7 +99,7 @@ def settled(path: Path) -> Iterator[None]:
     Not within `replacing` of the same folder, which would wait for itself.
     """
     place = path.resolve()
-    if not os.access(place.parent, os.W_OK):  # nobody can replace it
+    if not (place.parent.is_dir() and os.access(place.parent, os.W_OK)):  # nobody can replace it
         yield
         return
     with _alone(place):
