@@ -92,6 +92,7 @@ def rank(
     against: Sequence[str] | None = None,
     again: bool = False,
     by_torch: bool = False,
+    further: int | None = None,
     workers: int = 1,
     folder: str | Path = "runs/rank",
     progress: Callable[[str, int, int], None] | None = None,
@@ -107,7 +108,10 @@ def rank(
         against: names of the policies to rank among. None takes every built-in policy with stored results; with `again`,
             every built-in policy.
         again: fly the policies of `against` too, instead of taking their stored results.
-        by_torch: fly every policy with the neural detector, which takes minutes for each.
+        by_torch: fly every policy with the neural detector, which takes minutes for each. The surrogate flies too, as
+            control variate: it makes the intervals narrower and shifts nothing.
+        further: with `by_torch`, the number of further draws of the suite, of thirty conditions each, that only the
+            surrogate flies. None takes 3 for a suite of the library and 0 for a file; 0 takes torch alone.
         workers: number of processes that fly policies given by name. Callables fly in this process.
         folder: flights of policies given by name are kept here, so that an interrupted ranking goes on.
         progress: called with a stage, the number of its steps that are done, and the number of all its steps.
@@ -136,6 +140,8 @@ def rank(
         raise PolicyError(f"against: {against!r}, must be a list of names: ['worked', 'silence']")
     if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
         raise RunError(f"workers: {workers!r}, must be a whole number from 1 on")
+    if further is not None and (isinstance(further, bool) or not isinstance(further, int) or not 0 <= further <= 100):
+        raise RunError(f"further: {further!r}, must be None or a whole number from 0 to 100")
     with user_errors():
         ranked = rank_entries(
             entries,
@@ -144,6 +150,7 @@ def rank(
             against=against,
             again=again,
             by_torch=by_torch,
+            further=further,
             workers=workers,
             progress=progress or (lambda stage, done, of: None),
         )

@@ -33,9 +33,17 @@ def rank(
         bool,
         typer.Option(
             "--by-torch",
-            help="Fly every policy with the neural detector instead of the surrogate; it takes minutes for each policy.",
+            help="Fly every policy with the neural detector, and use the surrogate to make its intervals narrower (control variates); it takes minutes for each policy.",
         ),
     ] = False,
+    further: Annotated[
+        int | None,
+        typer.Option(
+            help="With --by-torch: further draws of the suite, of thirty conditions each, that only the surrogate flies; 0: torch alone. Default: 3 for a suite of the library, 0 for a file.",
+            min=0,
+            max=100,
+        ),
+    ] = None,
     workers: Annotated[int, typer.Option(help="Number of processes.", min=1)] = 1,
     out_dir: Annotated[
         Path,
@@ -53,7 +61,7 @@ def rank(
     with stages() as report:
         ranking = sortie.rank(
             split_policies(policies), suite=suite, against=None if against is None else split_policies(against),
-            again=again, by_torch=by_torch, workers=workers, folder=out_dir, progress=report,
+            again=again, by_torch=by_torch, further=further, workers=workers, folder=out_dir, progress=report,
         )  # fmt: skip
     out.print(ranking.summary())
     ranking.save(out_dir)

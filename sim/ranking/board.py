@@ -14,6 +14,7 @@ from rich.table import Table
 
 from sortie.scenarios.intervals import Estimate
 from sortie.scenarios.report_text import NONE, interval, listed, number, percent, size
+from sortie.sim.ranking.flights import Flight
 from sortie.sim.ranking.places import Standing
 from sortie.sim.ranking.rank import Ranked
 from sortie.sim.results.summary import Summary
@@ -106,6 +107,14 @@ def sentences(ranked: Ranked) -> Iterator[str]:
         "or told no peer of the target in its region. verified: what `sortie verify` finds. decides: median time of a "
         "decision on this machine.[/dim]"
     )
+    if ranked.control is not None:
+        further = len(ranked.control.suite.conditions) - ranked.conditions
+        yield (
+            f"[dim]AP is by {ranked.detector}, made more precise by the surrogate: it flew the same conditions and {further} "
+            "further ones of the same kind (control variates; unbiased whatever the surrogate's error). Intervals of "
+            f"differences are {ranked.width:.2f} times as wide as by {ranked.detector} alone. All other figures are of the "
+            f"flights by {ranked.detector}.[/dim]"
+        )
     if ranked.stored is not None:
         yield f"[dim]The built-in policies were flown with Sortie {ranked.stored}; --again flies them here.[/dim]"
     if ranked.stale:
@@ -142,8 +151,14 @@ def plain(ranked: Ranked) -> dict[str, Any]:
             policy: {other: _estimate(pair.difference) for other, pair in ranked.against(policy).items()}
             for policy in ranked.entries
         },
-        "flights": {p: {c: asdict(f) for c, f in of.items()} for p, of in ranked.flights.items()},
+        "flights": _flights(ranked.flights),
+        "by_surrogate": None if ranked.control is None else _flights(ranked.control.flights),
+        "width_with_surrogate": ranked.width,
     }
+
+
+def _flights(flights: Mapping[str, Mapping[str, Flight]]) -> dict[str, Any]:
+    return {p: {c: asdict(f) for c, f in of.items()} for p, of in flights.items()}
 
 
 def draw(ranked: Ranked, path: Path) -> Path:

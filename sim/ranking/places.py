@@ -6,10 +6,13 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sortie.scenarios.intervals import AMOUNT, LEVEL, SHARE, Estimate, Floats, mean_interval
+from sortie.scenarios.control_variates import controlled_mean
+from sortie.scenarios.intervals import AMOUNT, LEVEL, SHARE, Estimate, Floats, Range, mean_interval
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.folders import RunError
 from sortie.sim.ranking.flights import METRICS, Flight
@@ -26,7 +29,7 @@ class Standing:
     within theirs."""
     score: Estimate
     """Mean AP@0.5 over conditions: of the mission region in conditions with a region, else of the full scene. The interval
-    is Student's, 95 %, over conditions."""
+    is Student's, 95 %, over conditions; with `Control`, as `control_variates.controlled_mean` has it."""
     failed: tuple[str, ...]
     """Conditions in which the policy failed. It has a score of 0 there, the lowest."""
     figures: Mapping[str, Estimate]
@@ -53,35 +56,73 @@ class PairDifference:
         return (self.difference.low > 0) - (self.difference.high < 0)
 
 
-def scores(suite: ConditionSet, flights: Mapping[str, Mapping[str, Flight]]) -> dict[str, Floats]:
-    """[conditions] of each policy: the AP that counts there, 0 where the policy failed.
+class Control(NamedTuple):
+    """The surrogate's flights, as control variates for those by another detector."""
+
+    suite: ConditionSet
+    """The conditions of the ranking, in their order, and further ones behind them."""
+    flights: Mapping[str, Mapping[str, Flight]]
+    """Of the same policies in all of these conditions."""
+
+
+class Scored(NamedTuple):
+    """One policy's AP in each condition, or the difference of two policies'; 0 where a policy failed."""
+
+    ap: Floats
+    """[conditions]"""
+    surrogate: Floats
+    """[conditions and further ones], NaN where there is none; empty without `Control`."""
+
+    def minus(self, other: Scored) -> Scored:
+        """The difference, condition by condition."""
+        return Scored(self.ap - other.ap, self.surrogate - other.surrogate)
+
+    def mean(self, within: Range, level: float = LEVEL) -> Estimate:
+        """Over the conditions, corrected by the surrogate's where there are any."""
+        if not len(self.surrogate):
+            return mean_interval(self.ap, within, level)
+        paired, further = np.split(self.surrogate, [len(self.ap)])
+        return controlled_mean(self.ap, paired, further, level).estimate
+
+
+def scores(
+    suite: ConditionSet, flights: Mapping[str, Mapping[str, Flight]], control: Control | None = None
+) -> dict[str, Scored]:
+    """The AP of each policy in each condition, by the condition's metric.
 
     Conditions in which a policy has no AP although it flew, because no car was to be seen, are left out for all.
 
     Raises:
         RunError: no condition is left.
     """
-    found = {}
-    for policy, of_policy in flights.items():
-        values = [of_policy[c.name].values[f"ap50.{c.metric}"] for c in suite.conditions]
-        failed = [bool(of_policy[c.name].error) for c in suite.conditions]
-        found[policy] = np.array(
-            [0.0 if f else math.nan if v is None else v for v, f in zip(values, failed, strict=True)]
-        )
-    known = np.isfinite(list(found.values())).all(axis=0)
+    found = {policy: _aps(suite, of_policy) for policy, of_policy in flights.items()}
+    known: NDArray[np.bool_] = np.isfinite(np.array(list(found.values()))).all(axis=0)
     if not known.any():
         raise RunError("no condition has an accuracy under every policy: no car was to be seen, or nothing was scored")
-    return {policy: values[known] for policy, values in found.items()}
+    if control is None:
+        return {policy: Scored(values[known], np.zeros(0)) for policy, values in found.items()}
+    further = len(control.suite.conditions) - len(known)
+    kept = np.concatenate([known, np.full(further, True)])
+    return {
+        policy: Scored(values[known], _aps(control.suite, control.flights[policy])[kept])
+        for policy, values in found.items()
+    }
 
 
-def differences(scored: Mapping[str, Floats]) -> list[PairDifference]:
+def _aps(suite: ConditionSet, flights: Mapping[str, Flight]) -> Floats:
+    """[conditions]: 0 where the policy failed, NaN where no car was to be seen."""
+    each = [(flights[c.name], f"ap50.{c.metric}") for c in suite.conditions]
+    return np.array([0.0 if f.error else math.nan if f.values[name] is None else f.values[name] for f, name in each])
+
+
+def differences(scored: Mapping[str, Scored]) -> list[PairDifference]:
     """Every pair of policies once, in the order of the policies.
 
-    Intervals are Student's for paired differences, with Bonferroni's correction for the number of pairs.
+    Intervals are of paired differences, with Bonferroni's correction for the number of pairs.
     """
     pairs = list(itertools.combinations(scored, 2))
     level = 1 - (1 - LEVEL) / max(1, len(pairs))
-    return [PairDifference(a, b, mean_interval(scored[a] - scored[b], SHARE.of_differences(), level)) for a, b in pairs]
+    return [PairDifference(a, b, scored[a].minus(scored[b]).mean(SHARE.of_differences(), level)) for a, b in pairs]
 
 
 def places(policies: Sequence[str], pairs: Sequence[PairDifference]) -> dict[str, tuple[int, int]]:
@@ -106,19 +147,19 @@ def places(policies: Sequence[str], pairs: Sequence[PairDifference]) -> dict[str
 
 
 def standings(
-    suite: ConditionSet, flights: Mapping[str, Mapping[str, Flight]]
+    suite: ConditionSet, flights: Mapping[str, Mapping[str, Flight]], control: Control | None = None
 ) -> tuple[list[Standing], list[PairDifference]]:
     """All policies, the highest score first, and the differences that their places follow from.
 
     Raises:
         RunError: no condition has an accuracy under every policy.
     """
-    scored = scores(suite, flights)
+    scored = scores(suite, flights, control)
     pairs = differences(scored)
     place = places(list(scored), pairs)
     rows = [
         Standing(
-            policy, place[policy], mean_interval(scored[policy], SHARE),
+            policy, place[policy], scored[policy].mean(SHARE),
             tuple(c.name for c in suite.conditions if flights[policy][c.name].error),
             {name: _mean(name, flights[policy].values()) for name in METRICS},
         )

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from sortie.policies.contract import Policy, PolicyError
 from sortie.policies.registry import POLICIES, resolve
 from sortie.scenarios.reading.load import load_conditions
-from sortie.scenarios.schema.conditions import ConditionSet
+from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version
 from sortie.sim.ranking.flights import BY_TORCH, Flight, Flights, fly, fly_callable
-from sortie.sim.ranking.places import PairDifference, Standing, standings
+from sortie.sim.ranking.places import Control, PairDifference, Standing, standings
 from sortie.sim.ranking.stored import Results, read_results
-from sortie.sim.ranking.suite import NEWEST, digest_of, name_of
+from sortie.sim.ranking.suite import NEWEST, digest_of, further_conditions, name_of
 from sortie.sim.ranking.verdict import Verified, verify
 from sortie.sim.studies.conditions import scenario_of
 
@@ -24,6 +26,8 @@ SUITE = name_of(NEWEST)
 REFERENCE = "worked"
 """The policy whose flight in the first condition is compared with the stored one: equal records show that the stored
 results are those of this version, and the times of its decisions how fast this machine is beside the other."""
+FURTHER = 3
+"""Further draws of the suite that the surrogate flies for a ranking by torch."""
 
 
 class Entry(NamedTuple):
@@ -59,6 +63,10 @@ class Ranked:
     taken: tuple[str, ...]
     """Those with stored results."""
     conditions: int
+    control: Control | None
+    """The surrogate's flights, by which a ranking by torch was made more precise."""
+    width: float
+    """Median width of the intervals of pairs relative to those without `control`; 1 without it."""
 
     def row(self, policy: str) -> Standing:
         """One policy's."""
@@ -108,6 +116,7 @@ def rank(
     against: Sequence[str] | None = None,
     again: bool = False,
     by_torch: bool = False,
+    further: int | None = None,
     workers: int = 1,
     progress: Callable[[str, int, int], None] = lambda stage, done, of: None,
 ) -> Ranked:
@@ -120,7 +129,9 @@ def rank(
         against: names of the policies to rank them among; None is every built-in one with stored results, or every one where
             nothing stored is taken.
         again: fly these too, instead of taking the results that come with Sortie.
-        by_torch: fly with the neural detector.
+        by_torch: fly with the neural detector, and with the surrogate as control variate.
+        further: draws of the suite that the surrogate flies beyond the suite itself; 0 flies torch alone; None is `FURTHER`
+            for a suite of the library, else 0.
         workers: how many processes fly.
         progress: called with a stage, how much of it is done, and of how much.
 
@@ -128,6 +139,7 @@ def rank(
         ScenarioError, PolicyError, RunError: the suite, a policy or the folder is wrong, before anything flies.
     """
     asked = load_suite(suite, by_torch=by_torch)
+    more = _further(suite, further) if by_torch else []
     digest = digest_of(suite)
     own = {entry.label: entry for entry in entries}
     stored = None if again or by_torch else read_results(suite, digest)
@@ -147,25 +159,69 @@ def rank(
         verified |= {p: stored.verified[p] for p in taken}
     if not taken:
         stored = None  # nothing of it is shown, so that it need not be this version's
-    named = [p for p, f in decides.items() if f is None and p not in flights]
-    count = len(asked.conditions)
-    if named:
-        flights |= fly(
-            asked, named, folder, workers=workers, progress=lambda n: progress("flights", n, len(named) * count)
-        )
-    for label, function in decides.items():
-        if function is not None:
-            flights[label] = fly_callable(asked, function, progress=lambda n, p=label: progress(p, n, count))  # type: ignore[misc]
-    for k, policy in enumerate(todo := [p for p in decides if p not in verified]):
-        progress("verification", k, len(todo))
+    todo = {p: f for p, f in decides.items() if p not in flights}
+    flights |= _flown(asked, todo, folder, "flights", workers, progress)
+    control = None
+    if more:
+        plain = load_suite(suite)
+        wide = plain.model_copy(update={"conditions": (*plain.conditions, *more)})
+        control = Control(wide, _flown(wide, decides, folder, "flights by the surrogate", workers, progress))
+    for k, policy in enumerate(unproved := [p for p in decides if p not in verified]):
+        progress("verification", k, len(unproved))
         verified[policy] = verify(resolved[policy])
-    progress("verification", len(todo), len(todo))
+    progress("verification", len(unproved), len(unproved))
     stale, speed = (False, 1.0) if stored is None else _checked(stored, asked, folder)
-    rows, pairs = standings(asked, {p: flights[p] for p in decides})
+    flights = {p: flights[p] for p in decides}
+    rows, pairs = standings(asked, flights, control)
     return Ranked(
         suite, digest, code_version(), None if stored is None else stored.sortie, stale, speed,
-        "torch" if by_torch else "surrogate", tuple(rows), tuple(pairs), flights, verified, tuple(own), taken, count,
+        "torch" if by_torch else "surrogate", tuple(rows), tuple(pairs), flights, verified, tuple(own), taken,
+        len(asked.conditions), control, 1.0 if control is None else _width(pairs, standings(asked, flights)[1]),
     )  # fmt: skip
+
+
+def _further(suite: str, draws: int | None) -> list[Condition]:
+    """The conditions that only the surrogate flies.
+
+    Raises:
+        RunError: some are asked for, and there is no generator that draws them.
+    """
+    found = further_conditions(suite, FURTHER if draws is None else draws)
+    if draws and not found:
+        raise RunError(
+            f"--further {draws}: --suite {suite} is not drawn by Sortie, so there are no further draws of it"
+        )
+    return found
+
+
+def _flown(
+    suite: ConditionSet,
+    decides: Mapping[str, Policy | None],
+    folder: Path,
+    stage: str,
+    workers: int,
+    progress: Callable[[str, int, int], None],
+) -> Flights:
+    """Flights of policies by name (None) and of functions."""
+    named, count = [p for p, f in decides.items() if f is None], len(suite.conditions)
+    flights: Flights = {}
+    if named:
+        flights |= fly(suite, named, folder, workers=workers, progress=lambda n: progress(stage, n, len(named) * count))
+    for label, function in decides.items():
+        if function is not None:
+            told = f"{stage}, {label}"
+            flights[label] = fly_callable(suite, function, progress=lambda n, t=told: progress(t, n, count))  # type: ignore[misc]
+    return flights
+
+
+def _width(pairs: Sequence[PairDifference], alone: Sequence[PairDifference]) -> float:
+    """Median width of intervals relative to others of the same pairs; 1 where there are none."""
+    shares = [
+        a.difference.half_width / b.difference.half_width
+        for a, b in zip(pairs, alone, strict=True)
+        if b.difference.half_width > 0
+    ]
+    return float(np.median(shares)) if shares else 1.0
 
 
 def _policy(suite: ConditionSet, label: str) -> Policy:

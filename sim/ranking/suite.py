@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from sortie.scenarios.reading.load import condition_sets, read
+from sortie.scenarios.schema.conditions import Condition
 from sortie.scenarios.streams import stream
 from sortie.sim.folders import write_text
 
@@ -64,14 +65,42 @@ def suite_text(version: int) -> str:
         >>> suite_text(1).count("{name: ")
         30
     """
-    rng = stream(SEEDS[version], 0, (), "ranking.suite")
+    lines = []
+    for c in draw_conditions(version):
+        told = ", ".join(f'"{one}"' if set(one) & set("[{") else one for one in c.set)
+        lines.append(f"  - {{name: {c.name}, budget: {c.budget:.3g}, metric: {c.metric}, set: [{told}]}}\n")
+    head = _HEAD.format(version=version, seed=SEEDS[version], seconds=SECONDS, safety=r"\n".join(SAFETY))
+    return "".join([head, *lines])
+
+
+def further_conditions(suite: str, draws: int) -> list[Condition]:
+    """The conditions of as many more draws of a suite, each with the number of its draw behind its name; none for a suite that
+    this file did not draw."""
+    version = next((v for v in SEEDS if name_of(v) == suite), None)
+    if version is None:
+        return []
+    return [
+        c.model_copy(update={"name": f"{c.name}_{draw}"})
+        for draw in range(1, draws + 1)
+        for c in draw_conditions(version, draw)
+    ]
+
+
+def draw_conditions(version: int, draw: int = 0) -> list[Condition]:
+    """Draw a suite's conditions.
+
+    Args:
+        version: of the suite.
+        draw: 0 is the suite itself; another number draws others in the same way.
+    """
+    rng = stream(SEEDS[version], draw, (), "ranking.suite")
     kinds = [(mission, trouble) for mission in MISSIONS for trouble in TROUBLES]
     count = len(kinds)
     budgets = _spread(rng, count, *np.log(BUDGETS))
     charges, radii, spacings = (_spread(rng, count, *ends) for ends in (CHARGED, (20, 50), (15, 25)))
     sizes, shapes, styles = (_shared_out(rng, count, values) for values in (SIZES, SHAPES, STYLES))
     towns = rng.choice(10**6, count, replace=False) + 2 * 10**6  # beyond what `sortie learn` draws
-    lines = []
+    found = []
     for k, (mission, trouble) in enumerate(kinds):
         changed = [
             f"seed={int(rng.integers(1, 10**6))}",
@@ -84,14 +113,10 @@ def suite_text(version: int) -> str:
             *_mission(mission, radii[k]),
             *_trouble(rng, trouble, int(sizes[k])),
         ]
-        metric = "full_scene" if mission == "search" else "mission"
-        told = ", ".join(f'"{one}"' if set(one) & set("[{") else one for one in changed)
-        lines.append(
-            f"  - {{name: {mission}_{trouble}, budget: {np.exp(budgets[k]):.3g}, metric: {metric}, set: [{told}]}}"
-        )
-    return _HEAD.format(version=version, seed=SEEDS[version], seconds=SECONDS, safety=r"\n".join(SAFETY)) + "\n".join(
-        [*lines, ""]
-    )
+        metric: Literal["full_scene", "mission"] = "full_scene" if mission == "search" else "mission"
+        budget = float(f"{np.exp(budgets[k]):.3g}")
+        found.append(Condition(name=f"{mission}_{trouble}", budget=budget, metric=metric, set=tuple(changed)))
+    return found
 
 
 _HEAD = """\

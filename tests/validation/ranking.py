@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from stored import ROOT, Cell, Column, Table
 
 from sortie.policies.registry import POLICIES, resolve
 from sortie.scenarios.intervals import Estimate
 from sortie.sim.ranking.board import draw, place_text
 from sortie.sim.ranking.flights import fly
+from sortie.sim.ranking.places import scores
 from sortie.sim.ranking.rank import SUITE, Entry, Ranked, load_suite, rank
 from sortie.sim.ranking.stored import made_now, read_results, save_results
 from sortie.sim.ranking.suite import digest_of
@@ -40,6 +42,53 @@ def tables(work: Path) -> Mapping[str, Table]:
     ranked = rank([Entry(p) for p in stored.flights], work)
     draw(replace(ranked, entries=()), PICTURE)
     return {"ranking": accuracy(ranked), "ranking_costs": costs(ranked)}
+
+
+BY_TORCH = ("boxes", "worked", "all-4", "silence")
+"""Policies that are ranked by torch: the best of the surrogate's table, the paper's, and both ends of sharing maps."""
+
+
+def by_torch(work: Path, workers: int = 2) -> Mapping[str, Table]:
+    """Policies by the neural detector, with the surrogate as control variate and by torch alone.
+
+    Args:
+        work: folder of the flights, so that a measurement that was cut off goes on.
+    """
+    first, *others = BY_TORCH
+    both = rank([Entry(first)], work, against=others, by_torch=True, workers=workers)
+    alone = rank([Entry(first)], work, against=others, by_torch=True, further=0, workers=workers)
+    assert both.control is not None
+    cheap = scores(both.control.suite, both.control.flights)
+    columns = [
+        Column("place"), Column("policy"), Column("AP by torch, with the surrogate", ".3f"), Column("AP by torch alone", ".3f"),
+        Column("AP by the surrogate in all conditions", ".3f"),
+    ]  # fmt: skip
+    rows = [
+        [
+            place_text(r.place), f"`{r.policy}`", _interval(r.score), _interval(alone.row(r.policy).score),
+            float(np.mean(cheap[r.policy].ap)),
+        ]
+        for r in both.rows
+    ]  # fmt: skip
+    further = len(both.control.suite.conditions) - both.conditions
+    about = (
+        f"Suite `{both.suite}`, digest `{both.digest}`, Sortie {both.sortie}. Conditions: {both.conditions} by both detectors, "
+        f"{further} further ones by the surrogate. Intervals of 95 % over conditions."
+    )
+    differences = [
+        [f"`{p.policy}` minus `{p.other}`", _interval(p.difference), _interval(q.difference),
+         p.difference.half_width / q.difference.half_width]
+        for p, q in zip(both.pairs, alone.pairs, strict=True)
+    ]  # fmt: skip
+    pair_columns = [
+        Column("difference of AP"), Column("with the surrogate", "+.3f"), Column("by torch alone", "+.3f"),
+        Column("width of the interval, relative", ".2f"),
+    ]  # fmt: skip
+    together = f"Intervals are corrected for {len(both.pairs)} pairs."
+    return {
+        "ranking_by_torch": Table(columns, rows, about),
+        "ranking_by_torch_pairs": Table(pair_columns, differences, together),
+    }
 
 
 def accuracy(ranked: Ranked) -> Table:

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 import sortie
 from sortie.policies.registry import POLICIES
-from sortie.scenarios.intervals import Estimate
+from sortie.scenarios.intervals import SHARE, Estimate
 from sortie.scenarios.reading.load import condition_sets, load_conditions, read
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.campaign.work import RunResult, Task, fly_batch
@@ -25,9 +25,9 @@ from sortie.sim.cli import app
 from sortie.sim.folders import RunError
 from sortie.sim.ranking import flights, rank
 from sortie.sim.ranking.flights import KEPT, METRICS, Flight, fly
-from sortie.sim.ranking.places import PairDifference, differences, places, scores, standings
+from sortie.sim.ranking.places import Control, PairDifference, Scored, differences, places, scores, standings
 from sortie.sim.ranking.stored import made_now, read_results, save_results
-from sortie.sim.ranking.suite import MISSIONS, NEWEST, TROUBLES, digest_of, name_of, suite_text
+from sortie.sim.ranking.suite import MISSIONS, NEWEST, TROUBLES, digest_of, further_conditions, name_of, suite_text
 from sortie.sim.ranking.verdict import Verified
 from sortie.sim.studies.conditions import scenario_of
 
@@ -124,6 +124,18 @@ def test_a_set_with_seeds_of_its_own_is_no_suite(here: object) -> None:
         rank.load_suite("track_target")
 
 
+def test_further_draws_are_of_the_same_kinds_and_share_no_town_with_the_suite() -> None:
+    suite, more = rank.load_suite("ranking_v1"), further_conditions("ranking_v1", 2)
+    assert [c.name for c in more] == [f"{c.name}_{k}" for k in (1, 2) for c in suite.conditions]
+    assert [c.metric for c in more] == [c.metric for c in suite.conditions] * 2
+    towns = [o for c in (*suite.conditions, *more) for o in c.set if o.startswith("perception.scene.seed=")]
+    assert len(set(towns)) == 90
+    assert further_conditions("ranking_v1", 1) == more[:30]
+    assert further_conditions("small.yaml", 2) == []
+    wide = suite.model_copy(update={"conditions": tuple(more)})
+    assert scenario_of(wide, more[0], "all-4").perception.detector == "surrogate"
+
+
 # --- flights -------------------------------------------------------------------------------------
 
 
@@ -213,9 +225,9 @@ def test_equal_policies_share_their_places() -> None:
 
 def test_intervals_of_pairs_are_students_corrected_for_their_number() -> None:
     rng = np.random.default_rng(1)
-    scored = {p: 0.4 + 0.01 * rng.standard_normal(20) for p in "abcd"}
-    pair = differences(scored)[0]
-    d = scored["a"] - scored["b"]
+    aps = {p: 0.4 + 0.01 * rng.standard_normal(20) for p in "abcd"}
+    pair = differences({p: Scored(a, np.zeros(0)) for p, a in aps.items()})[0]
+    d = aps["a"] - aps["b"]
     off = stats.t.ppf(1 - 0.05 / 6 / 2, 19) * d.std(ddof=1) / math.sqrt(20)
     assert pair.difference.mean == pytest.approx(d.mean())
     assert pair.difference.high - pair.difference.low == pytest.approx(2 * off, rel=1e-3), (
@@ -226,7 +238,7 @@ def test_intervals_of_pairs_are_students_corrected_for_their_number() -> None:
 def test_a_failure_is_last_in_its_condition_and_loses_nothing_else() -> None:
     aps = {"fails": [0.5, math.nan, 0.5], "flies": [0.4, 0.1, 0.4]}
     scored = scores(suite_of(3), flights_of(aps))
-    assert scored["fails"].tolist() == [0.5, 0.0, 0.5]
+    assert scored["fails"].ap.tolist() == [0.5, 0.0, 0.5]
     rows, _ = standings(suite_of(3), flights_of(aps))
     failed = next(r for r in rows if r.policy == "fails")
     assert failed.failed == ("c1",)
@@ -235,14 +247,14 @@ def test_a_failure_is_last_in_its_condition_and_loses_nothing_else() -> None:
 
 def test_a_condition_without_a_car_counts_for_nobody() -> None:
     scored = scores(suite_of(2), flights_of({"a": [0.5, None], "b": [0.4, 0.9]}))
-    assert {p: s.tolist() for p, s in scored.items()} == {"a": [0.5], "b": [0.4]}
+    assert {p: s.ap.tolist() for p, s in scored.items()} == {"a": [0.5], "b": [0.4]}
     with pytest.raises(RunError, match="no condition has an accuracy"):
         scores(suite_of(1), flights_of({"a": [None]}))
 
 
 def test_the_condition_says_which_ap_counts() -> None:
     aps = {"a": [0.5, 0.6]}
-    assert scores(suite_of(2, "mission"), flights_of(aps, "mission"))["a"].tolist() == [0.5, 0.6]
+    assert scores(suite_of(2, "mission"), flights_of(aps, "mission"))["a"].ap.tolist() == [0.5, 0.6]
     with pytest.raises(RunError):
         scores(suite_of(2, "mission"), flights_of(aps, "full_scene"))
 
@@ -251,10 +263,47 @@ def test_true_places_lie_within_their_ranges_as_often_as_is_said() -> None:
     """Drawn rankings of five policies with known means: all ranges hold at once in at least 95 % of them."""
     rng, means, held = np.random.default_rng(2), np.array([0.4, 0.41, 0.42, 0.45, 0.5]), 0
     for _ in range(200):
-        scored = dict(zip("abcde", means[:, None] + 0.03 * rng.standard_normal((5, 30)), strict=True))
+        aps = means[:, None] + 0.03 * rng.standard_normal((5, 30))
+        scored = {p: Scored(a, np.zeros(0)) for p, a in zip("abcde", aps, strict=True)}
         found = places("abcde", differences(scored))
         held += all(found[p][0] <= 5 - k <= found[p][1] for k, p in enumerate("abcde"))
     assert held >= 190
+
+
+def control_of(aps: Mapping[str, list[float | None]]) -> Control:
+    return Control(suite_of(len(next(iter(aps.values())))), flights_of(aps))
+
+
+def test_the_surrogate_narrows_intervals_and_its_errors_shift_nothing() -> None:
+    """Drawn rankings of two policies that are equal by torch, 30 conditions, 90 further ones; the surrogate favours one of
+    them by 0.2. The unit of the counts is a ranking."""
+    rng, differences_, narrower, held = np.random.default_rng(3), [], 0, 0
+    for _ in range(200):
+        condition = 0.1 * rng.standard_normal((2, 120)) + 0.5
+        torch = condition[:, :30] + 0.02 * rng.standard_normal((2, 30))
+        cheap = condition + 0.02 * rng.standard_normal((2, 120)) + np.array([[0.2], [0.0]])
+        flights_, control = (flights_of(dict(zip("ab", map(list, aps), strict=True))) for aps in (torch, cheap))
+        rows, (pair,) = standings(suite_of(30), flights_, Control(suite_of(120), control))
+        (alone,) = standings(suite_of(30), flights_)[1]
+        differences_.append(pair.difference.mean)
+        narrower += pair.difference.half_width < alone.difference.half_width
+        held += pair.difference.low <= 0.0 <= pair.difference.high
+    error = np.std(differences_, ddof=1) / math.sqrt(200)
+    assert abs(np.mean(differences_)) < 3 * error, "0.2 without the correction"
+    assert narrower >= 190
+    assert held >= 182, "95 % of 200, less 2.6 standard errors"
+    assert {r.policy for r in rows} == {"a", "b"}
+
+
+def test_the_surrogates_flights_are_of_the_same_conditions_as_torchs() -> None:
+    """Torch's AP is twice the surrogate's: the mean is twice that over all conditions, if those without a car go in pairs."""
+    cheap = [0.1, 0.2, 0.3, 0.15, 0.25, 0.35, 0.3, None, 0.2]
+    torch: list[float | None] = [2 * v for v in (0.1, 0.2, 0.3)] + [None] + [2 * v for v in (0.25, 0.35)]
+    scored = scores(suite_of(6), flights_of({"a": torch}), control_of({"a": cheap}))["a"]
+    assert len(scored.ap) == 5
+    found = scored.mean(SHARE)
+    assert found.mean == pytest.approx(2 * np.mean([0.1, 0.2, 0.3, 0.25, 0.35, 0.3, 0.2]))
+    assert found.count == 5
 
 
 def test_the_sign_of_a_pair_turns_with_it() -> None:
@@ -320,6 +369,34 @@ def test_own_flights_are_all_that_a_ranking_costs(
     )
     alone = sortie.rank("mine.py:boxes", suite="small.yaml", against=[], folder="out")
     assert (alone.ranked.stored, alone.ranked.stale) == (None, False), "stored results of which nothing is shown"
+
+
+def test_a_ranking_by_torch_flies_the_surrogate_too(here: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rank, "BY_TORCH", ("perception.sample_rate_hz=1",))  # cheaper than torch, and other flights
+    more = [c.model_copy(update={"name": f"{c.name}_{k}"}) for k in range(4) for c in small().conditions]
+    monkeypatch.setattr(rank, "further_conditions", lambda suite, draws: more[: 2 * draws])
+    ranking = sortie.rank(["boxes", POLICIES["silence"]], suite="small.yaml", against=[], by_torch=True, folder="out")
+    assert len(here) == 2 + 2 + 2 * 3, (
+        "boxes by torch; by the surrogate in the same conditions and in three further draws"
+    )
+    control = ranking.ranked.control
+    assert control is not None
+    assert [len(of) for of in control.flights.values()] == [8, 8]
+    assert "8 further" not in str(ranking.summary())
+    assert "6 further ones" in " ".join(str(ranking.summary()).split())
+    alone = sortie.rank("boxes", suite="small.yaml", against=[], by_torch=True, further=0, folder="out")
+    assert len(here) == 10, "nothing is missing"
+    assert (alone.ranked.control, alone.ranked.width) == (None, 1.0)
+    kept = json.loads((ranking.save("out") / "ranking.json").read_text())
+    assert set(kept["by_surrogate"]["boxes"]) == {"poor", "rich", *(c.name for c in more[:6])}
+
+
+def test_further_draws_are_refused_for_a_suite_without_a_generator(here: list[int]) -> None:
+    with pytest.raises(RunError, match=r"--further 2: --suite small\.yaml is not drawn by Sortie"):
+        sortie.rank("boxes", suite="small.yaml", against=[], by_torch=True, further=2, folder="out")
+    with pytest.raises(RunError, match="further: -1, must be None or a whole number from 0 to 100"):
+        sortie.rank("boxes", suite="small.yaml", by_torch=True, further=-1, folder="out")
+    assert not here
 
 
 def test_the_command_prints_keeps_and_says_by_its_exit_code_what_failed(here: list[int]) -> None:
