@@ -7,7 +7,7 @@ SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
 
 
-.PHONY: help sortie screenshot test test-all lint check format bench figures validate-ns3 ns3 mutate clean scenarios notebooks outputs fuzz docs test-lowest
+.PHONY: help sortie screenshot test test-all lint check format bench bench-all figures validate-ns3 ns3 mutate clean scenarios notebooks outputs fuzz docs test-lowest
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -70,7 +70,10 @@ format: $(STAMP) ## format and fix what can be fixed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(STAMP) ## run the benchmarks
+bench: $(STAMP) ## print what Sortie costs on one page, beside its peers and the last release (BENCH="--gradys PYTHON")
+	$(BIN)/python tests/benchmarks/bench_page.py $(BENCH)
+
+bench-all: $(STAMP) ## run every benchmark, ten minutes
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only
 
 figures: $(STAMP) ## measure the pages' figures again, hours in all (FIGURE=name for one; FIGURE=--list, FIGURE=--render)

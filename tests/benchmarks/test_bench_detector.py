@@ -1,4 +1,4 @@
-"""What a scored fleet-frame of the torch detector costs, part by part: `make bench` runs these; nothing here asserts a time.
+"""What a scored fleet-frame of the torch detector costs, part by part: `make bench-all` runs these; nothing here asserts a time.
 
 A sortie scored at 10 Hz keeps real time where a fleet-frame costs less than 0.1 s of wall clock.
 """

@@ -1,4 +1,4 @@
-"""What the fleet's hot path costs; `make bench` prints it, `make test` only runs it once. No timed assertions."""
+"""What the fleet's hot path costs; `make bench-all` prints it, `make test` only runs it once. No timed assertions."""
 
 from __future__ import annotations
 

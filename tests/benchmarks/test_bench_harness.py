@@ -1,4 +1,4 @@
-"""What the harness costs, part by part: `make bench` runs these; nothing here asserts a time.
+"""What the harness costs, part by part: `make bench-all` runs these; nothing here asserts a time.
 
 The evaluator's benchmark records how many times as fast it is as plain loops over shapely polygons (`extra_info`).
 """

@@ -1,4 +1,4 @@
-"""The detector's forward pass by the hand-written kernel and by libraries: `make bench` runs these; nothing here asserts a time.
+"""The detector's forward pass by the hand-written kernel and by libraries: `make bench-all` runs these; nothing here asserts a time.
 
 A forward pass is one drone's image through encoder and head, in float32.
 ONNX Runtime and

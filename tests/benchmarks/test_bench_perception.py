@@ -1,4 +1,4 @@
-"""What perception costs: `make bench` runs these; nothing here asserts a time."""
+"""What perception costs: `make bench-all` runs these; nothing here asserts a time."""
 
 from __future__ import annotations
 

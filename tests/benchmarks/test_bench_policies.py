@@ -1,6 +1,6 @@
 """How long a decision takes: every registered policy at 5, 25 and 100 drones.
 
-`make bench` prints them; the worked policy should decide in at most 0.010 ms at the median at five drones, and the
+`make bench-all` prints them; the worked policy should decide in at most 0.010 ms at the median at five drones, and the
 cost should grow no faster than the fleet. `sortie overhead` measures the same on flown views, beside the bytes.
 """
 

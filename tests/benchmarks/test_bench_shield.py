@@ -1,6 +1,6 @@
 """How long a shield takes for one decision: ten lines, five fields, 20 drones.
 
-`make bench` prints it; a decision should take less than 0.3 ms, whatever the policy decides. `a mess` decides something
+`make bench-all` prints it; a decision should take less than 0.3 ms, whatever the policy decides. `a mess` decides something
 else for each link, and breaks several lines with each: nothing can be shared between links. At the gate a shield also asks
 how much the age of each peer's descriptor allows.
 """

@@ -1,6 +1,6 @@
 """How long a whole sortie takes: with the detector, without it, and what each part of that is.
 
-`make bench` prints them; a 120 s, five-drone sortie should take less than 120 s with the detector at 2 Hz, and
+`make bench-all` prints them; a 120 s, five-drone sortie should take less than 120 s with the detector at 2 Hz, and
 less than 2 s without, on two cores.
 """
 

@@ -1,4 +1,4 @@
-"""The surrogate beside the torch detector, on the same moments; and a whole sortie with it. `make bench` prints them."""
+"""The surrogate beside the torch detector, on the same moments; and a whole sortie with it. `make bench-all` prints them."""
 
 from __future__ import annotations
 

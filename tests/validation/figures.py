@@ -621,7 +621,7 @@ def _healths() -> Sequence[Any]:
 
 
 def _speed() -> Tables:
-    """As `make bench`."""
+    """As `make bench-all`."""
     return {"speed": speed_table(_benchmarks("tests/benchmarks"))}
 
 
