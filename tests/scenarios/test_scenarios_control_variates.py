@@ -94,6 +94,11 @@ def test_the_expensive_measurement_alone_is_the_plain_mean() -> None:
     assert controlled_mean(y, x, drawn(50, 0.9, 1)[1], control=False).estimate == mean_interval(y)
 
 
+def test_further_units_without_a_value_are_left_out() -> None:
+    (y, x), more = drawn(8, 0.8), drawn(20, 0.8, 1)[1]
+    assert controlled_mean(y, x, np.insert(more, [0, 7, 20], math.nan)) == controlled_mean(y, x, more)
+
+
 def test_measurements_of_other_units_are_refused() -> None:
     with pytest.raises(ValueError, match="2 expensive and 3 cheap measurements, must be of the same units"):
         controlled_mean([1.0, 2.0], [1.0, 2.0, 3.0], [])

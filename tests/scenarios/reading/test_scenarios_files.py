@@ -53,6 +53,28 @@ def test_every_field_that_names_a_file_is_known() -> None:
     assert '"silence"' in told
 
 
+def test_files_that_a_part_of_the_fleet_an_event_or_a_metric_names_are_known() -> None:
+    text = """
+name: own
+perception: {detector: torch}
+fleet:
+  makes:
+  - name: other
+    drones: [0]
+    policy: decide.py:decide
+    weights: net.safetensors
+    codebook: codes.safetensors
+    airframe: {power_model: "power.py:Power"}
+    battery: {cell_model: "cell.py:Cell"}
+  groups: [{drones: [1], mobility: "walk.py:Walk"}]
+events: [{at_s: 1, kind: own, model: "rain.py:Rain"}]
+metrics: {mine: {model: "figure.py:Figure"}}
+"""
+    found = named_files(loads(text).model_dump(mode="json", exclude_none=True))
+    models = ["cell.py", "decide.py", "figure.py", "power.py", "rain.py", "walk.py"]
+    assert sorted(found) == sorted([*models, "net.safetensors", "codes.safetensors"])
+
+
 def test_files_beside_a_scenario_are_found_from_anywhere(
     folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
