@@ -409,6 +409,17 @@ def test_k_senders_serve_each_receiver_and_all_agree_who(policy: Any, k: int) ->
     assert served == dict.fromkeys(range(5), k)
 
 
+@pytest.mark.parametrize("k", [0, 1, 3, 4, 7])
+def test_a_drone_sends_to_k_receivers_and_to_none_for_a_k_of_0(k: int) -> None:
+    """And the worst ones are the last of its order."""
+    view, sent = fleet_of(5), {}
+    for policy in (baselines.best_k_receivers, baselines.worst_k_receivers, baselines.random_k_receivers):
+        sent[policy] = [d.destination for d in policy(view, k=k) if d.representation == FEATURES]
+        assert len(sent[policy]) == min(k, 4)
+    best, worst = sent[baselines.best_k_receivers], sent[baselines.worst_k_receivers]
+    assert sorted(worst) == sorted(peers_by_overlap(view)[4 - len(best) :])
+
+
 def test_random_senders_differ_by_receiver_epoch_and_salt() -> None:
     view = at_one_place(fleet_of(5))
 
@@ -417,7 +428,7 @@ def test_random_senders_differ_by_receiver_epoch_and_salt() -> None:
         drones = [i for i in range(5) if i != receiver]
         return tuple(i for i in drones if by_peer(baselines.random_k(of_ego(now, i), k=2, salt=salt))[receiver].rho)
 
-    assert senders(0, 1.0) == senders(0, 9.9)
+    assert len({senders(0, 0.5 * half) for half in range(20)}) == 1
     epochs = [senders(0, 10.0 * e) for e in range(30)]
     salted = [senders(0, 10.0 * e, salt=1) for e in range(30)]
     assert len(set(epochs)) == len(set(salted)) == 6  # every pair of four comes up

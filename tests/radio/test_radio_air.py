@@ -205,6 +205,21 @@ def test_what_a_silenced_drone_had_put_on_the_air_is_counted() -> None:
     assert silenced == wire_bytes(lambda f: f.send(0, 1, 1)) > 100_000  # as one that is replaced then
 
 
+@pytest.mark.parametrize("end", [lambda air: None, lambda air: air.silence(0)], ids=["it flies on", "it is lost"])
+def test_a_descriptor_on_the_air_counts_as_heard_and_missed_whatever_becomes_of_its_sender(
+    end: Callable[[Air], None],
+) -> None:
+    f = Flight(STILL, 3, spread=0.0)
+    f.extra[0, 2] = 200.0
+    f.air.advance(f.extra)
+    f.publish(0)
+    f.env.timeout(2e-4).callbacks.append(lambda _: end(f.air))
+    f.env.run(until=0.01)
+    assert [(sender, ids) for _, sender, ids in f.heard] == [(0, (1,))]
+    assert (f.air.counters.receptions, f.air.counters.missed) == (1, 1)
+    assert f.air.counters.lost_to["weak_signal"] == 1
+
+
 def test_what_is_in_flight_at_the_end_is_told() -> None:
     f = Flight(STILL, 2)
     f.air.advance()

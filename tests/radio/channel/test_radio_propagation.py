@@ -178,6 +178,15 @@ def test_shadowing_is_normal_symmetric_and_shared_between_neighbours() -> None:
     assert abs(far) < 0.12  # one end is shared, the other is 424 m off
 
 
+@pytest.mark.parametrize("distance_m", [7.5, 15.0, 30.0, 60.0])
+def test_shadowing_has_one_deviation_however_long_the_link(distance_m: float) -> None:
+    """Mean square of links of one length that lie far apart, over many fields."""
+    ends = np.random.default_rng(4).random((30, 3)) * 20_000.0
+    place = np.concatenate([ends, ends + [distance_m, 0.0, 0.0]])
+    fields = [ShadowField(3.5, 30.0, 4.5, seed, 0).between(place, 0.0) for seed in range(120)]
+    assert np.sqrt(np.mean([np.diag(field, 30) ** 2 for field in fields])) == pytest.approx(3.5, rel=0.03)
+
+
 def test_the_channel_takes_its_shadowing_from_the_field() -> None:
     config = AirSettings(shadowing_distance_m=30.0)
     five, six = Channel(config, still(CROSS_M[:5]), 9, 2, 0.1), Channel(config, still(CROSS_M), 9, 2, 0.1)
@@ -314,6 +323,17 @@ def test_every_pair_in_range_is_listed_both_ways() -> None:
     assert links.begin == [0, *np.cumsum(near.sum(axis=1)).tolist()]
     np.testing.assert_allclose(np.tile(distance, 2), apart[:, links.sender, links.receiver])
     assert (np.diff(high * 80 + low) > 0).all()
+
+
+@pytest.mark.parametrize("frame", [0, 4])
+def test_a_pair_that_is_near_in_the_first_or_last_frame_alone_is_listed(frame: int) -> None:
+    """Both ends fly away from one another, or towards one another: 20 m each between that frame and the middle one."""
+    p = np.zeros((5, 2, 3))
+    p[:, 0, 0] = -12.0 - 10.0 * abs(np.arange(5) - frame)
+    p[:, 1] = -p[:, 0]
+    low, high, distance = near_pairs(p, 25.0)
+    assert (low.tolist(), high.tolist()) == ([0], [1])
+    np.testing.assert_allclose(distance[:, 0], 24.0 + 20.0 * abs(np.arange(5) - frame))
 
 
 def test_broken_attitudes_are_refused() -> None:
