@@ -10,7 +10,7 @@ from fleet_examples import grid_on_a_plain
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.fleet.coverage import View, placed, unpack_grid
+from sortie.fleet.coverage import View, pack_grid, placed, unpack_grid
 from sortie.fleet.lies import falsified
 from sortie.fleet.messages.compact import Form, decode_compact, encode_compact
 from sortie.fleet.trust import (
@@ -135,6 +135,15 @@ def test_the_check_counts_cells_that_cannot_be() -> None:
     expected = 256 - (len(rows) + 2) * (len(columns) + 2)
     lie = falsified(honest(1), "coverage", "much")
     assert coverage_doubt(lie) == f"coverage: {expected} cells seen well that its cameras cannot show so"
+
+
+def test_what_a_drone_may_have_seen_follows_from_its_speed_at_the_moment() -> None:
+    """A look of a second ago reaches as much further as it flew; one grid is judged anew for each speed."""
+    rows, columns = np.indices((16, 16)) - 7.5
+    grid = pack_grid(np.where(np.hypot(rows, columns) < 6.0, Coverage.WELL, Coverage.UNSEEN))
+    still = honest(1)._replace(coverage_grid=grid)
+    for speed_mps, doubted in ((0.0, True), (12.0, False), (0.0, True)):
+        assert (coverage_doubt(still._replace(velocity_mps=(speed_mps, 0.0, 0.0))) != "") == doubted
 
 
 # --- goodput and battery -------------------------------------------------------------------------

@@ -132,6 +132,16 @@ def test_a_group_moves_at_random_beside_a_formation() -> None:
     assert (np.ptp(mixed.position_m[:, [1, 3], :2], axis=0).max(axis=-1) > 40).all()
 
 
+def test_groups_of_one_model_move_apart_and_apart_from_the_fleet() -> None:
+    """All three begin at one place; each draws its own way."""
+    group = {"mobility": "random_waypoint", "mobility_params": {"slowest_mps": 9}}
+    fleet = Fleet(drones=3, groups=[{"drones": [1], **group}, {"drones": [2], **group}], **group)
+    place = fly(fleet, 20.0, 0.1, seed=5).position_m
+    assert np.ptp(place[0], axis=0).max() < 5
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert np.linalg.norm(place[-1, a] - place[-1, b]) > 20
+
+
 def test_headings_follow_the_course_and_read_no_future() -> None:
     turn = np.linspace(0, 4 * np.pi, 600)
     velocity = np.stack([5 * np.cos(turn), 5 * np.sin(turn), 0 * turn], axis=-1)[:, None]

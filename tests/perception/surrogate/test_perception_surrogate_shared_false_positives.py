@@ -13,7 +13,7 @@ from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import CaptureColumns
 from sortie.perception.surrogate.model import SHIPPED, load
 from sortie.perception.surrogate.plan import scene_model
-from sortie.perception.surrogate.shared_false_positives import SharedFalsePositives, estimate_shared
+from sortie.perception.surrogate.shared_false_positives import TILE_M, SharedFalsePositives, estimate_shared
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Perception, Scene
 
@@ -31,6 +31,15 @@ def test_as_many_things_lie_in_a_square_as_are_expected_there() -> None:
     mean, variance = np.mean(counts, axis=0), np.var(counts, axis=0)
     np.testing.assert_allclose(mean, [10, 30], rtol=0.15)
     np.testing.assert_allclose(variance, [10, 30], rtol=0.5)  # Poisson: as thrown
+
+
+def test_things_are_spread_over_their_tiles_by_two_draws_and_turned_by_a_third() -> None:
+    """Each even in 0 … 1, and none tells of another."""
+    several = [SharedFalsePositives(town).about(fleet((0, 0)), 40.0) for town in range(20)]
+    xy = np.concatenate([things.xy_m for things in several]) / TILE_M % 1.0
+    draws = np.column_stack([xy, np.concatenate([things.yaw_rad for things in several]) / (2 * np.pi)]).T
+    np.testing.assert_allclose(draws.mean(axis=1), 0.5, atol=0.03)
+    np.testing.assert_allclose(np.corrcoef(draws), np.eye(3), atol=0.1)
 
 
 def test_things_stand_where_they_stand_whichever_drones_look() -> None:

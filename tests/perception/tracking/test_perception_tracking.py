@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sortie.perception import budget
 from sortie.perception.lateness import SIGMA0_M
 from sortie.perception.metrics.assignment import least_cost
-from sortie.perception.motion import ACCELERATION_DENSITY, MOVES_AT, Tracks, predicted
+from sortie.perception.motion import ACCELERATION_DENSITY, MOVES_AT, Tracks, grown, predicted
 from sortie.perception.tracking import association
 from sortie.perception.tracking.following import followed, motion_of, motion_of_boxes
 from sortie.perception.tracking.tracker import BOX_VARIANCE_M2, COAST_S, SPEED_VARIANCE, step
@@ -62,6 +62,14 @@ def test_the_filter_is_the_one_with_matrices() -> None:
     np.testing.assert_allclose([*xy, *velocity], state, rtol=1e-9)
     np.testing.assert_allclose(np.kron([[pp, pv], [pv, vv]], np.eye(2)), covariance, rtol=1e-9, atol=1e-12)
     assert len(tracker.tracks) == 1
+
+
+def test_a_track_told_for_an_earlier_time_is_no_more_certain_than_for_a_later_one() -> None:
+    """Place and velocity drift apart with either sign of time; their covariance alone has its sign."""
+    still = np.array([[1.0, 0.0, 4.0]])
+    (pp, pv, vv), ((back_pp, back_pv, back_vv),) = grown(still, np.array([0.6]))[0], grown(still, np.array([-0.6]))
+    assert (back_pp, back_pv, back_vv) == (pp, -pv, vv)
+    assert vv == pytest.approx(4.0 + 0.6 * ACCELERATION_DENSITY)
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -182,7 +182,7 @@ def test_shadowing_is_normal_symmetric_and_shared_between_neighbours() -> None:
 def test_shadowing_has_one_deviation_however_long_the_link(distance_m: float) -> None:
     """Mean square of links of one length that lie far apart, over many fields."""
     ends = np.random.default_rng(4).random((30, 3)) * 20_000.0
-    place = np.concatenate([ends, ends + [distance_m, 0.0, 0.0]])
+    place = np.concatenate([ends, ends + np.array([distance_m, 0.0, 0.0])])
     fields = [ShadowField(3.5, 30.0, 4.5, seed, 0).between(place, 0.0) for seed in range(120)]
     assert np.sqrt(np.mean([np.diag(field, 30) ** 2 for field in fields])) == pytest.approx(3.5, rel=0.03)
 
