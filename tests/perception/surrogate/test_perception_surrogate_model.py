@@ -172,6 +172,19 @@ def test_surer_drones_find_more(parameters: Parameters) -> None:
     assert found[0] < found[1] < found[2]
 
 
+def test_one_draw_says_whether_there_is_a_box_and_the_other_how_high_its_score_is(parameters: Parameters) -> None:
+    first, second = (draw.ravel() for draw in np.meshgrid(np.linspace(0.01, 0.99, 40), [0.6, 0.8, 0.95]))
+    score = parameters.find(lonely(len(first), range=0.5), np.column_stack([first, second]).astype(np.float32)).reshape(
+        3, 40
+    )
+    there = score > 0.0
+    assert 0 < there[0].sum() < 40
+    assert (there == there[0]).all()
+    assert (np.diff(there[0].astype(int)) <= 0).all(), "the lowest draws have one"
+    assert [len(np.unique(row[there[0]])) for row in score] == [1, 1, 1]
+    assert len(np.unique(score[:, 0])) == 3
+
+
 def test_weak_boxes_lie_farther_off(parameters: Parameters) -> None:
     """Of the cars about a cross of drones, alone: were they found weakly, and were they found surely."""
     fleet = CaptureColumns.of(cross(10.0, 20.0, 0.3))

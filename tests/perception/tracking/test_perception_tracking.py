@@ -64,6 +64,17 @@ def test_the_filter_is_the_one_with_matrices() -> None:
     assert len(tracker.tracks) == 1
 
 
+def test_a_box_that_shows_a_car_the_other_way_round_does_not_turn_its_track() -> None:
+    """Front and back look alike: what is left of its turn is taken in by its weight, a half, a third, a quarter."""
+    tracker, yaw_rad = One(), 0.1
+    for k, (t_s, turn_rad, off_rad) in enumerate([(0.0, 0.0, 0.0), (0.5, np.pi, 0.2), (1.0, -np.pi, 0.0), (1.5, 2 * np.pi, -0.3)]):  # fmt: skip
+        seen = boxes((0.0, 0.0))
+        seen.yaw_rad[:] = yaw_rad + turn_rad + off_rad
+        tracker.look(t_s, seen)
+        yaw_rad += off_rad / (k + 1)
+        assert tracker.tracks.yaw_rad == pytest.approx([yaw_rad])
+
+
 def test_a_track_told_for_an_earlier_time_is_no_more_certain_than_for_a_later_one() -> None:
     """Place and velocity drift apart with either sign of time; their covariance alone has its sign."""
     still = np.array([[1.0, 0.0, 4.0]])
