@@ -237,6 +237,22 @@ def test_a_rule_over_a_grid_is_judged_on_other_draws(tmp_path: Path) -> None:
     assert made.gain.count == 40, "draws, not cells"
 
 
+def test_a_rule_and_the_fixed_policy_that_it_is_compared_with_are_chosen_on_the_same_half(tmp_path: Path) -> None:
+    """Policy 0 leads in every even draw, policy 1 in every odd one: each half chooses one policy for all, and gains nothing."""
+    runs = iter(range(1000))
+
+    def value(fields: dict[str, float], policy: int) -> float:
+        lead = (0.3 if next(runs) // 2 % 2 == 0 else -0.3) + (
+            0.2 if fields["fleet.battery.initial_soc"] > 0.6 else -0.2
+        )
+        return -lead * (policy == 0)  # bytes: less is better
+
+    made = rule(rows_of(tmp_path, TWO.replace("{count: 6}", "{count: 40}"), value), "bytes.data_sent")
+    assert made is not None
+    assert (made.below, made.above) == ("best-2(received_budget=0.1)", "worked")
+    assert (made.gain.low, made.gain.mean, made.gain.high, made.gain.count) == (0.0, 0.0, 0.0, 40)
+
+
 def test_levels_of_morris_have_no_intervals(tmp_path: Path) -> None:
     from sortie.sim.campaign.report import _lines
 

@@ -20,6 +20,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import pyarrow.compute as pc
 import pymavlink
 import pytest
 from places import HELPERS
@@ -36,6 +37,7 @@ from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.endpoint import read_key
 from sortie.sim.export.origin import ORIGIN, parse_origin
+from sortie.sim.export.telemeter import Telemeter
 from sortie.sim.export.telemetry import DATAGRAM_BYTES, MavlinkEndpoint, save_tlog
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
@@ -163,6 +165,23 @@ def pymavlink_tool(name: str, *arguments: str, folder: Path) -> str:
     command = [sys.executable, "-W", "ignore", str(tool), *arguments]
     environment = {**os.environ, "TZ": "UTC", "MPLBACKEND": "Agg"}
     return subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder, env=environment).stdout
+
+
+def test_telemetry_of_a_flight_in_slices_is_that_of_the_whole() -> None:
+    """Also where GNSS goes and comes after the last frame of a slice."""
+    record = run_sortie(example("duration_s=4", "events=[{kind: gnss_loss, at_s: 1.95, until_s: 2.97, drone: 1}]"))
+    tables = {name: record.tables[name] for name in ("states", "descriptors", "events")}
+    whole, sliced = list(Telemeter(record.scenario).add(tables)), Telemeter(record.scenario)
+    cuts = [
+        {
+            name: rows.filter((pc.field("t_s") >= second) & (pc.field("t_s") < second + 1))
+            for name, rows in tables.items()
+        }
+        for second in range(4)
+    ]
+    assert [each for cut in cuts for each in sliced.add(cut)] == whole
+    without = [state.time_s for drone, state in whole if drone == 1 and not state.fixed]
+    assert without == pytest.approx(np.arange(20, 30) / 10)
 
 
 def test_pymavlink_s_tools_make_sense_of_a_log(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from sortie.sim.playback.received import hatch
 from sortie.sim.playback.recording import save_rrd, scene_of, spread_m
 from sortie.sim.playback.viewer import LiveViewer, open_viewer, to_file, to_new_viewer
 from sortie.sim.results.accuracy import accuracy, matched
+from sortie.sim.results.link_traffic import LinkTraffic
 from sortie.sim.results.outcome import outcome, transitions
 from sortie.sim.results.palette import goodput_colours
 from sortie.sim.results.record import TABLES, SortieRecord
@@ -276,6 +277,17 @@ def test_a_link_is_as_wide_at_rates_that_do_not_divide_a_second(rate_hz: float, 
     assert min(expected) > 0
     radii = next(v for _, f, v in rows["/world/links"]["Arrows3D:radii"] if f == frame)
     assert radii == pytest.approx([-(1.5 + math.log2(1.0 + mbps)) for mbps in expected], rel=1e-5)
+
+
+def test_a_frame_has_what_was_said_and_settled_before_it() -> None:
+    """What is published or settled at its very instant is the next frame's; the second before it is that of its traffic."""
+    said = {"t_s": [0.0, 1.0], "drone": [0, 0], "goodput_mbps": [[5.0], [7.0]]}
+    settled = {"t_done_s": [0.0, 1.0], "drone": [0, 0], "peer": [1, 1], "payload_bytes": [125_000, 250_000]}
+    t_s, tables = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5]), (pa.table(said), pa.table(settled))
+    goodput, recent = LinkTraffic(2, 2.0).add(t_s, *tables)
+    assert goodput[:, 0, 1].tolist() == [0.0, 5.0, 5.0, 7.0, 7.0, 7.0]
+    assert recent[:, 0, 1].tolist() == [0.0, 1.0, 1.0, 2.0, 2.0, 0.0]
+    assert not goodput[:, 1, 0].any()
 
 
 def test_a_link_that_is_all_but_gone_is_crossed_out(rows: Rows, record: SortieRecord) -> None:

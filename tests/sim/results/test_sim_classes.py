@@ -143,6 +143,15 @@ def test_what_was_missed_is_of_the_class_that_was_missed() -> None:
         assert seen.full.truths == len(seen.hits)
 
 
+def test_the_playbacks_accuracy_is_of_cars_among_cars(right: SortieRecord) -> None:
+    """A truck that is found as a truck is neither a car nor a false one."""
+    seen = list(sightings(right.tables, Regions(right.tables["mission"], right.scenario.mission)))
+    assert any(TRUCK in each.hits.kind for each in seen)
+    for each in seen:
+        cars = int((each.hits.kind == CAR).sum())
+        assert (each.full.truths, each.full.hit.tolist()) == (cars, [True] * cars)
+
+
 def test_a_comparison_has_a_row_for_each_class() -> None:
     scenario = example("duration_s=4", "perception.detector=surrogate", WALKS, SURE)
     contenders = [Contender("silence", scenario, lambda view: []), Contender("boxes", scenario, boxes_to_all)]
