@@ -361,6 +361,12 @@ def _ranking() -> Tables:
     return ranking.measure(WORK / "ranking")
 
 
+def _ranking_by_torch() -> Tables:
+    import ranking
+
+    return ranking.by_torch(WORK / "ranking_by_torch")
+
+
 def _learned_example() -> Tables:
     import learned_example
 
@@ -696,6 +702,7 @@ FIGURES: dict[str, Figure] = {
     "surrogate_in_flight": Figure(45, _surrogate_in_flight),
     "arms": Figure(20, _arms),
     "ranking": Figure(10, _ranking, timed=True),
+    "ranking_by_torch": Figure(20, _ranking_by_torch),
     "handshakes": Figure(5, _handshakes),
     "requests": Figure(5, _requests),
     "fusion_methods": Figure(25, _fusion_methods),
