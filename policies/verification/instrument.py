@@ -9,6 +9,7 @@ that no `except` in the policy hides them. What the policy keeps from one decisi
 from __future__ import annotations
 
 import builtins
+import functools
 import math
 import sys
 import types
@@ -19,10 +20,28 @@ from typing import Any, NoReturn
 
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import Kept, kept_by
-from sortie.policies.verification.pure import IMPURE, PURE_MODULES, cannot_call, is_seeded, is_trusted, takes_ranges
+from sortie.policies.verification.pure import (
+    IMPURE,
+    PURE_MODULES,
+    cannot_call,
+    home_of,
+    is_seeded,
+    is_trusted,
+    reads_stored_text,
+    takes_ranges,
+)
 from sortie.policies.verification.source_checks import compiled
 from sortie.policies.verification.stand_ins import FOR_USER
 from sortie.policies.verification.symbols import MARK, Ranged, Refused, Text
+from sortie.policies.verification.watch import (
+    WATCH,
+    Unordered,
+    UnorderedFrozen,
+    ordered_for,
+    reach,
+    stop,
+    unordered,
+)
 from sortie.scenarios.plugins.user_code import is_users, load
 
 STAND_INS = (
@@ -31,21 +50,6 @@ STAND_INS = (
     "sortie.policies.verification.stand_ins",
     "sortie.policies.verification.solver",
 )
-
-
-class Watch:
-    """What one decision of an instrumented policy did that it may not do, or that cannot be searched."""
-
-    def __init__(self) -> None:
-        self.stopped: Reached | Refused | None = None
-
-    def stop(self, why: Reached | Refused) -> NoReturn:
-        self.stopped = self.stopped or why
-        raise why
-
-
-_WATCH = Watch()
-"""Of the decision that runs now; a process verifies one policy at a time."""
 
 
 class Remembers(Reached):
@@ -71,13 +75,13 @@ class Instrumented:
         """
         if self._kept is None:
             self._kept = kept_by(self.function, self.module)
-        _WATCH.stopped = None
+        WATCH.stopped = None
         try:
             return self.function(view, **params)
         finally:
-            if _WATCH.stopped is not None:
-                raise _WATCH.stopped
-            changed = self._kept.changed()
+            if WATCH.stopped is not None:
+                raise WATCH.stopped
+            changed = self._kept.changed() or WATCH.changed()
             if changed:
                 raise Remembers(changed)
 
@@ -90,26 +94,18 @@ def instrumented(path: File, attribute: str) -> Instrumented:
         Refused: it has something that cannot be checked.
         Exception: what the file raises.
     """
-    _WATCH.stopped = None
+    WATCH.begin()
     try:
         module = load(path, compiled, _builtins)
     except SyntaxError as error:
         raise Refused(str(error)) from None
     finally:
-        if _WATCH.stopped is not None:
-            raise _WATCH.stopped
+        if WATCH.stopped is not None:
+            raise WATCH.stopped
     return Instrumented(getattr(module, attribute), module)
 
 
 # --- the checks ----------------------------------------------------------------------------------
-
-
-def _stop(why: str) -> NoReturn:
-    _WATCH.stop(Refused(why))
-
-
-def _reach(what: str) -> NoReturn:
-    _WATCH.stop(Reached(what))
 
 
 def _is_stand_in(value: object) -> bool:
@@ -122,7 +118,7 @@ def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
         function._used()
     why = cannot_call(function)
     if why is not None:
-        _reach(why[1:]) if why.startswith("!") else _stop(why)
+        reach(why[1:]) if why.startswith("!") else stop(why)
     if type(function) is types.FunctionType and is_users(function.__module__):
         return function(*args, **kwargs)
     return on_behalf_of_the_policy(function, args, kwargs)
@@ -133,34 +129,41 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     for value in (*args, *kwargs.values()):
         if isinstance(value, Outside):
             value._used()
-        if type(value) is types.BuiltinFunctionType and type(value.__self__) is str:
-            _stop("hands on a method of a text")
-        if callable(value) and function not in (isinstance, issubclass) and (why := cannot_call(value)) is not None:
-            _reach(why[1:]) if why.startswith("!") else _stop(why)
-        if type(value) in (set, frozenset) and (function not in _BLIND_TO_SETS or "key" in kwargs):
-            _each(value)  # with a key, the first of those with equal keys is found
-    if not takes_ranges(function) and any(map(_has_text, (*args, *kwargs.values()))):
-        _stop(f"gives a range to {getattr(function, '__qualname__', function)}")
+        if not callable(value) or function in (isinstance, issubclass):
+            continue
+        if (why := cannot_call(value)) is not None:
+            reach(why[1:]) if why.startswith("!") else stop(why)
+        if reads_stored_text(value) and not (value is int and function is map and len(args) == 2):
+            stop(f"hands on {getattr(value, '__qualname__', value)}")
+    args, kwargs = ordered_for(function, args, kwargs)
+    owner = getattr(function, "__self__", None)
+    has_text = any(map(_has_text, (*args, *kwargs.values())))
+    reads = reads_stored_text(function) and function is not int and type(owner) is not str  # of which below
+    if has_text and (reads or not takes_ranges(function)):
+        stop(f"gives a range to {getattr(function, '__qualname__', function)}")
+    if has_text and function is int and len(args) + len(kwargs) > 1:
+        stop("reads a number in the text of a range")
     if function in (isinstance, issubclass) and len(args) == 2 and (why := _cannot_ask(args[1])):
-        _stop(why)
+        stop(why)
     special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
     if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
         return found
-    owner = getattr(function, "__self__", None)
-    if type(owner) is str:
-        if function.__name__ in ("format", "format_map") or any(map(_has_text, (*args, *kwargs.values()))):
-            return _stands_for_text(function, args, kwargs)
-    elif type(owner) in (set, frozenset) and function.__name__ in ("pop", "__iter__"):
-        _each(owner)
-    return _without_mark(function(*args, **kwargs))
+    if type(owner) is str and (has_text or function.__name__ in ("format", "format_map")):
+        return _stands_for_text(function, args, kwargs)
+    return _checked(function(*args, **kwargs))
 
 
-def _without_mark(found: Any) -> Any:
-    """What a call returned; plain text into which a number was written is refused, because its use is not noticed."""
-    parts = found if type(found) in (list, tuple) else (found,)
-    if any(type(part) is str and MARK in part for part in parts):
-        _stop("uses the text of a number inside other text for more than a reason")
-    return found
+def _checked(found: Any) -> Any:
+    """What a call returned, each set as one that watches its order.
+
+    Plain text into which a number was written is refused, because its use is not noticed. So is text with an address.
+    """
+    for part in found if type(found) in (list, tuple) else (found,):
+        if type(part) is str and MARK in part:
+            stop("uses the text of a number inside other text for more than a reason")
+        if (type(part) is str and " at 0x" in part) or (type(part) is bytes and b" at 0x" in part):
+            reach(f"the address in {part!r}")
+    return unordered(found)
 
 
 assert on_behalf_of_the_policy.__name__ == FOR_USER  # noqa: S101
@@ -183,19 +186,23 @@ def _has_text(value: Any) -> bool:
 
 def _stands_for_text(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """A method of a plain text that is given the text of a range, or something that may yield one."""
+    if function.__name__ not in ("join", "format", "format_map"):
+        stop(f"gives the text of a number to str.{function.__name__}")
     if function.__name__ == "join" and len(args) == 1:
         parts = args[0] if isinstance(args[0], Text) else list(args[0])
         args = (parts,)
     else:
         parts = [*args, *kwargs.values()]
         if any(isinstance(part, types.GeneratorType | map | filter) for part in parts):
-            _stop("makes text of an iterator")
+            stop("makes text of an iterator")
     found = next((part for part in parts if _is_stand_in(part)), None)
     if found is None:
-        return _without_mark(function(*args, **kwargs))
+        return _checked(function(*args, **kwargs))
     if isinstance(found, Text | Ranged):
+        if function.__name__ == "format":  # what is wrong with a number of this type must raise
+            function(*map(_example, args), **{name: _example(value) for name, value in kwargs.items()})
         return Text(found._path, found._axis, "text with a number")
-    return _stop("makes text of what is known as a range alone")
+    return stop("makes text of what is known as a range alone")
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -203,34 +210,37 @@ def _same(a: Any, b: Any) -> bool:
         if one is None or one is NotImplemented or one is Ellipsis or isinstance(one, bool | Enum | type):
             return a is b
     if _is_stand_in(a) or _is_stand_in(b) or isinstance(a, _VALUES) or isinstance(b, _VALUES):
-        _reach("the identity of a value (`is`)")
+        reach("the identity of a value (`is`)")
     return a is b
 
 
 _VALUES = (int, float, str, bytes, tuple, frozenset)
 
 
+def _example(value: Any) -> Any:
+    return value._example() if isinstance(value, Text | Ranged) else value
+
+
 def _text_of(write: Callable[[Any], str]) -> Callable[..., Any]:
     def act(*args: Any) -> Any:
-        if len(args) != 1 or _is_stand_in(args[0]):
+        if len(args) != 1:
             return NotImplemented
-        return _without_mark(_without_address(write(args[0])))
+        return args[0]._text() if isinstance(args[0], Text | Ranged) else _checked(write(args[0]))
 
     return act
 
 
-def _without_address(text: str) -> str:
-    if " at 0x" in text:
-        _reach(f"the address in {text!r}")
-    return text
+def _format(value: Any, spec: Any = "") -> Any:
+    return value._text(spec) if isinstance(value, Text | Ranged) else _checked(format(value, spec))
+
+
+_WRITES = {-1: lambda value: value, 97: _text_of(ascii), 114: _text_of(repr), 115: _text_of(str)}
 
 
 def _written(value: Any, conversion: int, spec: str) -> Any:
-    if conversion != -1:
-        value = repr(value) if conversion == 114 else ascii(value) if conversion == 97 else str(value)
     if isinstance(value, Outside):
         value._used()
-    return format(value, spec) if _is_stand_in(value) else _without_mark(_without_address(format(value, spec)))
+    return _format(_WRITES[conversion](value), spec)
 
 
 def _text(*parts: Any) -> Any:
@@ -245,19 +255,29 @@ def _text(*parts: Any) -> Any:
 def _percent(left: Any, right: Any) -> Any:
     if type(left) in (str, bytes) and any(map(_has_text, right if type(right) is tuple else (right,))):
         found = next((p for p in (right if type(right) is tuple else (right,)) if isinstance(p, Text | Ranged)), None)
-        return _stop("makes text of a range") if found is None else Text(found._path, found._axis, "text with a number")
-    return _without_mark(left % right)
+        left % (tuple(map(_example, right)) if type(right) is tuple else _example(right))
+        return stop("makes text of a range") if found is None else Text(found._path, found._axis, "text with a number")
+    return _checked(left % right)
+
+
+def _among(left: Any, right: Any) -> bool:
+    if isinstance(left, Text) and isinstance(right, str):
+        stop("looks for the text of a number in other text")
+    if isinstance(right, Outside):
+        right._used()
+    return left in right
 
 
 def _own(owner: Any, name: str) -> Any:
     """What an attribute may be assigned to: an object of the policy's own classes."""
-    if isinstance(owner, type) or not is_users(type(owner).__module__):
+    if isinstance(owner, type) or not is_users(home_of(type(owner))):
         if _is_stand_in(owner) or isinstance(owner, tuple):
             return owner  # raises what the real object raises
-        _stop(f"assigns to {name} of a {type(owner).__name__}")
+        stop(f"assigns to {name} of a {type(owner).__name__}")
     return owner
 
 
+_LASTS_UNCHANGED = (int, float, str, bytes, types.ModuleType, Enum)
 _PLAIN_PRIVATE = {"_replace", "_asdict", "_fields", "__name__", "__doc__", "__class__", "__init__", "__post_init__"}
 
 
@@ -265,7 +285,7 @@ def _attribute(owner: Any, name: str) -> Any:
     if isinstance(owner, Outside):
         return Outside(f"{owner._path}.{name}")
     if name[0] == "_" and name not in _PLAIN_PRIVATE and not (_is_users_own(owner) and name[:2] != "__"):
-        _stop(f"reads {name}")
+        stop(f"reads {name}")
     if name == "__class__" and _is_stand_in(owner):
         return owner.__class__
     if isinstance(owner, types.ModuleType) and not is_users(owner.__name__):
@@ -278,42 +298,32 @@ def _attribute(owner: Any, name: str) -> Any:
             return Outside(found.__name__)
         if f"{owner.__name__}.{name}" in IMPURE:
             return Outside(f"{owner.__name__}.{name}")
+        if not isinstance(found, _LASTS_UNCHANGED) and not callable(found):
+            WATCH.sees(f"{owner.__name__}.{name}", found)
         return found
     return getattr(owner, name)
 
 
 def _is_users_own(owner: Any) -> bool:
-    home = (
-        owner.__name__
-        if isinstance(owner, types.ModuleType)
-        else owner.__module__
-        if isinstance(owner, type)
-        else type(owner).__module__
-    )
-    return is_users(home)
+    if type(owner) is types.ModuleType:
+        return is_users(owner.__name__)
+    return is_users(home_of(owner if isinstance(owner, type) else type(owner)))
 
 
 def _decorator(found: Any) -> Any:
-    why = cannot_call(found)
-    if why is not None:
-        _reach(why[1:]) if why.startswith("!") else _stop(why)
-    return found
+    return functools.partial(_called, found)
 
 
 def _each(iterable: Any) -> Any:
-    if (
-        type(iterable) in (set, frozenset)
-        and len(iterable) > 1
-        and not all(type(x) in (int, bool) or isinstance(x, Enum) for x in iterable)
-    ):
-        _reach("the order of a set, which hashes decide")
     if isinstance(iterable, Outside):
         iterable._used()
-    return iterable
+    return unordered(iterable)
 
 
 def _type_of(*args: Any, **kwargs: Any) -> Any:
-    return args[0].__class__ if len(args) == 1 and _is_stand_in(args[0]) else NotImplemented
+    if len(args) == 1 and (_is_stand_in(args[0]) or isinstance(args[0], Unordered | UnorderedFrozen)):
+        return args[0].__class__
+    return NotImplemented
 
 
 def _rounding(how: str) -> Callable[..., Any]:
@@ -336,7 +346,7 @@ def _sum(items: Any, /, start: Any = 0) -> Any:
     floats = len(listed) + (type(start) is not int or start != 0)
     # Two floats have the same sum either way, and the solver follows combined inputs without rounding.
     if sys.version_info >= (3, 12) and floats > 2 and type(found).__name__ == "Ranged":
-        _stop("adds up floats with sum(…), which compensates rounding")
+        stop("adds up floats with sum(…), which compensates rounding")
     return found
 
 
@@ -359,10 +369,8 @@ def _finite(answer: bool) -> Callable[..., Any]:
 _SPECIAL: dict[Any, Callable[..., Any]] = {
     type: _type_of, float: _float, int: _rounding("int"), round: _rounding("round"), math.floor: _rounding("floor"),
     math.ceil: _rounding("ceil"), math.trunc: _rounding("int"), math.sqrt: _rounding("sqrt"), sum: _sum,
-    str: _text_of(str), repr: _text_of(repr), ascii: _text_of(ascii), sorted: _plain_sorted, math.isfinite: _finite(True), math.isnan: _finite(False), math.isinf: _finite(False),
+    str: _text_of(str), repr: _text_of(repr), ascii: _text_of(ascii), format: _format, sorted: _plain_sorted, math.isfinite: _finite(True), math.isnan: _finite(False), math.isinf: _finite(False),
 }  # fmt: skip
-_BLIND_TO_SETS = (len, sorted, min, max, any, all, set, frozenset, isinstance, bool, set.union, type)
-
 
 # --- what the sources see ------------------------------------------------------------------------
 
@@ -383,8 +391,8 @@ class Outside:
 
     def _used(self, *_: object, **__: object) -> NoReturn:
         if is_seeded(self._path):
-            _stop(f"draws from {self._path}")
-        _reach(self._path)
+            stop(f"draws from {self._path}")
+        reach(self._path)
 
 
 _OPERATORS = "call iter len bool getitem eq ne lt le gt ge add radd sub rsub mul rmul truediv float int str hash"
@@ -393,7 +401,8 @@ for _operator in _OPERATORS.split():
 
 CHECKS: dict[str, Any] = {
     "__called__": _called, "__same__": _same, "__text__": _text, "__written__": _written, "__percent__": _percent,
-    "__own__": _own, "__attribute__": _attribute, "__decorator__": _decorator, "__each__": _each,
+    "__own__": _own, "__attribute__": _attribute, "__decorator__": _decorator, "__each__": _each, "__among__": _among,
+    "__unordered__": unordered,
 }  # fmt: skip
 
 

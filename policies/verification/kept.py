@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from sortie.policies.verification.pure import HEAP, home_of
 from sortie.policies.verification.symbols import Refused
 from sortie.scenarios.plugins.user_code import is_users
 
 _LEAVES = (
     int, str, bytes, bool, type(None), type(Ellipsis), type(NotImplemented), Decimal, Fraction, range, complex,
-    types.BuiltinFunctionType, types.MethodDescriptorType, types.WrapperDescriptorType, types.GenericAlias,
+    types.MethodDescriptorType, types.WrapperDescriptorType, types.GenericAlias,
     types.UnionType, types.GetSetDescriptorType, types.MemberDescriptorType, re.Pattern, np.generic, np.dtype, np.ufunc,
 )  # fmt: skip
 
@@ -42,7 +43,7 @@ class Kept:
         self._before = self._now()
 
     def _now(self) -> dict[str, Any]:
-        return {name: _fingerprint(value, {}) for name, value in self._roots.items()}
+        return {name: fingerprint(value) for name, value in self._roots.items()}
 
     def changed(self) -> str:
         """What has changed since, in words; empty if nothing has."""
@@ -62,23 +63,38 @@ def kept_by(function: Callable[..., Any], module: types.ModuleType) -> Kept:
     return Kept({**roots, "the policy itself": function})
 
 
+def fingerprint(value: Any) -> Any:
+    """What is equal for an object as long as nothing in it has changed.
+
+    Raises:
+        Refused: it may change in a way that cannot be seen.
+    """
+    return _fingerprint(value, {})
+
+
 def _fingerprint(value: Any, met: dict[int, int]) -> Any:
     kind = type(value)
     if kind is float:
         return "float", value.hex()
-    if isinstance(value, Enum):
-        return kind.__name__, value.name
     if kind in _LEAVES or isinstance(value, np.generic | np.ufunc):
         return kind.__name__, value if not isinstance(value, np.generic) else value.tobytes()
     if id(value) in met:
         return "again", met[id(value)]
     met[id(value)] = len(met)
-    if kind in (list, tuple) or (isinstance(value, tuple) and not is_users(kind.__module__)):
+    if isinstance(value, Enum):
+        own = [v for name, v in vars(value).items() if name != "__objclass__"] if is_users(home_of(kind)) else []
+        return kind.__name__, value.name, tuple([_fingerprint(v, met) for v in own])
+    if kind is types.BuiltinFunctionType:  # a method of a list changes with the list
+        owner = value.__self__
+        of = () if isinstance(owner, types.ModuleType | type | None) else _fingerprint(owner, met)
+        return kind.__name__, value.__name__, of
+    if kind in (list, tuple) or (isinstance(value, tuple) and not is_users(home_of(kind))):
         return kind.__name__, tuple([_fingerprint(v, met) for v in value])
     if kind in (dict, types.MappingProxyType, collections.OrderedDict, collections.defaultdict, collections.Counter):
-        return kind.__name__, tuple([(_fingerprint(k, met), _fingerprint(v, met)) for k, v in value.items()])
-    if kind in (set, frozenset):
-        return kind.__name__, frozenset([_fingerprint(v, met) for v in value])
+        makes = _fingerprint(value.default_factory, met) if kind is collections.defaultdict else ()
+        return kind.__name__, makes, tuple([(_fingerprint(k, met), _fingerprint(v, met)) for k, v in value.items()])
+    if isinstance(value, set | frozenset):
+        return kind.__name__, frozenset([_fingerprint(v, met) for v in _members(value)])
     if kind in (collections.deque, bytearray):
         return kind.__name__, tuple([_fingerprint(v, met) for v in value])
     if kind is np.ndarray:
@@ -86,11 +102,19 @@ def _fingerprint(value: Any, met: dict[int, int]) -> Any:
     return kind.__name__, id(value), _parts(value, met)
 
 
+def _members(value: Any) -> Any:
+    """The members of a set, which may be one that watches its order."""
+    return (set if isinstance(value, set) else frozenset).__iter__(value)
+
+
 def _parts(value: Any, met: dict[int, int]) -> Any:
     """The changeable parts of a function, a class, a module or an object."""
     found: list[Any]
-    if isinstance(value, types.FunctionType):
-        if not is_users(value.__module__) and not value.__dict__ and value.__closure__ is None:
+    if is_users(home_of(type(value))) and not isinstance(value, type):
+        found = _parts_of_users(value)
+    elif isinstance(value, types.FunctionType):
+        is_others = not is_users(value.__globals__.get("__name__"))
+        if is_others and not value.__dict__ and value.__closure__ is None:
             return ()
         cells = [c.cell_contents for c in value.__closure__ or () if _is_full(c)]
         found = [
@@ -102,9 +126,9 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
     elif isinstance(value, types.ModuleType):
         found = [v for n, v in vars(value).items() if n not in _PYTHONS_OWN] if is_users(value.__name__) else []
     elif isinstance(value, type):
-        own = {n: v for n, v in vars(value).items() if _may_change(n, v)} if is_users(value.__module__) else {}
-        found = [*(x for item in own.items() for x in item), *(c for c in value.__mro__[1:] if is_users(c.__module__))]
-        found += [type(value)] if is_users(type(value).__module__) else []
+        own = {n: v for n, v in vars(value).items() if _may_change(n, v)} if is_users(home_of(value)) else {}
+        found = [*(x for item in own.items() for x in item), *(c for c in value.__mro__[1:] if is_users(home_of(c)))]
+        found += [type(value)] if is_users(home_of(type(value))) else []
     elif isinstance(value, functools.partial):
         found = [value.func, *value.args, *value.keywords.values()]
     elif isinstance(value, types.MethodType):
@@ -113,12 +137,7 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
         found = [value.__func__]
     elif isinstance(value, property):
         found = [value.fget, value.fset]
-    elif is_users(type(value).__module__):
-        found = [x for item in _attributes(value).items() for x in item]
-        if isinstance(value, list | tuple | set | frozenset | dict):
-            found += [*value, *(value.values() if isinstance(value, dict) else ())]
-        found.append(type(value))  # its class may be reached through it alone
-    elif type(value).__module__ in ("typing", "__future__", "operator", "sortie.policies.verification.instrument"):
+    elif home_of(type(value)) in ("typing", "__future__", "operator", "sortie.policies.verification.instrument"):
         found = []
     elif hasattr(value, "__wrapped__") or hasattr(value, "cache_info"):
         raise Refused("keeps results from one decision to the next (functools)")
@@ -127,12 +146,42 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
     return tuple([_fingerprint(v, met) for v in found])
 
 
+_BASES = (
+    object, int, float, complex, str, bytes, bytearray, tuple, list, dict, collections.OrderedDict,
+    collections.defaultdict, collections.deque, property, staticmethod, classmethod, types.ModuleType, Decimal,
+)  # fmt: skip
+"""Compiled classes that keep no more than their content and what their attributes show."""
+
+
+def _parts_of_users(value: Any) -> list[Any]:
+    """What an object of the policy's own class keeps: its attributes, its content, and its class, reached through it alone."""
+    found = [x for item in _attributes(value).items() for x in item]
+    for base in type(value).__mro__:
+        is_compiled = not base.__flags__ & HEAP
+        if is_compiled and base not in _BASES and not issubclass(base, BaseException):
+            raise Refused(f"keeps a {base.__name__} from one decision to the next")
+        if base not in (object, str, bytes, int, float, complex):
+            shown = [n for n, v in vars(base).items() if isinstance(v, _SHOWN) and n not in _ALWAYS_SHOWN]
+            found += [getattr(value, name, None) for name in shown]
+    if isinstance(value, dict):
+        found += [x for item in dict.items(value) for x in item]
+    for base in (list, tuple, bytearray, collections.deque):
+        if isinstance(value, base):  # as it is, whatever the class's own `__iter__` says
+            read: Any = base.__iter__
+            found += read(value)
+    return [*found, type(value)]
+
+
+_SHOWN = types.MemberDescriptorType | types.GetSetDescriptorType
+_ALWAYS_SHOWN = {"__dict__", "__weakref__", "__class__", "__traceback__", "__context__", "__cause__"}
+
+
 def _may_change(name: str, value: Any) -> bool:
     """Whether an attribute of a class may keep something: all but what Python itself puts there."""
     if name[:2] != "__":
         return True
     changes = (types.FunctionType, staticmethod, classmethod, property, list, dict, set, bytearray)
-    return name not in _PYTHONS_OWN and (isinstance(value, changes) or is_users(type(value).__module__))
+    return name not in _PYTHONS_OWN and (isinstance(value, changes) or is_users(home_of(type(value))))
 
 
 def _attributes(value: Any) -> dict[str, Any]:

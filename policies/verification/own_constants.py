@@ -53,7 +53,7 @@ def _moved(view: FleetView, constants: Sequence[float], rng: np.random.Generator
             return None
         c = float(rng.choice(known))
         around = (c, c, math.nextafter(c, -math.inf), math.nextafter(c, math.inf))
-        return min(max(float(rng.choice(around)), low), high)
+        return float(min(max(float(rng.choice(around)), low), high))
 
     descriptors, ages_s = dict(view.descriptors), dict(view.age_s)
     egos = [int(c) for c in constants if c in descriptors]

@@ -9,7 +9,7 @@ heard, every order of the drones in the view, and
 | charge and headrooms | every float of 0 … 1 |
 | goodput | every float of 0 … 10⁵ Mb/s |
 | ages | every float of 0 … 3600 s |
-| phase, region | all five; none, or any disc |
+| phase, region | all five; none, or any disc within 100 km |
 | novelty flags, target ids | every byte; how many, 0 … 16 |
 | positions, footprints | every order of the peers by `peers_by_overlap`, through which alone they may be read |
 
@@ -22,7 +22,7 @@ heard, every order of the drones in the view, and
 | `drawn` | random views alone, because the policy cannot be followed; none fails |
 
 Drawn views are tried after every proof too, up to the largest fleet that a scenario may have. A proof covers neither
-rosters (`context.roster`), nor another period than the one given, nor NaN.
+rosters (`context.roster`), nor another period than the one given, nor another `detached_after_periods`, nor NaN.
 """
 
 from __future__ import annotations

@@ -13,11 +13,12 @@ import operator
 import random
 import re
 import statistics
+import sys
 import types
 from enum import Enum
 from typing import Any
 
-from sortie.scenarios.plugins.user_code import is_users
+from sortie.scenarios.plugins.user_code import PREFIX, is_users
 
 PURE_MODULES = frozenset({
     "__future__", "abc", "bisect", "cmath", "collections", "copy", "dataclasses", "decimal", "enum", "fractions",
@@ -111,6 +112,38 @@ _OPEN_MODULES = frozenset(
 )
 
 
+HEAP = 1 << 9
+"""Of a class's `__flags__`: it was made while Python ran."""
+
+
+def home_of(kind: type) -> str:
+    """The module of a class. One that is not found there is the policy's own, whatever its `__module__` says."""
+    home = str(type.__dict__["__module__"].__get__(kind))
+    if not kind.__flags__ & HEAP or is_users(home):
+        return home
+    found: Any = sys.modules.get(home)
+    for part in kind.__qualname__.split("."):
+        found = getattr(found, part, None)
+    return home if found is kind else PREFIX
+
+
+def reads_stored_text(function: Any) -> bool:
+    """Whether compiled code reads what is stored in a text, or the order of a set, without asking its methods."""
+    if isinstance(function, types.MethodDescriptorType | types.ClassMethodDescriptorType):
+        return function.__objclass__ in (str, bytes, bytearray, set, frozenset)
+    if isinstance(function, type):
+        return function in (bytes, bytearray, complex, int) or (
+            issubclass(function, str | bytes) and function is not str
+        )
+    if type(function) is types.BuiltinFunctionType:
+        return function in (ord, operator.contains, operator.concat) or type(function.__self__) in (
+            str,
+            bytes,
+            bytearray,
+        )
+    return isinstance(function, functools.partial) and reads_stored_text(function.func)
+
+
 def is_trusted(home: str) -> bool:
     """Whether a module is one of Sortie's that policies are made of."""
     return home == "sortie" or home.startswith(_TRUSTED)
@@ -132,9 +165,10 @@ def takes_ranges(function: Any) -> bool:
             or _is_tuple_method(function)
         )
     if isinstance(function, type):
+        home = home_of(function)
         return (
-            function in _BUILTINS or is_users(function.__module__) or is_trusted(function.__module__)
-            or function.__module__ in ("itertools", "collections", "functools") or issubclass(function, BaseException)
+            function in _BUILTINS or is_users(home) or is_trusted(home)
+            or home in ("itertools", "collections", "functools") or issubclass(function, BaseException)
         )  # fmt: skip
     if isinstance(function, functools.partial):
         return takes_ranges(function.func)
@@ -165,11 +199,12 @@ def cannot_call(function: Any) -> str | None:
         return cannot_call(function.func)
     if hasattr(function, "cache_info"):
         return "keeps results (functools.cache)"
-    if is_users(kind.__module__) or kind is operator.itemgetter or isinstance(function, Enum):
+    home = home_of(kind)
+    if is_users(home) or kind is operator.itemgetter or isinstance(function, Enum):
         return None
-    if kind.__module__.startswith("sortie.policies.verification"):
+    if home.startswith("sortie.policies.verification"):
         return None  # a stand-in that is called raises what the real object raises
-    if kind.__module__ == "typing" or kind in (types.GenericAlias, types.UnionType):
+    if home == "typing" or kind in (types.GenericAlias, types.UnionType):
         return None
     return f"calls {kind.__module__}.{kind.__name__}" if callable(function) else None
 
@@ -207,10 +242,10 @@ def _compiled_function(function: Any) -> str | None:
         return f"calls {home}.{name}" if home.partition(".")[0] in PURE_MODULES else f"!{home}.{name}"
     if isinstance(owner, _PLAIN) or (isinstance(owner, type) and owner in _PLAIN) or isinstance(owner, type(iter(()))):
         return None
-    home = type(owner).__module__
+    home = home_of(type(owner))
     if home in _C_MODULES or home in ("decimal", "fractions"):
         return None
-    if is_users(home) or home.startswith("sortie.") or (isinstance(owner, type) and is_users(owner.__module__)):
+    if is_users(home) or home.startswith("sortie.") or (isinstance(owner, type) and is_users(home_of(owner))):
         return None
     return (
         f"!{home}.{type(owner).__name__}.{name}"
@@ -220,7 +255,9 @@ def _compiled_function(function: Any) -> str | None:
 
 
 def _class(kind: type) -> str | None:
-    home = kind.__module__
+    home = home_of(kind)
+    if issubclass(kind, set | frozenset) and is_users(home):
+        return f"calls {kind.__name__}, a set of its own kind"
     if kind in _BUILTINS or kind in _PLAIN or is_users(home) or is_trusted(home) or issubclass(kind, BaseException):
         return None
     path = f"{home}.{kind.__name__}"

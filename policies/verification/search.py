@@ -96,11 +96,11 @@ def search_size(
             return Run(policy, FleetOfRanges(path, drones, ego, heard, period_s))
 
         for path, found in explore(run, make):
-            exact = exact and path.exact
             found.compare(plain)
             for searched, complaint in properties:
                 if searched.fault is None and not searched.unclear:
                     _search_cell(path, found, searched, complaint, confirm, budget)
+            exact = exact and path.exact  # a property's own sums and products count too
             if all(searched.fault is not None or searched.unclear for searched, _ in properties):
                 return exact
             if budget.is_spent:

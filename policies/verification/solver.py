@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any
 
-from sortie.policies.verification.symbols import Path, Ranged, Refused
+from sortie.policies.verification.symbols import MARK, Path, Ranged, Refused, Text
 
 STEP_MS = 2000
 """The longest time for one question to the solver."""
@@ -255,8 +255,12 @@ class Solved(Ranged):
     def __abs__(self) -> Any:
         return self if self >= 0 else -self
 
-    def __format__(self, spec: str) -> str:
-        return self._text(spec)
+    def _text(self, spec: str = "") -> str:
+        format(self._example(), spec)
+        return Text(self._path, self._axis, f"{MARK}{self._axis}{MARK}")
+
+    def _example(self) -> float:
+        return 0.0 if isinstance(self, float) else 0
 
     def _value_in(self, values: Mapping[str, float]) -> float:
         path: Any = self._path

@@ -8,9 +8,28 @@ from typing import Any
 
 
 def compiled(source: bytes, path: str) -> types.CodeType:
-    tree = Checks().visit(ast.parse(source, path))
+    plain = ast.parse(source, path)
+    for node in ast.walk(plain):
+        names = {getattr(node, field, None) for field in ("id", "name", "arg", "asname", "rest")}
+        reads_name = isinstance(node, ast.Name) and node.id == "__name__" and isinstance(node.ctx, ast.Load)
+        taken = RESERVED & names
+        if taken and not reads_name and not isinstance(node, ast.keyword):
+            raise SyntaxError(f"uses the name {taken.pop()}")
+    tree = Checks().visit(plain)
     code: types.CodeType = compile(ast.fix_missing_locations(tree), path, "exec", dont_inherit=True)
     return code
+
+
+RESERVED = {
+    "__called__", "__same__", "__text__", "__written__", "__percent__", "__own__", "__attribute__", "__decorator__",
+    "__each__", "__among__", "__unordered__", "__builtins__", "__build_class__", "__name__", "__module__",
+    "__qualname__", "__file__", "__spec__", "__loader__", "__cached__", "__path__", "__package__",
+}  # fmt: skip
+"""The checks, and names by which a policy would say that it is another one, or find where it lies."""
+_IN_ANNOTATIONS = (
+    ast.Name, ast.Attribute, ast.Subscript, ast.Constant, ast.Tuple, ast.List, ast.BinOp, ast.operator, ast.Load,
+)  # fmt: skip
+_SET_OPERATORS = (ast.BitAnd, ast.BitOr, ast.BitXor, ast.Sub)
 
 
 class Checks(ast.NodeTransformer):
@@ -24,12 +43,24 @@ class Checks(ast.NodeTransformer):
 
     def visit_Compare(self, node: ast.Compare) -> ast.AST:
         self.generic_visit(node)
-        if not any(isinstance(op, ast.Is | ast.IsNot) for op in node.ops):
+        if not any(isinstance(op, ast.Is | ast.IsNot | ast.In | ast.NotIn) for op in node.ops):
             return node
         if len(node.ops) > 1:
-            raise SyntaxError("has `is` in a chain of comparisons")
-        same: ast.expr = ast.Call(_name("__same__"), [node.left, node.comparators[0]], [])
-        return ast.copy_location(ast.UnaryOp(ast.Not(), same) if isinstance(node.ops[0], ast.IsNot) else same, node)
+            raise SyntaxError("has `is` or `in` in a chain of comparisons")
+        check = "__same__" if isinstance(node.ops[0], ast.Is | ast.IsNot) else "__among__"
+        same: ast.expr = ast.Call(_name(check), [node.left, node.comparators[0]], [])
+        negative = isinstance(node.ops[0], ast.IsNot | ast.NotIn)
+        return ast.copy_location(ast.UnaryOp(ast.Not(), same) if negative else same, node)
+
+    def visit_Set(self, node: ast.Set) -> ast.AST:
+        return self._set(node)
+
+    def visit_SetComp(self, node: ast.SetComp) -> ast.AST:
+        return self._set(node)
+
+    def _set(self, node: ast.expr) -> ast.AST:
+        self.generic_visit(node)
+        return ast.copy_location(ast.Call(_name("__unordered__"), [node], []), node)
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
         self.generic_visit(node)
@@ -43,6 +74,8 @@ class Checks(ast.NodeTransformer):
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
         self.generic_visit(node)
+        if isinstance(node.op, _SET_OPERATORS):
+            return ast.copy_location(ast.Call(_name("__unordered__"), [node], []), node)
         if not isinstance(node.op, ast.Mod):
             return node
         return ast.copy_location(ast.Call(_name("__percent__"), [node.left, node.right], []), node)
@@ -61,7 +94,7 @@ class Checks(ast.NodeTransformer):
         return ast.copy_location(ast.Call(_name("__attribute__"), [node.value, ast.Constant(node.attr)], []), node)
 
     def _decorated(self, node: Any) -> Any:
-        returns, node.returns = getattr(node, "returns", None), None
+        returns, node.returns = _plain_annotation(getattr(node, "returns", None)), None
         self.generic_visit(node)
         node.returns = returns
         node.decorator_list = [ast.Call(_name("__decorator__"), [d], []) for d in node.decorator_list]
@@ -104,11 +137,13 @@ class Checks(ast.NodeTransformer):
         return node
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
+        _plain_annotation(node.annotation)
         node.target = self.visit(node.target)
         node.value = None if node.value is None else self.visit(node.value)
         return node
 
     def visit_arg(self, node: ast.arg) -> ast.AST:
+        _plain_annotation(node.annotation)
         return node
 
     def visit_Global(self, node: ast.Global) -> ast.AST:
@@ -116,6 +151,13 @@ class Checks(ast.NodeTransformer):
 
     def visit_AsyncFunctionDef(self, node: ast.AsyncFunctionDef) -> ast.AST:
         raise SyntaxError("has asynchronous code")
+
+
+def _plain_annotation(node: ast.expr | None) -> ast.expr | None:
+    """An annotation, which stays as it is; it must compute nothing."""
+    if node is not None and not all(isinstance(part, _IN_ANNOTATIONS) for part in ast.walk(node)):
+        raise SyntaxError("computes an annotation")
+    return node
 
 
 def _name(text: str) -> ast.Name:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import operator
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
@@ -100,10 +101,18 @@ class Flags:
 
 
 def _by_value(name: str) -> Callable[..., Any]:
-    def operator(*operands: Any) -> Any:
-        return getattr(int, name)(*(x._bits(-1) if type(x) is Flags else x for x in operands))
+    reflected = f"__{name[3:]}" if name[:3] == "__r" else ""
 
-    return operator
+    def act(*operands: Any) -> Any:
+        plain = [x._bits(-1) if type(x) is Flags else x for x in operands]
+        found = getattr(int, name)(*plain)
+        if found is not NotImplemented or len(plain) != 2:
+            return found
+        if hasattr(operator, reflected):  # the other operand's own method meets the int, not the stand-in
+            return getattr(operator, reflected)(*reversed(plain))
+        return getattr(operator, name)(*plain) if hasattr(operator, name) else found
+
+    return act
 
 
 _OWN_METHODS = {*vars(Flags), "__new__", "__getattribute__", "__init_subclass__", "__subclasshook__"}

@@ -15,9 +15,12 @@ from __future__ import annotations
 import math
 import numbers
 import struct
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NoReturn, TypeVar
+
+from sortie.scenarios.plugins.user_code import is_users
 
 T = TypeVar("T")
 
@@ -326,20 +329,26 @@ class Ranged:
     def __getattr__(self, name: str) -> NoReturn:
         self._cannot()
 
-    def __format__(self, spec: str) -> str:
+    def _text(self, spec: str = "") -> str:
         """The number's text if the range is a single number; otherwise a text that can only be used as a reason."""
         low, high = self._path.ranges[self._axis]
         written = format(self._at(low), spec)  # also for a wide range, because a wrong spec must raise
-        return written if low == high else Text(self._path, self._axis, f"{MARK}{self._axis}{MARK}")
-
-    def _text(self, spec: str) -> str:
-        format(0.0 if isinstance(self, float) else 0, spec)
+        if low == high and (self._at(low) != 0 or type(low) is int):  # a zero may be -0.0
+            return written
         return Text(self._path, self._axis, f"{MARK}{self._axis}{MARK}")
 
-    def __str__(self) -> str:
-        return self.__format__("")
+    def __format__(self, spec: str) -> str:
+        return self._cannot() if for_policy(sys._getframe(1)) else self._text(spec)
 
-    __repr__ = __str__
+    def __str__(self) -> str:
+        return self._cannot() if for_policy(sys._getframe(1)) else self._text()
+
+    def __repr__(self) -> str:
+        return self._cannot() if for_policy(sys._getframe(1)) else self._text()
+
+    def _example(self) -> float:
+        """One of its values, to see what plain Python says of its type."""
+        return self._at(self._path.ranges[self._axis][0])
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
@@ -347,12 +356,22 @@ class Ranged:
         return type(self._at(self._path.ranges[self._axis][0]))
 
 
+def for_policy(frame: Any) -> bool:
+    """Whether a policy wants a text, through compiled code, the checks on it or Python's library.
+
+    The checks ask for `_text`, of which they know what becomes. Sortie's own policies and errors put texts into reasons alone.
+    """
+    home = str(frame.f_globals.get("__name__", ""))
+    is_checks = home == "sortie.policies.verification.instrument"
+    return is_checks or is_users(home) or home.partition(".")[0] in sys.stdlib_module_names
+
+
 class Text(str):
     """The text of a number with a known range. It can be used as a reason; any other use raises `Refused`.
 
-    It stays a `Text` in `str`, `format`, `+`, and an f-string that has nothing else. Among other text in an f-string,
-    in `join` and in `str.format`, Python makes plain text of it. The plain text has a mark from the private use area
-    instead of the number, so code that reads a number there fails. A comparison of such text is not noticed.
+    Sortie's own f-strings and `join` make plain text of it. The plain text has a mark instead of the number, so code that
+    reads a number there fails. The checks (`instrument`) keep a policy's text a `Text`, and refuse compiled code that would
+    read what is stored.
     """
 
     _path: Path
@@ -375,14 +394,20 @@ class Text(str):
     def __rmod__(self, other: str) -> Text:
         return Text(self._path, self._axis, str.__mod__(other, self._plain()))
 
-    def __format__(self, spec: str) -> Text:
+    def _text(self, spec: str = "") -> Text:
         return Text(self._path, self._axis, str.__format__(self, spec))
 
-    def __str__(self) -> Text:
-        return self
+    def __format__(self, spec: str) -> str:
+        return self._refused() if for_policy(sys._getframe(1)) else self._text(spec)
 
-    def __repr__(self) -> Text:
-        return Text(self._path, self._axis, str.__repr__(self))
+    def __str__(self) -> str:
+        return self._refused() if for_policy(sys._getframe(1)) else self
+
+    def __repr__(self) -> str:
+        return self._refused() if for_policy(sys._getframe(1)) else self
+
+    def _example(self) -> str:
+        return "0"
 
     def __bool__(self) -> bool:
         return True  # the text of a number is never empty
@@ -399,7 +424,7 @@ for _method in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} -
     setattr(Text, _method, Text._refused)
 
 MARK = "\ue000"
-"""Stands in a text where a number with a range was written."""
+"""Stands in a text where Sortie's own code wrote a number with a range."""
 _EXACT = 2.0**53
 """Up to here every whole number is a float."""
 

@@ -241,16 +241,26 @@ def _beat_of_process() -> _Beat | None:
 
 @functools.cache
 def _refuse_exits() -> None:
-    """`os._exit` within a guarded call raises SystemExit, in this process and not in those that it forks."""
+    """`os._exit` and `os.execv` within a guarded call raise SystemExit, in this process and not in those that it forks."""
     process = os.getpid()
 
-    def leave(code: int) -> None:
-        watch = _WATCHES.get(threading.get_ident())
-        if watch is not None and watch.calling and os.getpid() == process:
-            raise SystemExit(code)
-        _exit(code)
+    def refused(name: str) -> Callable[..., Any]:
+        act = getattr(os, name)
 
-    os._exit = leave  # type: ignore[assignment]
+        @functools.wraps(act)
+        def leave(*args: Any) -> Any:
+            watch = _WATCHES.get(threading.get_ident())
+            if watch is not None and watch.calling and os.getpid() == process:
+                raise SystemExit(args[0] if name == "_exit" else f"of {name}")
+            return act(*args)
+
+        return leave
+
+    compiled = sys.modules.get("posix") or sys.modules.get("nt") or os  # `os` takes them from there
+    for name in ("_exit", "execv", "execve"):
+        leave = refused(name)
+        setattr(os, name, leave)
+        setattr(compiled, name, leave)
 
 
 _exit = os._exit

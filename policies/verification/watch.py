@@ -1,0 +1,129 @@
+"""What stops a decision of an instrumented policy, and the sets and foreign objects that are watched meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Any, NoReturn
+
+from sortie.policies.verification.confine import Reached
+from sortie.policies.verification.kept import fingerprint
+from sortie.policies.verification.symbols import Refused
+
+
+class Watch:
+    """What one decision of an instrumented policy did that it may not do, or that cannot be searched."""
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the policy before."""
+        self.stopped: Reached | Refused | None = None
+        self._others: dict[str, tuple[Any, Any]] = {}
+
+    def stop(self, why: Reached | Refused) -> NoReturn:
+        self.stopped = self.stopped or why
+        raise why
+
+    def sees(self, name: str, value: Any) -> None:
+        """Keep how an object of another module is now: it outlasts the decision."""
+        if name not in self._others:
+            try:
+                self._others[name] = value, fingerprint(value)
+            except Refused as refused:
+                self.stop(refused)
+
+    def changed(self) -> str:
+        """Which object of another module is no longer as it was, in words; empty if none."""
+        return next((f"changes {n}" for n, (value, was) in self._others.items() if fingerprint(value) != was), "")
+
+
+WATCH = Watch()
+"""Of the decision that runs now; a process verifies one policy at a time."""
+
+
+def stop(why: str) -> NoReturn:
+    """The search cannot follow this."""
+    WATCH.stop(Refused(why))
+
+
+def reach(what: str) -> NoReturn:
+    """The policy uses this, which is not in its view."""
+    WATCH.stop(Reached(what))
+
+
+# --- sets: hashes decide their order, and those of texts differ from process to process ---------------
+
+
+def _see_order(members: list[Any]) -> Any:
+    # A copy of a set of small whole numbers has their order too; that of other numbers may depend on its history.
+    if len(members) > 1 and not all(
+        isinstance(x, int | IntEnum) and (0 <= x < 8 or len(members) <= 4) for x in members
+    ):
+        reach("the order of a set, which hashes decide")
+    return iter(members)
+
+
+class Unordered(set[Any]):
+    """A set that stops the run as soon as someone sees its order, be it compiled code."""
+
+    def __iter__(self) -> Any:
+        return _see_order(list(set.__iter__(self)))
+
+    def pop(self) -> Any:
+        _see_order(list(set.__iter__(self)))
+        return set.pop(self)
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return set
+
+
+class UnorderedFrozen(frozenset[Any]):
+    """The same of a frozen set."""
+
+    def __iter__(self) -> Any:
+        return _see_order(list(frozenset.__iter__(self)))
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return frozenset
+
+
+def unordered(value: Any) -> Any:
+    """A plain set as one that watches its order; anything else as it is."""
+    return Unordered(value) if type(value) is set else UnorderedFrozen(value) if type(value) is frozenset else value
+
+
+def _watched(method: Callable[..., Any]) -> Callable[..., Any]:
+    def act(*operands: Any) -> Any:
+        return unordered(method(*operands))
+
+    return act
+
+
+_MAKE_SETS = (
+    "__and__ __or__ __sub__ __xor__ __rand__ __ror__ __rsub__ __rxor__ union intersection difference "
+    "symmetric_difference copy"
+)
+for _name in _MAKE_SETS.split():
+    setattr(Unordered, _name, _watched(getattr(set, _name)))
+    setattr(UnorderedFrozen, _name, _watched(getattr(frozenset, _name)))
+_BLIND = (sorted, min, max, any, all)
+_COMPARABLE = ({str}, {bytes}, {int, float, bool})
+
+
+def ordered_for(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Arguments of a call, with plain sets for functions that sort them, and watched ones to be made by others."""
+    is_blind = any(function is f for f in _BLIND) and "key" not in kwargs  # equal keys would show the order
+
+    def one(value: Any) -> Any:
+        if value is set or value is frozenset:
+            return value if function in (isinstance, issubclass) else Unordered if value is set else UnorderedFrozen
+        if is_blind and type(value) in (Unordered, UnorderedFrozen):
+            members = list((set if type(value) is Unordered else frozenset).__iter__(value))
+            return members if any({type(x) for x in members} <= kinds for kinds in _COMPARABLE) else value
+        return value
+
+    return tuple(map(one, args)), {name: one(value) for name, value in kwargs.items()}

@@ -1,0 +1,65 @@
+"""Policies with a fault that only real objects, another process or a later decision show, and correct ones beside them.
+
+A body is as in `policies_corpus`. K is a charge at which the fault shows.
+"""
+
+from __future__ import annotations
+
+K = "0.4123457"
+LATER = 1_000_003
+
+TEXTS = (
+    "bad = f'{soc:.7f}' in 'K'", "bad = operator.contains('K', f'{soc:.7f}')", "bad = ascii(soc) == 'K'", "bad = f'{soc!a}' == 'K'",
+    "bad = ascii([soc]) == '[K]'", "bad = '%a' % {0: soc} == '{0: K}'", "bad = repr([f'{soc:.7f}']) == \"['K']\"",
+    "bad = '%.12s' % {0: soc} == '{0: 0.412345'", "bad = f'{[soc]!s:.10}' == '[K'", "bad = '{!s:.10}'.format([soc]) == '[K'",
+    "bad = bytes(f'{soc:.7f}', 'utf8') == b'K'", "bad = bytearray(str(soc), 'utf8') == b'K'", "bad = not 'K'.replace(str(soc), '')",
+    "bad = not 'K'.removeprefix(str(soc))", "bad = str.startswith(str(soc), 'K')", "bad = any(map(str.endswith, [str(soc)], ['4123457']))",
+    "try:\n    bad = complex(str(soc)) == K\nexcept ValueError:\n    pass", "try:\n    bad = int(f'{soc * 1e7:.0f}', 16) == 0x4123457\nexcept ValueError:\n    pass",
+    "class T(str):\n    pass\nbad = T(soc) == 'K'", "e = ValueError(str(soc))\nbad = repr(e) == \"ValueError('K')\"", "bad = soc <= 0 and f'{soc}' == '-0.0'",
+    "try:\n    '{:d}'.format(soc)\nexcept ValueError:\n    bad = 0.4 < soc < 0.4000001", "try:\n    '%c' % soc\nexcept TypeError:\n    bad = 0.4 < soc < 0.4000001",
+    "bad = me.novelty_flags == 129.0 and soc == K", "out = []\nclass C:\n    x: out.append(soc.hex() == (K).hex()) = 1\nbad = out[0]",
+)  # fmt: skip
+"""The text of a number, read by compiled code; and two other things that a stand-in answered otherwise."""
+
+ORDERS = (
+    "bad = f\"{ {'a', 'b', 'c'} }\"[2] == 'c' and soc == K", "bad = str([{'a', 'b', 'c'}])[3] == 'c' and soc == K",
+    "l = []\nl += {'a', 'b', 'c'}\nbad = l[0] == 'c' and soc == K", "for a, b, c in [{'a', 'b', 'c'}]:\n    bad = a == 'c' and soc == K",
+    "bad = list(map(list, [{'a', 'b', 'c'}]))[0][0] == 'c' and soc == K", "def g():\n    yield from {'a', 'b', 'c'}\nbad = next(g()) == 'c' and soc == K",
+    "l = [0]\nl[:] = {'a', 'b', 'c'}\nbad = l[0] == 'c' and soc == K", "class T(set):\n    pass\nfor x in T(['a', 'b', 'c']):\n    bad = x == 'c' and soc == K",
+    "class E(enum.Enum):\n    A = 1\n    B = 2\nfor e in {E.A, E.B}:\n    bad = e is E.B and soc == K", "bad = max({frozenset('ab'), frozenset('cd')}) == frozenset('ab') and soc == K",
+    "bad = list(map(set.pop, [{'a', 'b', 'c'}]))[0] == 'c' and soc == K", "bad = [*map(list, map(set, ['abc']))][0][0] == 'c' and soc == K",
+    "bad = list(map(list, [{'a': 1, 'b': 2}.keys() & {'a', 'b'}]))[0][0] == 'b' and soc == K",
+    "@repr\ndef f():\n    pass\nbad = f[-3] == '4' and soc == K", "bad = ('%s' % (object(),))[-2] == '0' and soc == K", "bad = 'bad' in __file__",
+    "out = []\ndef f(x: out.append(hash('bad') % 1000003 == 1)):\n    pass\nbad = out[0]",
+)  # fmt: skip
+"""Hashes, addresses and places of files, which differ from process to process."""
+
+KEPT = (
+    ("PUSH, COPY = (lambda l: (l.append, l.copy))([])", "PUSH(1)\nn = len(COPY())"),
+    ("class C(collections.deque):\n    pass\nC = C()", "C.append(1)\nn = len(C)"),
+    ("class C(itertools.count):\n    pass\nC = C()", "n = next(C)"),
+    ("class C(Exception):\n    pass\nC = C(0)", "C.args = (C.args[0] + 1,)\nn = C.args[0]"),
+    ("class C(StopIteration):\n    pass\nC = C(0)", "C.value = C.value + 1\nn = C.value"),
+    ("class C(property):\n    pass\nC = C(len)\nC.n = 0", "C.n += 1\nn = C.n"),
+    ("class C(functools.partial):\n    pass\nC = C(len)\nC.n = 0", "C.n += 1\nn = C.n"),
+    ("import types\nclass C(types.ModuleType):\n    pass\nC = C('x')\nC.n = 0", "C.n += 1\nn = C.n"),
+    ("class C(enum.Enum):\n    A = 1\nC.A.n = 0", "C.A.n += 1\nn = C.A.n"),
+    ("C = collections.defaultdict(functools.partial(next, itertools.count()))", "n = C[0]\ndel C[0]"),
+    ("", "import hashlib\nA = hashlib.algorithms_available\nA.add(len(A))\nn = len(A)\nA.discard(n - 1) if n > 9999 else None"),
+    ("", "from sortie.policies.contract import PHASE_OF as P\nn = P.get('x', 0) + 1\nP['x'] = n"),
+    ("import decimal", "F = decimal.BasicContext.flags\nF[decimal.Clamped] = n = int(F[decimal.Clamped]) + 1"),
+    ("class C:\n    __module__ = 'typing'\n    kept = []", "C.kept.append(1)\nn = len(C.kept)"),
+    ("C = type('C', (), {'__module__': 'typing', 'kept': []})", "C.kept.append(1)\nn = len(C.kept)"),
+    ("__name__ = 'statistics'\ndef C(kept=[0]):\n    kept[0] += 1\n    return kept[0]", "n = C()"),
+    ("def __own__(owner, name):\n    return owner", "math.n = n = 1 + (math.n if hasattr(math, 'n') else 0)"),
+)  # fmt: skip
+"""What is set up when the file is loaded, and how each decision counts."""
+
+HARMLESS = (
+    "kinds = {'a', 'b'}\nbad = 'c' in kinds or soc > 1", "names = {TaskPhase.TRACK, TaskPhase.SEARCH}\nbad = me.task_phase in names and me.task_phase == 4",
+    "bad = sorted({'b', 'a'} | {'c'}) != ['a', 'b', 'c'] or soc > 1", "strong = {p for p in view.peers if me.goodput_to(p) > 5}\nfor p in strong:\n    bad = bad or me.goodput_to(p) < 5",
+    "d = collections.defaultdict(set)\nfor p in view.peers:\n    d[0].add(p)\nbad = d[0] != set(view.peers) or type(d[0]) is not set", "why = f'{soc:.1%} of {first:.0f}'\nbad = soc > 1",
+    "names = ', '.join(str(p) for p in view.peers)\nbad = not names", "def f(x: float) -> list[float] | None:\n    return None\nbad = f(soc) is not None",
+    "import sortie.policies.contract as contract\nbad = contract.PHASE_NAMES[me.task_phase] == 'x'", "bad = me.novelty_flags + 0.5 < 0 or me.novelty_flags == 0.5", "bad = soc not in (soc,)",
+)  # fmt: skip
+"""The same words in correct policies, which stay proved."""

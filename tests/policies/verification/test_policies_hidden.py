@@ -1,0 +1,60 @@
+"""Nothing is proved of a policy whose fault only real objects, another process or a later decision show."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+from policies_corpus import LINE, source
+from policies_hidden import HARMLESS, KEPT, LATER, ORDERS, TEXTS, K
+
+from sortie.policies.contract import PHASE_OF, FleetView
+from sortie.policies.registry import resolve
+from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.own_constants import views_at
+from sortie.policies.verification.proof import prove
+from sortie.scenarios.plugins.user_calls import ProgramExitError, watched
+
+pytestmark = pytest.mark.filterwarnings("ignore::SyntaxWarning")
+
+
+def outcome(folder: Path, text: str) -> str:
+    path = folder / "policy.py"
+    path.write_text(text)
+    return prove(resolve(f"{path}:decide"), parse(LINE), max_drones=2, views=0)[-1].outcome
+
+
+@pytest.mark.parametrize("body", [*TEXTS, *ORDERS])
+def test_what_differs_from_the_search_is_not_proved(tmp_path: Path, body: str) -> None:
+    assert outcome(tmp_path, source(body.replace("K", K))) in ("drawn", "searched", "refuted")
+
+
+@pytest.mark.parametrize("number", range(len(KEPT)))
+def test_what_is_kept_elsewhere_is_not_proved(tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hashlib, "algorithms_available", set(hashlib.algorithms_available))
+    head, body = KEPT[number]
+    text = source(f"{body}\nbad = n > {LATER}").replace("STATE = ", f"{head}\nSTATE = ", 1)
+    try:
+        assert outcome(tmp_path, text) in ("drawn", "searched", "refuted")
+    finally:
+        PHASE_OF.pop("x", None)
+
+
+@pytest.mark.parametrize("body", HARMLESS)
+def test_the_same_words_in_correct_policies_stay_proved(tmp_path: Path, body: str) -> None:
+    assert outcome(tmp_path, source(body)) == "proved"
+
+
+@pytest.mark.parametrize("end", ["posix._exit(0)", "os.execv('/bin/true', ['true'])", "os.execlp('true', 'true')"])
+def test_a_policy_that_ends_the_process_is_broken(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "policy.py"
+    path.write_text(f"import os, posix\ndef decide(view):\n    {end}\n")
+    policy = resolve(f"{path}:decide")
+    with watched(5.0), pytest.raises(ProgramExitError, match="must return"):
+        policy(FleetView(0, 0.1, {}, {}))
+
+
+def test_views_at_constants_have_floats_as_in_flight() -> None:
+    for view in views_at({0.0, 1.0}, 0, 40):
+        assert all(type(d.battery_soc) is float for d in view.descriptors.values())
