@@ -84,36 +84,49 @@ class Dask:
         fill()
         while flying:
             try:
-                future = landed.get(timeout=LOOK_S)
+                came = [landed.get(timeout=LOOK_S)]
             except queue.Empty:
                 self._look()
                 continue
-            batch, status = flying.pop(future), future.status
-            if status in ("lost", "pending"):
-                # its worker died between the end of the run and this look: the scheduler has it flown again
-                flying[future] = batch
-                with self._of_cluster():
-                    future.add_done_callback(landed.put)
-            elif status == "finished":
-                with self._of_cluster():
-                    results, seconds = future.result()
-                self._learn(seconds / len(batch))
+            with suppress(queue.Empty):
+                while (
+                    True
+                ):  # rows that come together are written together: a disk takes as long for one batch as for many
+                    came.append(landed.get_nowait())
+            rows = list[RunResult]()
+            try:
+                for future in came:
+                    batch, status = flying.pop(future), future.status
+                    if status in ("lost", "pending"):
+                        # its worker died between the end of the run and this look: the scheduler has it flown again
+                        flying[future] = batch
+                        with self._of_cluster():
+                            future.add_done_callback(landed.put)
+                    elif status == "finished":
+                        with self._of_cluster():
+                            results, seconds = future.result()
+                        self._learn(seconds / len(batch))
+                        rows += results
+                    elif status == "cancelled":
+                        raise self._gone()
+                    elif not isinstance(error := future.exception(), KilledWorker):
+                        raise (
+                            error
+                            if isinstance(error, RunError)
+                            else RunError(f"a worker cannot fly: {type(error).__name__}: {_in_one_line(error)}")
+                        )
+                    elif len(batch) > 1:
+                        for task in batch:
+                            submit([task])
+                    else:
+                        rows.append(killed(batch[0], code))
                 fill()
-                yield results
-            elif status == "cancelled":
-                raise self._gone()
-            elif not isinstance(error := future.exception(), KilledWorker):
-                raise (
-                    error
-                    if isinstance(error, RunError)
-                    else RunError(f"a worker cannot fly: {type(error).__name__}: {_in_one_line(error)}")
-                )
-            elif len(batch) > 1:
-                for task in batch:
-                    submit([task])
-            else:
-                fill()
-                yield [killed(batch[0], code)]
+            except RunError:
+                if rows:
+                    yield rows
+                raise
+            if rows:
+                yield rows
 
     def _look(self) -> None:
         """Whether there are workers: one line when there are none, an error when that lasts."""

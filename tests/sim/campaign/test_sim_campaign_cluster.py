@@ -90,6 +90,32 @@ def test_workers_that_come_late_are_used(tmp_path: Path) -> None:
     assert len(noticed) == 1
 
 
+def _all_end(client: _Client) -> int:
+    for future in client.flying:
+        future.end("finished")
+    return 1
+
+
+def test_batches_that_come_together_are_written_together(tmp_path: Path) -> None:
+    """Also those that came with what ends the campaign."""
+    p = plan(tmp_path)
+    tasks = [(run, p.task(run)) for run in range(6)]
+
+    def lose_the_third(client: _Client) -> int:
+        for i, future in enumerate(client.flying):
+            future.end("finished" if i < 2 else "cancelled")
+        return 3
+
+    three = [lambda client: 3] * 2
+    together = Dask(_Client(*three, _all_end, *[_all_end] * 20), "tcp://head:8786").results(p.code, iter(tasks))
+    assert [r.run for r in next(together)] == [0, 1]
+    assert sorted(r.run for rows in together for r in rows) == [2, 3, 4, 5]
+    broken = Dask(_Client(*three, *three, lose_the_third), "tcp://head:8786").results(p.code, iter(tasks))
+    assert [r.run for r in next(broken)] == [0, 1]
+    with pytest.raises(RunError):
+        next(broken)
+
+
 def _dies(client: _Client) -> int:
     raise OSError("Connection reset by peer\nin two lines")
 
