@@ -640,6 +640,12 @@ def _benchmarks(where: str) -> list[dict[str, Any]]:
     return measured
 
 
+def _campaign_scale() -> Tables:
+    import campaign_scale
+
+    return campaign_scale.tables()
+
+
 def _inference_libraries() -> Tables:
     """Needs onnx, onnxruntime and openvino for their rows."""
     measured = _benchmarks("tests/benchmarks/test_bench_inference_libraries.py")
@@ -697,6 +703,7 @@ FIGURES: dict[str, Figure] = {
     "paper": Figure(8, _paper),
     "conditions_first": Figure(8, _conditions_first),
     "inference_libraries": Figure(2, _inference_libraries, timed=True),
+    "campaign_scale": Figure(10, _campaign_scale, timed=True),
     "speed": Figure(12, _speed, timed=True),
     "difficulty": Figure(12, _difficulty),
     "surrogate_in_flight": Figure(45, _surrogate_in_flight),
