@@ -35,6 +35,18 @@ LOOK_S = 1.0
 """How often it is looked whether there are workers, while none answers."""
 
 
+def _come(landed: queue.SimpleQueue[Any]) -> list[Any]:
+    """All that has landed; nothing after `LOOK_S`. Rows that come together are written together: a disk takes as long for
+    one batch as for many."""
+    try:
+        came = [landed.get(timeout=LOOK_S)]
+    except queue.Empty:
+        return []
+    while not landed.empty():
+        came.append(landed.get())
+    return came
+
+
 class Dask:
     """A dask.distributed cluster, through its client."""
 
@@ -83,17 +95,11 @@ class Dask:
 
         fill()
         while flying:
-            try:
-                came = [landed.get(timeout=LOOK_S)]
-            except queue.Empty:
+            came = _come(landed)
+            if not came:
                 self._look()
                 continue
-            with suppress(queue.Empty):
-                while (
-                    True
-                ):  # rows that come together are written together: a disk takes as long for one batch as for many
-                    came.append(landed.get_nowait())
-            rows = list[RunResult]()
+            rows: list[RunResult] = []
             try:
                 for future in came:
                     batch, status = flying.pop(future), future.status
