@@ -82,7 +82,7 @@ def by_torch(work: Path, workers: int = 2) -> Mapping[str, Table]:
     ]  # fmt: skip
     pair_columns = [
         Column("difference of AP"), Column("with the surrogate", "+.3f"), Column("by torch alone", "+.3f"),
-        Column("width of the interval, relative", ".2f"),
+        Column("relative width", ".2f"),
     ]  # fmt: skip
     together = f"Intervals are corrected for {len(both.pairs)} pairs."
     return {
