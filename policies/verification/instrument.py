@@ -13,6 +13,7 @@ import functools
 import math
 import sys
 import types
+from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable, Sequence
 from enum import Enum
 from pathlib import Path as File
@@ -23,7 +24,9 @@ from sortie.policies.verification.kept import Kept, kept_by
 from sortie.policies.verification.pure import (
     IMPURE,
     PURE_MODULES,
+    calls_others,
     cannot_call,
+    foreign_method,
     home_of,
     is_seeded,
     is_trusted,
@@ -116,6 +119,8 @@ def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
     """A call of the policy's code."""
     if isinstance(function, Outside):
         function._used()
+    if isinstance(function, Written):
+        function = function.write
     why = cannot_call(function)
     if why is not None:
         reach(why[1:]) if why.startswith("!") else stop(why)
@@ -133,9 +138,14 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
             continue
         if (why := cannot_call(value)) is not None:
             reach(why[1:]) if why.startswith("!") else stop(why)
-        if reads_stored_text(value) and not (value is int and function is map and len(args) == 2):
+        if calls_others(value) or (
+            reads_stored_text(value) and not (value is int and function is map and len(args) == 2)
+        ):
             stop(f"hands on {getattr(value, '__qualname__', value)}")
     args, kwargs = ordered_for(function, args, kwargs)
+    if calls_others(function) or "key" in kwargs:
+        args = tuple([_WRITTEN["str"] if value is str else value for value in args])
+        kwargs = {name: _WRITTEN["str"] if value is str else value for name, value in kwargs.items()}
     owner = getattr(function, "__self__", None)
     has_text = any(map(_has_text, (*args, *kwargs.values())))
     reads = reads_stored_text(function) and function is not int and type(owner) is not str  # of which below
@@ -158,12 +168,41 @@ def _checked(found: Any) -> Any:
 
     Plain text into which a number was written is refused, because its use is not noticed. So is text with an address.
     """
-    for part in found if type(found) in (list, tuple) else (found,):
-        if type(part) is str and MARK in part:
+    found = unordered(found)
+    parts, met = [found], set[int]()
+    while parts:
+        part = parts.pop()
+        kind = type(part)
+        if kind is str and MARK in part:
             stop("uses the text of a number inside other text for more than a reason")
-        if (type(part) is str and " at 0x" in part) or (type(part) is bytes and b" at 0x" in part):
+        if (kind is str and " at 0x" in part) or (kind is bytes and b" at 0x" in part):
             reach(f"the address in {part!r}")
-    return unordered(found)
+        if kind is set or kind is frozenset:
+            stop("makes sets within another object")
+        if isinstance(part, type) and part is found:
+            _made(part)
+        if kind in _CONTAINERS and id(part) not in met:
+            met.add(id(part))
+            parts += [x for item in part.items() for x in item] if isinstance(part, dict) else part
+    return found
+
+
+_CONTAINERS = (list, tuple, dict, deque, defaultdict, OrderedDict, Counter)
+
+
+def _made(kind: Any) -> Any:
+    """A class as it is, if all that Python calls by its special names is the policy's own code."""
+    if isinstance(kind, type) and is_users(home_of(kind)) and (name := foreign_method(kind)) is not None:
+        stop(f"has compiled code as {name} of {kind.__name__}")
+    return kind
+
+
+def _caught() -> None:
+    error = sys.exc_info()[1]
+    if isinstance(error, BaseExceptionGroup):
+        error = error.subgroup((RecursionError, MemoryError))
+    if isinstance(error, RecursionError | MemoryError | BaseExceptionGroup):
+        stop("goes on after the end of the stack or of the memory")
 
 
 assert on_behalf_of_the_policy.__name__ == FOR_USER  # noqa: S101
@@ -300,8 +339,16 @@ def _attribute(owner: Any, name: str) -> Any:
             return Outside(f"{owner.__name__}.{name}")
         if not isinstance(found, _LASTS_UNCHANGED) and not callable(found):
             WATCH.sees(f"{owner.__name__}.{name}", found)
+        return _guarded(found)
+    found = getattr(owner, name)
+    return _checked(found) if isinstance(owner, BaseException) and name == "args" else found
+
+
+def _guarded(found: Any) -> Any:
+    """A function that a policy may not call as one that says so, whoever calls it; anything else as it is."""
+    if isinstance(found, type) or not callable(found) or (why := cannot_call(found)) is None:
         return found
-    return getattr(owner, name)
+    return Outside(why[1:]) if why[0] == "!" else Unknown(why)
 
 
 def _is_users_own(owner: Any) -> bool:
@@ -317,6 +364,8 @@ def _decorator(found: Any) -> Any:
 def _each(iterable: Any) -> Any:
     if isinstance(iterable, Outside):
         iterable._used()
+    if isinstance(iterable, map | filter | zip | enumerate) or type(iterable).__module__ == "itertools":
+        return map(_checked, iterable)  # what compiled code makes there, no other check would see
     return unordered(iterable)
 
 
@@ -399,10 +448,37 @@ _OPERATORS = "call iter len bool getitem eq ne lt le gt ge add radd sub rsub mul
 for _operator in _OPERATORS.split():
     setattr(Outside, f"__{_operator}__", Outside._used)
 
+
+class Unknown(Outside):
+    """A function that no search can follow."""
+
+    def _used(self, *_: object, **__: object) -> NoReturn:
+        stop(self._path)
+
+
+for _operator in _OPERATORS.split():
+    setattr(Unknown, f"__{_operator}__", Unknown._used)
+
+
+class Written:
+    """A builtin that makes text, with the checks that a call by its name has."""
+
+    def __init__(self, write: Any) -> None:
+        self.write = write
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return on_behalf_of_the_policy(self.write, args, kwargs)
+
+
+_WRITTEN = {write.__name__: Written(write) for write in (repr, ascii, format, str)}
+BUILTINS = {name: _guarded(value) for name, value in vars(builtins).items() if name[:2] != "__"} | {
+    name: value for name, value in _WRITTEN.items() if name != "str"
+}
+"""What a policy finds under the builtins' names."""
 CHECKS: dict[str, Any] = {
     "__called__": _called, "__same__": _same, "__text__": _text, "__written__": _written, "__percent__": _percent,
     "__own__": _own, "__attribute__": _attribute, "__decorator__": _decorator, "__each__": _each, "__among__": _among,
-    "__unordered__": unordered,
+    "__unordered__": unordered, "__caught__": _caught, "__made__": _made,
 }  # fmt: skip
 
 
@@ -419,7 +495,7 @@ def _builtins(find: Callable[..., Any]) -> dict[str, Any]:
             return _Names(module, wanted) if wanted else module
         return Outside(home)
 
-    return vars(builtins) | CHECKS | {"__import__": importing}
+    return vars(builtins) | BUILTINS | CHECKS | {"__import__": importing}
 
 
 class _Names(types.ModuleType):

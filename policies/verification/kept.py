@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import dataclasses
 import functools
 import inspect
 import re
@@ -11,23 +12,26 @@ from collections.abc import Callable
 from decimal import Decimal
 from enum import Enum
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sortie.policies.verification.pure import HEAP, home_of
+from sortie.policies.verification.source_checks import RESERVED
 from sortie.policies.verification.symbols import Refused
 from sortie.scenarios.plugins.user_code import is_users
 
+_TUPLE_FIELD: Any = type(vars(NamedTuple("Named", [("x", int)]))["x"])
 _LEAVES = (
-    int, str, bytes, bool, type(None), type(Ellipsis), type(NotImplemented), Decimal, Fraction, range, complex,
-    types.MethodDescriptorType, types.WrapperDescriptorType, types.GenericAlias,
+    int, str, bytes, bool, type(None), type(Ellipsis), type(NotImplemented), Fraction,
+    types.MethodDescriptorType, types.WrapperDescriptorType, types.GenericAlias, _TUPLE_FIELD,
+    type(vars(dataclasses).get("_HAS_DEFAULT_FACTORY")),
     types.UnionType, types.GetSetDescriptorType, types.MemberDescriptorType, re.Pattern, np.generic, np.dtype, np.ufunc,
 )  # fmt: skip
 
 
 _PYTHONS_OWN = {
-    "__name__", "__doc__", "__package__", "__loader__", "__spec__", "__file__", "__cached__", "__builtins__", "__path__",
+    "__name__", "__package__", "__loader__", "__spec__", "__file__", "__cached__", "__builtins__", "__path__",
     "__annotations__", "__dataclass_fields__", "__dataclass_params__", "__match_args__", "__dict__", "__weakref__",
     "__annotate__", "__annotate_func__", "__annotations_cache__", "__conditional_annotations__", "__firstlineno__",
     "__static_attributes__",
@@ -59,7 +63,7 @@ def kept_by(function: Callable[..., Any], module: types.ModuleType) -> Kept:
     Raises:
         Refused: one of them is of a kind that cannot be compared, such as an iterator.
     """
-    roots = {name: value for name, value in vars(module).items() if name not in _PYTHONS_OWN}
+    roots = {name: value for name, value in vars(module).items() if name not in RESERVED}
     return Kept({**roots, "the policy itself": function})
 
 
@@ -78,15 +82,17 @@ def _fingerprint(value: Any, met: dict[int, int]) -> Any:
         return "float", value.hex()
     if kind in _LEAVES or isinstance(value, np.generic | np.ufunc):
         return kind.__name__, value if not isinstance(value, np.generic) else value.tobytes()
+    if kind in (Decimal, range, complex):  # equal ones may differ: 1.0 and 1, -0 and 0, empty ranges
+        return kind.__name__, repr(value)
     if id(value) in met:
         return "again", met[id(value)]
     met[id(value)] = len(met)
     if isinstance(value, Enum):
         own = [v for name, v in vars(value).items() if name != "__objclass__"] if is_users(home_of(kind)) else []
-        return kind.__name__, value.name, tuple([_fingerprint(v, met) for v in own])
+        return _fingerprint(kind, met), value.name, tuple([_fingerprint(v, met) for v in own])
     if kind is types.BuiltinFunctionType:  # a method of a list changes with the list
         owner = value.__self__
-        of = () if isinstance(owner, types.ModuleType | type | None) else _fingerprint(owner, met)
+        of = owner.__name__ if isinstance(owner, types.ModuleType) else _fingerprint(owner, met)
         return kind.__name__, value.__name__, of
     if kind in (list, tuple) or (isinstance(value, tuple) and not is_users(home_of(kind))):
         return kind.__name__, tuple([_fingerprint(v, met) for v in value])
@@ -94,9 +100,11 @@ def _fingerprint(value: Any, met: dict[int, int]) -> Any:
         makes = _fingerprint(value.default_factory, met) if kind is collections.defaultdict else ()
         return kind.__name__, makes, tuple([(_fingerprint(k, met), _fingerprint(v, met)) for k, v in value.items()])
     if isinstance(value, set | frozenset):
-        return kind.__name__, frozenset([_fingerprint(v, met) for v in _members(value)])
+        members = [_fingerprint(v, met) for v in _members(value)]
+        ordered = all(isinstance(v, int) for v in _members(value))  # by what was there before, and it may be seen
+        return kind.__name__, tuple(members) if ordered else frozenset(members)
     if kind in (collections.deque, bytearray):
-        return kind.__name__, tuple([_fingerprint(v, met) for v in value])
+        return kind.__name__, getattr(value, "maxlen", None), tuple([_fingerprint(v, met) for v in value])
     if kind is np.ndarray:
         return "array", value.dtype.str, value.shape, value.tobytes()
     return kind.__name__, id(value), _parts(value, met)
@@ -130,7 +138,7 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
         found = [*(x for item in own.items() for x in item), *(c for c in value.__mro__[1:] if is_users(home_of(c)))]
         found += [type(value)] if is_users(home_of(type(value))) else []
     elif isinstance(value, functools.partial):
-        found = [value.func, *value.args, *value.keywords.values()]
+        found = [value.func, value.args, value.keywords]
     elif isinstance(value, types.MethodType):
         found = [value.__func__, value.__self__]
     elif isinstance(value, staticmethod | classmethod):

@@ -105,7 +105,7 @@ _NOT = {
     operator.attrgetter: "operator.attrgetter", operator.methodcaller: "operator.methodcaller",
     operator.is_: "operator.is_", operator.is_not: "operator.is_not", functools.lru_cache: "functools.lru_cache",
     functools.cache: "functools.cache", functools.singledispatch: "functools.singledispatch",
-    statistics.NormalDist: "statistics.NormalDist",
+    statistics.NormalDist: "statistics.NormalDist", getattr(operator, "call", None): "operator.call",
 }  # fmt: skip
 _OPEN_MODULES = frozenset(
     {"builtins", "math", "operator", "_operator", "itertools", "_functools", "_bisect", "_heapq", "_collections"}
@@ -144,6 +144,40 @@ def reads_stored_text(function: Any) -> bool:
     return isinstance(function, functools.partial) and reads_stored_text(function.func)
 
 
+CALL_OTHERS = (map, filter, functools.reduce, functools.partial)
+"""Compiled code that calls what it is given; so does all of `itertools`."""
+
+
+def calls_others(function: Any) -> bool:
+    """Whether this is compiled code that calls other functions, which no check would see."""
+    return function in CALL_OTHERS or (isinstance(function, type) and home_of(function) == "itertools")
+
+
+def foreign_method(kind: type) -> str | None:
+    """The first method with a special name that Python would call without a check; None if the class has none."""
+    for name, value in vars(kind).items():
+        if isinstance(value, property):
+            parts, special = [value.fget, value.fset, value.fdel], name[:2] == "__"
+        else:
+            parts, special = [getattr(value, "__func__", value)], False
+        if special or any(map(_is_foreign, parts if isinstance(value, property) or name[:2] == "__" else ())):
+            return name
+    return None
+
+
+_METHODS = (
+    types.FunctionType, types.MethodType, types.WrapperDescriptorType, types.MethodDescriptorType, types.ClassMethodDescriptorType,
+    types.GetSetDescriptorType, types.MemberDescriptorType,
+)  # fmt: skip
+
+
+def _is_foreign(value: Any) -> bool:
+    kind = type(value)
+    if kind in _METHODS or (kind is types.BuiltinFunctionType and value.__name__ == "__new__"):
+        return False
+    return hasattr(kind, "__get__") or (callable(value) and (isinstance(value, type) or not is_users(home_of(kind))))
+
+
 def is_trusted(home: str) -> bool:
     """Whether a module is one of Sortie's that policies are made of."""
     return home == "sortie" or home.startswith(_TRUSTED)
@@ -172,6 +206,8 @@ def takes_ranges(function: Any) -> bool:
         )  # fmt: skip
     if isinstance(function, functools.partial):
         return takes_ranges(function.func)
+    if is_users(home_of(type(function))):
+        return isinstance(type(function).__call__, types.FunctionType)
     owner = getattr(function, "__self__", None)
     if owner is None or isinstance(owner, types.ModuleType):
         return getattr(function, "__module__", None) in _OPEN_MODULES or isinstance(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import types
 from typing import Any
 
@@ -22,8 +23,8 @@ def compiled(source: bytes, path: str) -> types.CodeType:
 
 RESERVED = {
     "__called__", "__same__", "__text__", "__written__", "__percent__", "__own__", "__attribute__", "__decorator__",
-    "__each__", "__among__", "__unordered__", "__builtins__", "__build_class__", "__name__", "__module__",
-    "__qualname__", "__file__", "__spec__", "__loader__", "__cached__", "__path__", "__package__",
+    "__each__", "__among__", "__unordered__", "__caught__", "__made__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
+    "__qualname__", "__match_args__", "__del__", "__file__", "__spec__", "__loader__", "__cached__", "__path__", "__package__",
 }  # fmt: skip
 """The checks, and names by which a policy would say that it is another one, or find where it lies."""
 _IN_ANNOTATIONS = (
@@ -80,11 +81,32 @@ class Checks(ast.NodeTransformer):
             return node
         return ast.copy_location(ast.Call(_name("__percent__"), [node.left, node.right], []), node)
 
-    def visit_AugAssign(self, node: ast.AugAssign) -> ast.AST:
-        self.generic_visit(node)
+    def visit_AugAssign(self, node: ast.AugAssign) -> Any:
         if isinstance(node.op, ast.Mod):
             raise SyntaxError("has `%=`")
-        return node
+        if not isinstance(node.op, _SET_OPERATORS):
+            self.generic_visit(node)
+            return node
+        # The keys of a mapping give a new, plain set. Taken apart as Python itself does.
+        target, before = node.target, list[ast.stmt]()
+        if isinstance(target, ast.Name):
+            held = target.id
+            after = ast.Assign([ast.Name(held, ast.Store())], _unordered(_name(held)))
+        else:
+            if isinstance(target, ast.Subscript) and any(isinstance(n, ast.Slice) for n in ast.walk(target.slice)):
+                raise SyntaxError("changes a slice in place")
+            held, key = "__part__", getattr(target, "slice", None)
+            before.append(_assign("__held__", self.visit(target.value)))
+            target.value = _name("__held__")
+            if key is not None:
+                before.append(_assign("__key__", self.visit(key)))
+                target.slice = _name("__key__")
+            read = copy.deepcopy(target)
+            read.ctx = ast.Load()
+            before.append(_assign(held, self.visit(read)))
+            after = ast.Assign([self.visit(target)], _unordered(_name(held)))
+        change = ast.AugAssign(ast.Name(held, ast.Store()), node.op, self.visit(node.value))
+        return [ast.fix_missing_locations(ast.copy_location(n, node)) for n in (*before, change, after)]
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         self.generic_visit(node)
@@ -104,7 +126,33 @@ class Checks(ast.NodeTransformer):
         return self._decorated(node)
 
     def visit_ClassDef(self, node: ast.ClassDef) -> Any:
-        return self._decorated(node)
+        found = self._decorated(node)
+        found.decorator_list.append(_name("__made__"))
+        return found
+
+    # Where the stack or the memory ends depends on the process. These are the places where a policy can go on after it.
+
+    def visit_ExceptHandler(self, node: ast.ExceptHandler) -> ast.AST:
+        self.generic_visit(node)
+        node.body.insert(0, _caught())
+        return node
+
+    def visit_Try(self, node: ast.Try) -> ast.AST:
+        return self._finally(node)
+
+    def visit_TryStar(self, node: ast.TryStar) -> ast.AST:
+        return self._finally(node)
+
+    def _finally(self, node: ast.Try | ast.TryStar) -> ast.AST:
+        self.generic_visit(node)
+        if node.finalbody:
+            node.finalbody.insert(0, _caught())
+        return node
+
+    def visit_With(self, node: ast.With) -> ast.AST:
+        self.generic_visit(node)
+        node.body = [ast.Try(node.body, [], [], [_caught()])]
+        return node
 
     def visit_Assign(self, node: ast.Assign) -> ast.AST:
         self.generic_visit(node)
@@ -132,6 +180,8 @@ class Checks(ast.NodeTransformer):
         return node  # a pattern has names alone
 
     def visit_MatchClass(self, node: ast.MatchClass) -> ast.AST:
+        if any(name[0] == "_" or name == "args" for name in node.kwd_attrs):
+            raise SyntaxError("matches an attribute that a search cannot follow")
         for pattern in (*node.patterns, *node.kwd_patterns):
             self.visit(pattern)
         return node
@@ -162,3 +212,15 @@ def _plain_annotation(node: ast.expr | None) -> ast.expr | None:
 
 def _name(text: str) -> ast.Name:
     return ast.Name(text, ast.Load())
+
+
+def _assign(name: str, value: ast.expr) -> ast.Assign:
+    return ast.Assign([ast.Name(name, ast.Store())], value)
+
+
+def _unordered(value: ast.expr) -> ast.Call:
+    return ast.Call(_name("__unordered__"), [value], [])
+
+
+def _caught() -> ast.Expr:
+    return ast.Expr(ast.Call(_name("__caught__"), [], []))

@@ -58,9 +58,7 @@ def reach(what: str) -> NoReturn:
 
 def _see_order(members: list[Any]) -> Any:
     # A copy of a set of small whole numbers has their order too; that of other numbers may depend on its history.
-    if len(members) > 1 and not all(
-        isinstance(x, int | IntEnum) and (0 <= x < 8 or len(members) <= 4) for x in members
-    ):
+    if len(members) > 1 and not all(isinstance(x, int | IntEnum) and 0 <= x < 8 for x in members):
         reach("the order of a set, which hashes decide")
     return iter(members)
 
