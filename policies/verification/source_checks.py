@@ -95,11 +95,11 @@ class Checks(ast.NodeTransformer):
         else:
             if isinstance(target, ast.Subscript) and any(isinstance(n, ast.Slice) for n in ast.walk(target.slice)):
                 raise SyntaxError("changes a slice in place")
-            held, key = "__part__", getattr(target, "slice", None)
+            held = "__part__"
             before.append(_assign("__held__", self.visit(target.value)))
             target.value = _name("__held__")
-            if key is not None:
-                before.append(_assign("__key__", self.visit(key)))
+            if isinstance(target, ast.Subscript):
+                before.append(_assign("__key__", self.visit(target.slice)))
                 target.slice = _name("__key__")
             read = copy.deepcopy(target)
             read.ctx = ast.Load()

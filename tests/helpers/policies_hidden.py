@@ -22,6 +22,18 @@ TEXTS = (
 """The text of a number, read by compiled code; and two other things that a stand-in answered otherwise."""
 
 ORDERS = (
+    *(f"class C:\n    {name} = {of}\nc = C()\nbad = {use} == '7' and soc == K" for name, of, use in [
+        ("__getitem__", "hash", "c['a']"), ("__call__", "id", "c('a')"), ("__class_getitem__", "hash", "C['a']"), ("__getitem__", "str", "c[object()][-4]"),
+        ("__getitem__", "staticmethod(str)", "c[object()][-4]"), ("__getitem__", "property(lambda self: str)", "c[object()][-4]"), ("x", "property(str)", "c.x[-4]"),
+        ("__contains__", "eval", "('id(1)' in c)"), ("__neg__", "globals", "(-c)"),
+    ]),
+    "bad = next(map(operator.call, [hash], ['a'])) == 7 and soc == K", "bad = any(map(lambda t: t[-4] == '7', map(str, [object()]))) and soc == K",
+    "for t in map(repr, [object()]):\n    bad = t[-4] == '7' and soc == K", "bad = dict(enumerate(map(repr, [object()])))[0][-4] == '7' and soc == K",
+    "match 'a':\n    case str(__hash__=h):\n        bad = h() == 7 and soc == K", "try:\n    [].index(object())\nexcept ValueError as e:\n    bad = e.args[0][20] == '7' and soc == K",
+    "k = {}.keys()\nk |= {'a', 'b'}\nbad = list(k)[0] == 'b' and soc == K", "d = {0: {}.keys()}\nd[0] |= {'a', 'b'}\nbad = [*d[0]][0] == 'b' and soc == K",
+    "s = {0, 16, 1, 2, 3}\ns.discard(1)\nbad = list(s) == [0, 2, 3, 16] and soc == K",
+    "def f(n):\n    try:\n        return f(n + 1)\n    except RecursionError:\n        return n\nbad = f(0) == 7 and soc == K",
+    "def f():\n    try:\n        return f()\n    finally:\n        return 1\nbad = f() == 7 and soc == K",
     "bad = f\"{ {'a', 'b', 'c'} }\"[2] == 'c' and soc == K", "bad = str([{'a', 'b', 'c'}])[3] == 'c' and soc == K",
     "l = []\nl += {'a', 'b', 'c'}\nbad = l[0] == 'c' and soc == K", "for a, b, c in [{'a', 'b', 'c'}]:\n    bad = a == 'c' and soc == K",
     "bad = list(map(list, [{'a', 'b', 'c'}]))[0][0] == 'c' and soc == K", "def g():\n    yield from {'a', 'b', 'c'}\nbad = next(g()) == 'c' and soc == K",
@@ -35,6 +47,15 @@ ORDERS = (
 """Hashes, addresses and places of files, which differ from process to process."""
 
 KEPT = (
+    ("__dataclass_fields__ = []", "__dataclass_fields__.append(1)\nn = len(__dataclass_fields__)"),
+    ("class C:\n    __doc__ = []", "C.__doc__.append(1)\nn = len(C.__doc__)"),
+    ("P = functools.partial(dict, a=1)", "P.keywords['b'] = P.keywords.pop('a', 1)\nn = 1 if 'b' not in P.keywords else 0"),
+    ("S = [Decimal('1')]", "n = len(str(S[0]))\nS[0] = Decimal('1.0')"),
+    ("S = [range(0)]", "n = S[0].start\nS[0] = range(5, 5)"),
+    ("S = [math.sqrt]\nimport cmath", "n = S[0](4).real\nS[0] = cmath.sqrt"),
+    ("S = [dict.fromkeys]", "n = len(type(S[0]('a')).__name__)\nS[0] = collections.OrderedDict.fromkeys"),
+    ("S = {8, 0}", "n = len(S)\nS.clear()\nS.add(0)\nS.add(8)"),
+    ("S = [collections.deque([], 1)]", "n = S[0].maxlen\nS[0] = collections.deque([], 2)"),
     ("PUSH, COPY = (lambda l: (l.append, l.copy))([])", "PUSH(1)\nn = len(COPY())"),
     ("class C(collections.deque):\n    pass\nC = C()", "C.append(1)\nn = len(C)"),
     ("class C(itertools.count):\n    pass\nC = C()", "n = next(C)"),
@@ -56,6 +77,9 @@ KEPT = (
 """What is set up when the file is loaded, and how each decision counts."""
 
 HARMLESS = (
+    "seen = set()\nfor p in view.peers:\n    seen |= {p}\nd = {0: 5.0}\nd[0] -= 1\nbad = len(seen) > 9 or d[0] > 4", "for p, q in zip(view.peers, view.peers[1:]):\n    bad = q < p",
+    "class L:\n    def __init__(self, least): self.least = least\n    def __call__(self, x): return x < self.least\nbad = L(0.5)(soc) and soc > 0.5",
+    "C = collections.namedtuple('C', 'low high')\nbad = soc < C(0.3, 0.7).low and soc > 0.5", "try:\n    bad = {0: True}[len(view.peers)]\nexcept KeyError:\n    pass\nfinally:\n    pass",
     "kinds = {'a', 'b'}\nbad = 'c' in kinds or soc > 1", "names = {TaskPhase.TRACK, TaskPhase.SEARCH}\nbad = me.task_phase in names and me.task_phase == 4",
     "bad = sorted({'b', 'a'} | {'c'}) != ['a', 'b', 'c'] or soc > 1", "strong = {p for p in view.peers if me.goodput_to(p) > 5}\nfor p in strong:\n    bad = bad or me.goodput_to(p) < 5",
     "d = collections.defaultdict(set)\nfor p in view.peers:\n    d[0].add(p)\nbad = d[0] != set(view.peers) or type(d[0]) is not set", "why = f'{soc:.1%} of {first:.0f}'\nbad = soc > 1",
