@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from typing import Any
+
+from sortie._supervised import supervised
 
 
 def main() -> None:
     """Entry point of the `sortie` command."""
+    code = supervised()
+    if code is not None:
+        sys.exit(code)
     usual: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     ours = [number for number, handler in usual.items() if signal.getsignal(number) == handler]  # ignored ones stay so
     for number in ours:

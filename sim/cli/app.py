@@ -12,6 +12,7 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
+from sortie._supervised import report as report_code
 from sortie.scenarios.errors import SortieError
 from sortie.sim.cli import (
     bench,
@@ -101,10 +102,14 @@ def main() -> None:
     """The `sortie` command, once it is imported (sortie.__main__)."""
     own_process()
     try:
-        app()
-    except SortieError as error:
-        err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
-        sys.exit(2)
+        try:
+            app()
+        except SortieError as error:
+            err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
+            sys.exit(2)
+    except SystemExit as ended:
+        report_code(ended.code)
+        raise
 
 
 @app.callback(invoke_without_command=True)

@@ -1,0 +1,58 @@
+"""A parent for commands of which the exit code is a verdict: their code may not end the process before it is reached.
+
+A policy can end its process from compiled code, from a thread, or when Python exits, with an exit code of its choice. The
+command therefore runs in a child that reports its exit code through a pipe.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from types import FrameType
+
+COMMANDS = ("check", "verify")
+_PIPE = "SORTIE_REPORTS_TO"
+_ENDED = b"error: the process ended before the command did; code that it runs must not end the process\n"
+
+
+def supervised() -> int | None:
+    """Run this command line in a child and return its exit code; None where this process is to run it itself."""
+    if _to is not None or not {*sys.argv[1:2]} & {*COMMANDS}:
+        return None
+    reads, writes = os.pipe()
+    child = subprocess.Popen(  # noqa: S603 - this command again
+        [sys.executable, "-m", "sortie", *sys.argv[1:]], pass_fds=[writes], env=os.environ | {_PIPE: str(writes)}
+    )
+    os.close(writes)
+
+    def forward(number: int, frame: FrameType | None) -> None:
+        if number != signal.SIGINT or sys.stdin is None or not sys.stdin.isatty():
+            child.send_signal(number)  # a terminal sends Ctrl-C to the child itself
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, forward)
+    status = child.wait()
+    os.set_blocking(reads, False)
+    try:
+        reported = os.read(reads, 1)
+    except BlockingIOError:  # somebody else still holds the other end
+        reported = b""
+    if reported:
+        return reported[0] or int(status != 0)
+    if status == 0:
+        os.write(2, _ENDED)
+        return 1
+    return status if status > 0 else 128 - status
+
+
+def report(code: object) -> None:
+    """Tell the parent this command's exit code, as `SystemExit` has it."""
+    if _to is not None:
+        os.write(_to, bytes([code & 255 if isinstance(code, int) else int(code is not None)]))
+
+
+_held = os.environ.pop(_PIPE, None)  # before any code of others runs
+_to = None if _held is None else int(_held)
