@@ -35,8 +35,8 @@ DRAWN = (
     "medium", "receptions", "events",
 )  # fmt: skip
 """The tables that a playback shows."""
-BLOCK_S = 120.0
-"""So much of a sortie is drawn at once."""
+BLOCK_DRONE_S = 600.0
+"""So many drones times seconds are drawn at once, which takes some 100 MB."""
 
 
 class Playback:
@@ -80,6 +80,7 @@ def save_rrd(record: SortieRecord, path: Path) -> None:
         playback = Playback(recording, record.scenario, scene, name=name)
         for known_s, new in _in_blocks(record):
             playback.add(known_s, new)
+            recording.flush()  # else what waits for the disk fills the memory
 
 
 def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> None:
@@ -100,15 +101,17 @@ def save_comparison(flown: Sequence[tuple[str, SortieRecord]], path: Path) -> No
             playback = Playback(recording, record.scenario, scene_of(record), root)
             for known_s, new in _in_blocks(record):
                 playback.add(known_s, new)
+                recording.flush()
 
 
 def _in_blocks(record: SortieRecord) -> Iterator[tuple[float, dict[str, pa.Table]]]:
     """The rows that a playback draws, in blocks of whole seconds, and what is known by then."""
     end_s = record.scenario.duration_s
+    block_s = max(1.0, BLOCK_DRONE_S // record.scenario.fleet.drones)
     rows = {name: InTime(record.tables, name, "t_done_s" if name == "transmissions" else "t_s") for name in DRAWN}
     known_s = 0.0
     while known_s < end_s:
-        known_s = min(known_s + BLOCK_S, end_s)
+        known_s = min(known_s + block_s, end_s)
         until_s = known_s if known_s < end_s else float("inf")
         yield known_s, {name: each.before(until_s) for name, each in rows.items()}
 

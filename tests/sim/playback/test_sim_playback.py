@@ -601,7 +601,7 @@ def test_live_draws_what_is_saved(rows: Rows, record: SortieRecord, tmp_path: Pa
 def test_a_long_sortie_is_drawn_in_blocks(
     rows: Rows, record: SortieRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording, "BLOCK_S", 3.0)
+    monkeypatch.setattr(recording, "BLOCK_DRONE_S", 15.0)
     save_rrd(record, tmp_path / "blocks.rrd")
     assert_same(read(tmp_path / "blocks.rrd"), rows)
 
