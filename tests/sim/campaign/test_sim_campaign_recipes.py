@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -80,6 +81,14 @@ def test_a_trial_fails_by_each_of_its_rules(changed: dict[str, Any], passed: boo
 # --- SLURM ------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def jobqueue() -> None:
+    """dask-jobqueue, without the handler of Ctrl-C that its import leaves behind."""
+    before = signal.getsignal(signal.SIGINT)
+    pytest.importorskip("dask_jobqueue")
+    signal.signal(signal.SIGINT, before)
+
+
 @contextmanager
 def _recipe() -> Iterator[ModuleType]:
     """The module slurm.py."""
@@ -91,24 +100,40 @@ def _recipe() -> Iterator[ModuleType]:
     yield module
 
 
+BY_LOCAL_JOBS = """
+import sys
+from pathlib import Path
+from dask_jobqueue.local import LocalCluster
+
+folder, campaign, out = sys.argv[1:]
+sys.path.insert(0, folder)
+import slurm
+
+if __name__ == "__main__":
+    with LocalCluster(**slurm.options_of_jobs(1, "2GB"), log_directory=None) as cluster:
+        code = slurm.fly(cluster, 2, campaign, Path(out))
+        print(len(cluster.scheduler.workers), "workers")
+    sys.exit(code)
+"""
+"""In a process of its own: dask-jobqueue leaves processes behind."""
+
+
 @CLUSTER
 @pytest.mark.slow
-def test_the_slurm_recipe_flies_the_same_rows_by_local_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("dask_jobqueue")
-    from dask_jobqueue.local import LocalCluster
-
+def test_the_slurm_recipe_flies_the_same_rows_by_local_jobs(
+    jobqueue: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     p, out = plan(tmp_path), tmp_path / "joined"
     run_campaign(p, tmp_path / "alone", InProcess())
-    with _recipe() as slurm, LocalCluster(**slurm.options_of_jobs(1, "2GB"), log_directory=None) as cluster:
-        assert slurm.fly(cluster, 2, str(tmp_path / "small_ones.yaml"), out) == 0
-        assert len(cluster.scheduler.workers) == 2
+    command = [sys.executable, "-c", BY_LOCAL_JOBS, str(RECIPES), str(tmp_path / "small_ones.yaml"), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["2 workers"]), done.stderr
     assert table_bytes(out) == table_bytes(tmp_path / "alone")
     assert (out / "report.md").is_file()
 
 
-def test_a_job_of_the_slurm_recipe_has_a_worker_for_each_core(tmp_path: Path) -> None:
-    pytest.importorskip("dask_jobqueue")
+def test_a_job_of_the_slurm_recipe_has_a_worker_for_each_core(jobqueue: None, tmp_path: Path) -> None:
     from dask_jobqueue.slurm import SLURMJob
 
     files = [tmp_path / name for name in ("ca.pem", "cert.pem", "key.pem")]
