@@ -21,19 +21,22 @@ def supervised() -> int | None:
     """Run this command line in a child and return its exit code; None where this process is to run it itself."""
     if _to is not None or not {*sys.argv[1:2]} & {*COMMANDS}:
         return None
-    reads, writes = os.pipe()
-    child = subprocess.Popen(  # noqa: S603 - this command again
-        [sys.executable, "-m", "sortie", *sys.argv[1:]], pass_fds=[writes], env=os.environ | {_PIPE: str(writes)}
-    )
-    os.close(writes)
+    children: list[subprocess.Popen[bytes]] = []
 
     def forward(number: int, frame: FrameType | None) -> None:
+        if not children:
+            os._exit(128 + number)
         if number != signal.SIGINT or sys.stdin is None or not sys.stdin.isatty():
-            child.send_signal(number)  # a terminal sends Ctrl-C to the child itself
+            children[0].send_signal(number)  # a terminal sends Ctrl-C to the child itself
 
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, forward)
+    reads, writes = os.pipe()
+    command = [sys.executable, "-P", "-m", "sortie", *sys.argv[1:]]  # -P: no module of the folder in which it is called
+    child = subprocess.Popen(command, pass_fds=[writes], env=os.environ | {_PIPE: str(writes)})  # noqa: S603 - this command again
+    children.append(child)
+    os.close(writes)
     status = child.wait()
     os.set_blocking(reads, False)
     try:

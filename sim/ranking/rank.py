@@ -139,6 +139,8 @@ def rank(
         ScenarioError, PolicyError, RunError: the suite, a policy or the folder is wrong, before anything flies.
     """
     asked = load_suite(suite, by_torch=by_torch)
+    if further is not None and not by_torch:
+        raise RunError(f"--further {further}: needs --by-torch, which these further flights make more precise")
     more = _further(suite, further) if by_torch else []
     digest = digest_of(suite)
     own = {entry.label: entry for entry in entries}

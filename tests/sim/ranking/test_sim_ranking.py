@@ -396,6 +396,8 @@ def test_further_draws_are_refused_for_a_suite_without_a_generator(here: list[in
         sortie.rank("boxes", suite="small.yaml", against=[], by_torch=True, further=2, folder="out")
     with pytest.raises(RunError, match="further: -1, must be None or a whole number from 0 to 100"):
         sortie.rank("boxes", suite="small.yaml", by_torch=True, further=-1, folder="out")
+    with pytest.raises(RunError, match="--further 1: needs --by-torch"):
+        sortie.rank("boxes", suite="ranking_v1", further=1, folder="out")
     assert not here
 
 
