@@ -145,7 +145,7 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
         found = [value.__func__]
     elif isinstance(value, property):
         found = [value.fget, value.fset]
-    elif home_of(type(value)) in ("typing", "__future__", "operator", "sortie.policies.verification.instrument"):
+    elif home_of(type(value)) in _UNCHANGING:
         found = []
     elif hasattr(value, "__wrapped__") or hasattr(value, "cache_info"):
         raise Refused("keeps results from one decision to the next (functools)")
@@ -180,6 +180,13 @@ def _parts_of_users(value: Any) -> list[Any]:
     return [*found, type(value)]
 
 
+_UNCHANGING = {
+    "typing",
+    "__future__",
+    "operator",
+    *(f"sortie.policies.verification.{m}" for m in ("call_checks", "outside")),
+}
+"""Modules of classes that keep nothing that changes."""
 _SHOWN = types.MemberDescriptorType | types.GetSetDescriptorType
 _ALWAYS_SHOWN = {"__dict__", "__weakref__", "__class__", "__traceback__", "__context__", "__cause__"}
 
