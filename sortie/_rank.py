@@ -109,7 +109,7 @@ def rank(
             every built-in policy.
         again: fly the policies of `against` too, instead of taking their stored results.
         by_torch: fly every policy with the neural detector, which takes minutes for each. The surrogate flies too, as
-            control variate: it makes the intervals narrower and shifts nothing.
+            control variate: it makes the intervals narrower and adds no bias.
         further: with `by_torch`, the number of further draws of the suite, of thirty conditions each, that only the
             surrogate flies. None takes 3 for a suite of the library and 0 for a file; 0 takes torch alone.
         workers: number of processes that fly policies given by name. Callables fly in this process.

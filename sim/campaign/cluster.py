@@ -93,6 +93,34 @@ class Dask:
                     return
                 submit(batch)
 
+        def settle(future: Any) -> list[RunResult]:
+            """The rows of a batch; nothing if it is to be flown again."""
+            batch, status = flying.pop(future), future.status
+            if status in ("lost", "pending"):
+                # its worker died between the end of the run and this look: the scheduler has it flown again
+                flying[future] = batch
+                with self._of_cluster():
+                    future.add_done_callback(landed.put)
+                return []
+            if status == "finished":
+                with self._of_cluster():
+                    results, seconds = future.result()
+                self._learn(seconds / len(batch))
+                return list(results)
+            if status == "cancelled":
+                raise self._gone()
+            if not isinstance(error := future.exception(), KilledWorker):
+                raise (
+                    error
+                    if isinstance(error, RunError)
+                    else RunError(f"a worker cannot fly: {type(error).__name__}: {_in_one_line(error)}")
+                )
+            if len(batch) == 1:
+                return [killed(batch[0], code)]
+            for task in batch:
+                submit([task])
+            return []
+
         fill()
         while flying:
             came = _come(landed)
@@ -102,30 +130,7 @@ class Dask:
             rows: list[RunResult] = []
             try:
                 for future in came:
-                    batch, status = flying.pop(future), future.status
-                    if status in ("lost", "pending"):
-                        # its worker died between the end of the run and this look: the scheduler has it flown again
-                        flying[future] = batch
-                        with self._of_cluster():
-                            future.add_done_callback(landed.put)
-                    elif status == "finished":
-                        with self._of_cluster():
-                            results, seconds = future.result()
-                        self._learn(seconds / len(batch))
-                        rows += results
-                    elif status == "cancelled":
-                        raise self._gone()
-                    elif not isinstance(error := future.exception(), KilledWorker):
-                        raise (
-                            error
-                            if isinstance(error, RunError)
-                            else RunError(f"a worker cannot fly: {type(error).__name__}: {_in_one_line(error)}")
-                        )
-                    elif len(batch) > 1:
-                        for task in batch:
-                            submit([task])
-                    else:
-                        rows.append(killed(batch[0], code))
+                    rows += settle(future)
                 fill()
             except RunError:
                 if rows:

@@ -606,6 +606,19 @@ def test_a_long_sortie_is_drawn_in_blocks(
     assert_same(read(tmp_path / "blocks.rrd"), rows)
 
 
+def test_each_block_is_on_disk_before_the_next_and_blocks_of_large_fleets_are_short(
+    record: SortieRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a large fleet's recording fills the memory."""
+    steps: list[object] = []
+    monkeypatch.setattr(recording, "BLOCK_DRONE_S", 3.0 * record.scenario.fleet.drones)
+    monkeypatch.setattr(recording.Playback, "add", lambda self, known_s, new: steps.append(known_s))
+    flush = rr.RecordingStream.flush
+    monkeypatch.setattr(rr.RecordingStream, "flush", lambda self: (steps.append("flush"), flush(self)))
+    save_rrd(record, tmp_path / "blocks.rrd")
+    assert steps == [3.0, "flush", 6.0, "flush", record.scenario.duration_s, "flush", "flush"]
+
+
 def assert_same(live: Rows, rows: Rows) -> None:
     assert set(live) == set(rows)
     for entity, components in rows.items():
