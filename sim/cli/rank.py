@@ -33,7 +33,7 @@ def rank(
         bool,
         typer.Option(
             "--by-torch",
-            help="Fly every policy with the neural detector, and use the surrogate to make its intervals narrower (control variates); it takes minutes for each policy.",
+            help="Fly every policy with the neural detector, and use the surrogate, a fast fitted model of it, to make the AP's intervals narrower; it takes minutes for each policy.",
         ),
     ] = False,
     further: Annotated[

@@ -191,6 +191,13 @@ def _ns3() -> Tables:
     return wifi_compare.tables()
 
 
+def _ns3_drawn() -> Tables:
+    sys.path.insert(0, str(ROOT / "tests/validation/ns3"))
+    import wifi_drawn
+
+    return {"ns3_drawn": wifi_drawn.table(seed=20261124, plans=12)}
+
+
 def _transport() -> Tables:
     import transport
 
@@ -699,6 +706,7 @@ FIGURES: dict[str, Figure] = {
     "representations": Figure(4, _representations),
     "link": Figure(5, _link),
     "ns3": Figure(15, _ns3, timed=True),
+    "ns3_drawn": Figure(5, _ns3_drawn, timed=True),
     "transport": Figure(6, _transport),
     "paper": Figure(8, _paper),
     "conditions_first": Figure(8, _conditions_first),
