@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import dds_peer
 import pytest
+from dds_domains import domain
 from missing_libraries import path_without
 from places import ROOT
 from sim_examples import BASE, example
@@ -36,8 +37,6 @@ from sortie.sim.live.seals import Seals
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import MAX_DRONES, fly_live
 
-DOMAIN = os.getpid() % 200 + 20
-"""Tests that run beside one another share no bus."""
 STAMP_NS = 1_700_000_000_123_456_789
 
 
@@ -77,9 +76,9 @@ def test_types_made_of_msg_files_are_those_written_by_hand(ros_name: str, by_han
 
 
 def test_a_writer_s_farewell_is_no_sample_and_no_error() -> None:
-    bus = Bus(DOMAIN)
+    bus = Bus(domain(__name__))
     topic = Topic(TopicKind.COMPACT, 0, 1)
-    reader, writer = bus.reader(topic, 4), Bus(DOMAIN).writer(topic)
+    reader, writer = bus.reader(topic, 4), Bus(domain(__name__)).writer(topic)
     while not writer.listeners:
         time.sleep(0.01)
     writer.write(pack_bytes(b"abc"))
@@ -92,12 +91,12 @@ def test_a_writer_s_farewell_is_no_sample_and_no_error() -> None:
 
 def test_a_reader_that_is_found_while_they_are_counted_breaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The binding's list of them asks how many there are, makes room for so many, and asks again."""
-    bus, topic = Bus(DOMAIN), Topic(TopicKind.COMPACT, 0, 2)
+    bus, topic = Bus(domain(__name__)), Topic(TopicKind.COMPACT, 0, 2)
     writer = bus.writer(topic)
     said = iter([1, 2])
     monkeypatch.setattr(type(writer._writer), "_get_matched_subscriptions", lambda *_: next(said))
     assert writer.listeners == 0
-    readers = [Bus(DOMAIN).reader(topic, 1) for _ in range(2)]
+    readers = [Bus(domain(__name__)).reader(topic, 1) for _ in range(2)]
     until_s = time.monotonic() + 10.0
     while writer.listeners < len(readers) and time.monotonic() < until_s:
         time.sleep(0.01)
@@ -190,7 +189,7 @@ class Flown(NamedTuple):
 def flown() -> Flown:
     """Three drones for five seconds; number 2 is killed at 2.5 s, and a peer of its own making says 10 contexts."""
     environment = {**os.environ, "CYCLONEDDS_URI": LOOPBACK}
-    command = [sys.executable, str(Path(dds_peer.__file__)), str(DOMAIN), "10"]
+    command = [sys.executable, str(Path(dds_peer.__file__)), str(domain(__name__)), "10"]
     pids: dict[int, int] = {}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as peer:
         try:
@@ -201,7 +200,7 @@ def flown() -> Flown:
                 "context.authentication=false",
                 "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}",
             )
-            result = fly_live(scenario, duration_s=5.0, kill=(2, 2.5), domain=DOMAIN, begun=pids.update)
+            result = fly_live(scenario, duration_s=5.0, kill=(2, 2.5), domain=domain(__name__), begun=pids.update)
             told, _ = peer.communicate(timeout=60)
         finally:
             peer.kill()
@@ -297,7 +296,7 @@ def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path, monkeyp
     done = CliRunner().invoke(
         app,
         ["live", str(scenario), "--set", "fleet.drones=2", "--policy", "all-4(received_budget=0.02)", "--duration", "2", "--begin", "1",
-         "--loss", "0.5", "--domain", str(DOMAIN), "--out", str(told)],
+         "--loss", "0.5", "--domain", str(domain(__name__)), "--out", str(told)],
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     assert "50% of descriptors lost" in done.output
@@ -323,7 +322,7 @@ def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost
             "policy={name: all-4, dwell_s: 0, changes: [{at_s: 0.3, name: best-2, params: {received_budget: 0.05}}]}"
         )
         scenario = example("fleet.drones=2", changing)
-        result = fly_live(scenario, loss=1.0, domain=DOMAIN, begun=interrupt)
+        result = fly_live(scenario, loss=1.0, domain=domain(__name__), begun=interrupt)
     finally:
         signal.signal(signal.SIGALRM, before)
     assert result.interrupted
@@ -344,7 +343,7 @@ def test_a_fleet_that_is_gone_before_it_reports_is_an_error() -> None:
         os.kill(pids[0], signal.SIGKILL)
 
     with pytest.raises(RunError, match=r"^no drone's process lived long enough to report: was killed by SIGKILL$"):
-        fly_live(example("fleet.drones=1"), domain=DOMAIN, begun=killed)
+        fly_live(example("fleet.drones=1"), domain=domain(__name__), begun=killed)
 
 
 @pytest.mark.parametrize(
@@ -363,7 +362,7 @@ def test_a_fleet_that_is_gone_before_it_reports_is_an_error() -> None:
 )
 def test_options_that_do_not_fit_are_named(sets: list[str], options: dict[str, Any], message: str) -> None:
     with pytest.raises(RunError) as error:
-        fly_live(example(*sets), domain=DOMAIN, **options)
+        fly_live(example(*sets), domain=domain(__name__), **options)
     assert str(error.value) == message
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import socket
 import threading
 import time
@@ -12,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from dds_domains import domain
 from scipy.spatial.transform import Rotation
 from sim_examples import example
 from typer.testing import CliRunner
@@ -30,8 +30,6 @@ from sortie.sim.live.rules import rules_of
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
 from sortie.sim.live.vehicle import CirclingVehicle, circle
-
-DOMAIN = os.getpid() % 200 + 23
 
 
 def heard(t_s: float = 3.0, origin: Origin | None = None, system: int = 1) -> VehicleState:
@@ -158,7 +156,7 @@ def test_a_fleet_flies_with_a_vehicle_and_notices_that_it_falls_silent() -> None
     try:
         result = fly_live(
             example("fleet.drones=2", "duration_s=5"),
-            domain=DOMAIN,
+            domain=domain(__name__),
             mavlink=[f"udpin:127.0.0.1:{port}"],
             begun=lambda _: threading.Timer(2.0, vehicle.pause).start(),
         )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import threading
+import time
 from typing import Any
 
 import pytest
+from dds_domains import domain
 from sim_examples import example
 
 from sortie.fleet.messages.auth import Opened
@@ -14,13 +15,13 @@ from sortie.fleet.staleness import LinkHealth
 from sortie.policies.contract import Descriptor
 from sortie.sim.export.topics import CONTEXT
 from sortie.sim.folders import RunError
+from sortie.sim.live import session
 from sortie.sim.live.bus import Bus
 from sortie.sim.live.result import LiveResult
 from sortie.sim.live.seals import Seals
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
 
-DOMAIN = os.getpid() % 200 + 24
 POLICY = "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}"
 
 
@@ -31,7 +32,7 @@ def healths(result: LiveResult, drone: int, peer: int) -> list[LinkHealth]:
 
 
 def test_a_drone_that_starts_late_is_shared_with_and_shares() -> None:
-    result = fly_live(example("fleet.drones=2", POLICY), duration_s=4.0, start=(1, 2.0), domain=DOMAIN)
+    result = fly_live(example("fleet.drones=2", POLICY), duration_s=4.0, start=(1, 2.0), domain=domain(__name__))
     first, late = result.each
     assert (first.drone, late.drone) == (0, 1)
     assert late.published < 25 < first.published
@@ -45,7 +46,7 @@ def test_a_drone_that_starts_late_is_shared_with_and_shares() -> None:
 def test_a_drone_that_was_killed_comes_back_and_is_believed() -> None:
     """Its counters begin above those that it used before."""
     result = fly_live(
-        example("fleet.drones=2", POLICY), duration_s=5.0, kill=(1, 1.5), start=(1, 3.5), domain=DOMAIN + 1
+        example("fleet.drones=2", POLICY), duration_s=5.0, kill=(1, 1.5), start=(1, 3.5), domain=domain(__name__ + ".1")
     )
     assert [d.drone for d in result.each] == [0, 1, 1]
     assert all(set(d.refused) <= {"payload late"} for d in result.each)  # a busy host is late
@@ -54,23 +55,31 @@ def test_a_drone_that_was_killed_comes_back_and_is_believed() -> None:
     assert result.noticed[0].by == 1
 
 
-def test_rosters_on_the_bus_follow_who_starts_late() -> None:
-    """Read off the bus by somebody else, while the processes fly."""
+def test_rosters_on_the_bus_follow_who_starts_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read off the bus by somebody else, whom the flight waits for here."""
     heard: list[Descriptor] = []
     over = threading.Event()
+    bus, open_descriptor = Bus(domain(__name__ + ".2")), Seals(None).open_descriptor
+    reader = bus.reader(CONTEXT, depth=10)
+    wait_until_connected = session._wait_until_connected
+
+    def wait_for_the_listener_too(*of: Any) -> None:
+        wait_until_connected(*of)
+        until_s = time.monotonic() + 60.0
+        while not reader._reader.get_subscription_matched_status().current_count and time.monotonic() < until_s:
+            time.sleep(0.01)
 
     def listen() -> None:
-        bus, open_descriptor = Bus(DOMAIN + 2), Seals(None).open_descriptor
-        reader = bus.reader(CONTEXT, depth=10)
         while not over.is_set():
             bus.wait(0.1)
             heard.extend(found.descriptor for cdr in reader.take() if isinstance(found := open_descriptor(cdr), Opened))
 
+    monkeypatch.setattr(session, "_wait_until_connected", wait_for_the_listener_too)
     listener = threading.Thread(target=listen)
     listener.start()
     sets = ("fleet.drones=2", POLICY, "context.roster=true", "context.authentication=false")
     try:
-        fly_live(example(*sets), duration_s=4.0, start=(1, 2.0), domain=DOMAIN + 2)
+        fly_live(example(*sets), duration_s=4.0, start=(1, 2.0), domain=domain(__name__ + ".2"))
     finally:
         over.set()
         listener.join()

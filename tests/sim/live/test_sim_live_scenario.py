@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import simpy
+from dds_domains import domain
 from memory_bus import MemoryBus
 from policies_examples import fleet_of
 from pydantic import BaseModel
@@ -38,7 +38,6 @@ from sortie.sim.live.seals import Seals
 from sortie.sim.live.session import fly_live
 from sortie.sim.live.watchdog import DETECTIONS, Watchdog
 
-DOMAIN = os.getpid() % 200 + 27
 NONE = "perception.detector=none"
 OTHER = "fleet.makes=[{name: other, drones: [1], policy: all-4, policy_params: {received_budget: 0.03125}, feature_space: other}]"
 MEMBERS = "events=[{kind: drone_joins, at_s: 1.5, drone: 1}, {kind: drone_lost, at_s: 4, drone: 1}]"
@@ -77,7 +76,9 @@ def test_a_make_s_own_policy_decides() -> None:
 @pytest.fixture(scope="module")
 def mixed() -> LiveResult:
     """Two makes with two networks; drone 1 joins late, and is lost."""
-    return fly_live(example("fleet.drones=2", "duration_s=6", OTHER, MEMBERS), domain=DOMAIN, decide_within_s=1.0)
+    return fly_live(
+        example("fleet.drones=2", "duration_s=6", OTHER, MEMBERS), domain=domain(__name__), decide_within_s=1.0
+    )
 
 
 def test_two_networks_fly_and_each_says_which(mixed: LiveResult) -> None:

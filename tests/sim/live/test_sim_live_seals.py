@@ -9,6 +9,7 @@ from pathlib import Path
 
 import dds_attacker
 import pytest
+from dds_domains import domain
 from policies_examples import fleet_of
 from sim_examples import example
 from typer.testing import CliRunner
@@ -32,7 +33,6 @@ from sortie.sim.live.seals import KEY_ID, KEY_VARIABLE, Seals, find_key, secrets
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
 
-DOMAIN = os.getpid() % 200 + 21
 MASTER = bytes(range(32))
 ORDER = Topic(TopicKind.DIRECTIVE, 0, 1)
 PAYLOAD = Topic(TopicKind.FEATURES, 0, 1)
@@ -114,13 +114,13 @@ def test_the_key_comes_from_a_file_of_its_owner_alone(tmp_path: Path, monkeypatc
 @pytest.fixture(scope="module")
 def attacked() -> LiveResult:
     """Two drones for three seconds, and a stranger who writes in drone 0's name."""
-    command = [sys.executable, str(Path(dds_attacker.__file__)), str(DOMAIN)]
+    command = [sys.executable, str(Path(dds_attacker.__file__)), str(domain(__name__))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "CYCLONEDDS_URI": LOOPBACK}) as stranger:  # fmt: skip
         try:
             assert stranger.stdout is not None
             assert stranger.stdout.readline() == "listening\n"
             policy = "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}"
-            return fly_live(example("fleet.drones=2", policy), duration_s=3.0, domain=DOMAIN)
+            return fly_live(example("fleet.drones=2", policy), duration_s=3.0, domain=domain(__name__))
         finally:
             stranger.kill()
 
@@ -151,7 +151,7 @@ class FixedClock:
 def node_of(drone: int) -> tuple[LiveNode, FixedClock, PeerMemory]:
     """A drone's node, alone on its bus, in the scenario's flight."""
     scenario = example("fleet.drones=2")
-    node = LiveNode(Bus(DOMAIN + 1), seals(drone), drone, 2, seed=0, loss=0.0)
+    node = LiveNode(Bus(domain(__name__ + ".1")), seals(drone), drone, 2, seed=0, loss=0.0)
     clock, rules = FixedClock(), rules_of(scenario, 0.0, 6.0)
     memory = PeerMemory(drone, rules, DroneStatus())
     node.fly(clock, memory, rules, lambda: (1.0,))  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from dds_domains import domain
 from policies_examples import fleet_of
 from sim_examples import example
 from typer.testing import CliRunner
@@ -23,7 +24,6 @@ from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
 from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog, parse_fallback
 
-DOMAIN = os.getpid() % 200 + 22
 POLICY = """
 import os, time
 from pathlib import Path
@@ -188,7 +188,7 @@ def test_a_drone_flies_on_as_its_policy_dies(tmp_path: Path) -> None:
         "    return [Directive(view.ego, p, Representation.FEATURES, 0.05, None, 10.0) for p in view.peers]\n"
     )
     policy = f"policy={{name: '{tmp_path}/mine.py:decide', dwell_s: 0.3}}"
-    result = fly_live(example("fleet.drones=2", "duration_s=10", policy), domain=DOMAIN)
+    result = fly_live(example("fleet.drones=2", "duration_s=10", policy), domain=domain(__name__))
     broken, sound = result.each
     assert (broken.policy_restarts, sound.policy_restarts) == (1, 0)
     assert 5 < broken.fallbacks < 95
