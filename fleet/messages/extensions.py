@@ -24,6 +24,7 @@ To add a field: a field with a default in `sortie.policies.contract.Descriptor`,
 from __future__ import annotations
 
 import re
+import reprlib
 import struct
 from collections.abc import Callable
 from functools import lru_cache
@@ -75,14 +76,16 @@ class ExtensionField(NamedTuple):
 
 def _encode_feature_space(name: str) -> bytes:
     if not _FEATURE_SPACE.fullmatch(name):
-        raise ValueError(f"feature_space is {name!r}, must be 1 to 32 letters, digits or any of _ . + -")
+        raise ValueError(f"feature_space is {reprlib.repr(name)}, must be 1 to 32 letters, digits or any of _ . + -")
     return name.encode("ascii")
 
 
 def _decode_feature_space(value: bytes) -> str:
     name = value.decode("ascii", "replace")
     if not _FEATURE_SPACE.fullmatch(name):
-        raise MalformedDatagram(f"feature_space is {name!r}, must be 1 to 32 letters, digits or any of _ . + -")
+        raise MalformedDatagram(
+            f"feature_space is {reprlib.repr(name)}, must be 1 to 32 letters, digits or any of _ . + -"
+        )
     return name
 
 
@@ -98,7 +101,9 @@ def _encode_roster(roster: Roster) -> bytes:
 
 def _encode_codebook(digest: str) -> bytes:
     if not _CODEBOOK.fullmatch(digest):
-        raise ValueError(f"codebook is {digest!r}, must be {2 * _DIGEST_BYTES} digits of a hexadecimal number")
+        raise ValueError(
+            f"codebook is {reprlib.repr(digest)}, must be {2 * _DIGEST_BYTES} digits of a hexadecimal number"
+        )
     return bytes.fromhex(digest)
 
 
@@ -113,7 +118,7 @@ def _decode_roster(value: bytes) -> Roster:
     bits = int.from_bytes(value[4:], "little")
     if len(value) < 5 or not value[-1] or bits >> MAX_AGENT_ID + 1:
         wanted = f"an epoch of 4 B and the bits of ids up to {MAX_AGENT_ID}, the last byte not 0"
-        raise MalformedDatagram(f"roster is {value.hex()}, must be {wanted}")
+        raise MalformedDatagram(f"roster is {reprlib.repr(value.hex())}, must be {wanted}")
     return Roster(int.from_bytes(value[:4], "little"), tuple(i for i in range(bits.bit_length()) if bits >> i & 1))
 
 

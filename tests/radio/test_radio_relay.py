@@ -16,7 +16,6 @@ from radio_flights import Hover, trace
 from sortie.radio import Status
 from sortie.radio.relay import Routes, cheapest
 from sortie.radio.settings import AirSettings
-from sortie.radio.topology import bottleneck, connectivity, link_graph, widest_path, widths
 
 LINE_M = np.array([[0.0, 0.0, 60.0], [150.0, 0.0, 60.0], [300.0, 0.0, 60.0]])
 """Three in a row: either end is heard badly by the other, well by the middle."""
@@ -174,27 +173,3 @@ def test_goodput_to_a_relayed_peer_is_that_of_its_hops(tmp_path: Path) -> None:
     flight = Hover(traced(tmp_path, relay_max_hops=2), LINE_M)
     flight.fly(5.0, lambda frame: flight.send(0, 2, 60_000))
     assert flight.air.goodput_mbps(0)[1] == pytest.approx(50.0, rel=0.05)
-
-
-# --- how the fleet hangs together ----------------------------------------------------------------------
-
-
-@settings(max_examples=60, deadline=None)
-@given(mbps=goodputs())
-def test_widths_and_bottleneck_are_those_of_the_widest_paths(mbps: np.ndarray) -> None:
-    n = len(mbps)
-    graph, reached = link_graph(mbps, 1e-6), []
-    usable = np.where(mbps > 0, mbps, np.nan)
-    for i in range(n):
-        for j in range(n):
-            path = widest_path(graph, i, j) if i != j else []
-            width = widths(usable)[i, j]
-            assert np.isneginf(width) if not path else width == bottleneck(graph, path)[2]
-            reached += [width] if path else []
-    found = connectivity(mbps, 1e-6)
-    assert (found.bottleneck is None) == (not reached)
-    if found.bottleneck is not None:
-        i, j, width = found.bottleneck
-        assert width == min(reached) == mbps[i, j]
-    assert found.connected == (len(reached) == n * (n - 1))
-    assert (not found.cut) == found.connected
