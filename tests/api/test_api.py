@@ -217,6 +217,7 @@ def test_a_gain_over_sorties_is_the_mean_of_the_sorties_own_with_students_interv
     assert (gain.low, gain.high) == pytest.approx(student, abs=1e-4)  # the ends of AP, -1 and 1, are far away
 
 
+@pytest.mark.slow
 def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The surrogate stands for torch; the command prints and writes the same."""
     fly = multifidelity.fly_torch

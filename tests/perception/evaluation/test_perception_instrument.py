@@ -60,7 +60,14 @@ def everywhere(net: CarNet, features: torch.Tensor, frames: SeenFrames, f: int, 
 
 
 @pytest.mark.parametrize("unsent", ["zero", "masked"])
-@pytest.mark.parametrize("fusion", [name for name, f in FUSIONS.items() if f.shares == "features"])
+@pytest.mark.parametrize(
+    "fusion",
+    [  # one in the short suite: together they take a minute
+        pytest.param(name, marks=[] if name == "where2comm" else pytest.mark.slow)
+        for name, f in FUSIONS.items()
+        if f.shares == "features"
+    ],
+)
 def test_fusing_where_something_arrived_is_fusing_everywhere(frames: SeenFrames, fusion: str, unsent: str) -> None:
     net = network(fusion)
     view = CarNetInstrument(net).look(frames, 0)

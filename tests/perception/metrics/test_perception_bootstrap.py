@@ -98,6 +98,7 @@ def test_nothing_to_find_and_nothing_found() -> None:
     assert rank([]).ap(np.zeros((2, 0))).shape == (2,)
 
 
+@pytest.mark.slow
 def test_the_interval_covers_the_truth_as_often_as_it_says() -> None:
     """200 experiments of 40 frames each, five alike egos a frame; the true AP from 10,000 frames."""
 
@@ -124,6 +125,7 @@ def test_the_interval_covers_the_truth_as_often_as_it_says() -> None:
     assert by_ego < by_frame - 15, "egos of one frame are not independent, and taking them for it is overconfident"
 
 
+@pytest.mark.slow
 def test_p_values_of_no_difference_are_even() -> None:
     """Two conditions that are equally good: p below 0.1 in about a tenth of the experiments."""
     p = []

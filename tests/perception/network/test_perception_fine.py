@@ -110,7 +110,7 @@ def everywhere(net: CarNet, features: Tensor, frames: Frames, e: Exchange) -> Te
     return out
 
 
-@pytest.mark.parametrize("unsent", ["zero", "masked"])
+@pytest.mark.parametrize("unsent", ["zero", pytest.param("masked", marks=pytest.mark.slow)])
 def test_fusing_where_something_arrived_is_fusing_everywhere(fleet: Frames, unsent: str) -> None:
     net = network()
     view = CarNetInstrument(net).look(fleet, 0)

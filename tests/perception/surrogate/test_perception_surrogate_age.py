@@ -17,7 +17,10 @@ LEVEL = 0.01
 """Of each one-sided test."""
 
 
-@pytest.fixture(scope="module", params=get_args(Rule))
+@pytest.fixture(
+    scope="module",
+    params=[rule if rule == "average" else pytest.param(rule, marks=pytest.mark.slow) for rule in get_args(Rule)],
+)
 def gains(request: pytest.FixtureRequest) -> dict[Case, np.ndarray]:
     return late_shares.gains(request.param, TOWNS)
 

@@ -67,7 +67,7 @@ def test_where_nobody_shares_an_alarm_there_are_no_shared_false_positives() -> N
     assert estimate_shared([4, 4], 4) == (1.0, 1.0)
 
 
-@pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), (0.5, 0.3), (0.9, 0.8)])
+@pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), pytest.param(0.5, 0.3, marks=pytest.mark.slow), (0.9, 0.8)])
 def test_a_fleet_of_known_shared_false_positives_is_measured_as_such(part: float, chance: float) -> None:
     planted = replace(load(SHIPPED), shared_false_positives=np.array([part, chance, 0.4, 0.1], np.float32))
     found = fit_shared_false_positives(detector_runs(planted, 40), planted.floor, 0)
