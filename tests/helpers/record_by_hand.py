@@ -129,7 +129,7 @@ def tables_of(given: dict[str, list[dict[str, Any]]]) -> dict[str, pa.Table]:
     """All tables of these rows; cells that no row names are zeros."""
     zero = {pa.string(): "", pa.bool_(): False, pa.binary(): b""}
     return {
-        name: pa.table({c: pa.array([r.get(c, zero.get(t, 0)) for r in given.get(name, [])], t) for c, t in columns.items()})
+        name: pa.table({c: pa.array([r.get(c, zero.get(t, [] if pa.types.is_list(t) else 0)) for r in given.get(name, [])], t) for c, t in columns.items()})
         for name, columns in TABLES.items()
     }  # fmt: skip
 
