@@ -252,6 +252,20 @@ def test_one_seed_flies_in_the_scenario_s_own_town_and_its_interval_is_over_inst
     ]  # fmt: skip
 
 
+def test_every_policy_is_compared_with_the_first_and_not_with_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The third finds what the second found: over the first that is a loss, and over the second nothing."""
+    third = {key: FRAMES["silence", *key[1:]] for key in (("boxes", 5, False), ("boxes", 5, True))}
+    fake(monkeypatch, FRAMES | third)
+    first, second = contenders()
+    policy = second.scenario.policy.model_copy(update={"name": "boxes"})
+    last = Contender("third", second.scenario.model_copy(update={"policy": policy}))
+    for seeds in ([5], [5, 5]):
+        found = compare.compare([first, second, last], seeds)
+        wanted = {"full_scene": -1.0, "mission": 1.0}
+        assert [s.gain for s in found.sorties[:3]] == [{"full_scene": None, "mission": None}, wanted, wanted]
+        assert [g.gain for g in found.gains if g.metric == "ap50.full_scene"] == [-1.0, -1.0]
+
+
 def test_functions_decide_for_their_own_contender(monkeypatch: pytest.MonkeyPatch) -> None:
     def quiet(view: Any) -> list[Any]:
         return []
