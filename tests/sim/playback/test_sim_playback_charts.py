@@ -1,0 +1,121 @@
+"""The plots of a playback, of a record of a few rows: every point worked out by hand, also second by second."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from record_by_hand import record, rows, tables_of
+
+from sortie.scenarios.schema import Scenario
+from sortie.sim.playback.charts import Charts
+from sortie.sim.results.regions import Regions
+from sortie.sim.results.sightings import sightings
+
+NAN = math.nan
+Series = dict[str, list[tuple[float, float]]]
+
+
+class Kept:
+    """A canvas that keeps the points of plot lines."""
+
+    def __init__(self) -> None:
+        self.points: Series = {}
+
+    def static(self, path: str, *shown: Any) -> None: ...
+
+    def columns(self, path: str, t_s: Any, columns: Any) -> None: ...
+
+    def scalars(self, path: str, t_s: Any, values: Any) -> None:
+        pairs = zip(np.asarray(t_s, float).tolist(), np.asarray(values, float).tolist(), strict=True)
+        self.points.setdefault(path, []).extend((round(t, 9), v if v != v else round(v, 9)) for t, v in pairs)
+
+
+def scenario(drones: int) -> Scenario:
+    made = record().scenario
+    return made.model_copy(update={"fleet": made.fleet.model_copy(update={"drones": drones})})
+
+
+def drawn(given: dict[str, list[dict[str, Any]]], drones: int = 2, seconds: tuple[float, ...] = (4.0,)) -> Series:
+    """What is plotted of these tables, which come up to each of these seconds."""
+    flown = replace(record(), tables=tables_of(rows() | given))
+    kept, of = Kept(), scenario(drones)
+    charts = Charts(kept, of)  # type: ignore[arg-type]
+    charts.begin()
+    before = -1.0
+    for known_s in seconds:
+        new: dict[str, pa.Table] = {}
+        for name, table in flown.tables.items():
+            stamp = {"transmissions": "t_done_s"}.get(name, "t_s")
+            if stamp not in table.column_names:
+                continue
+            t_s = table[stamp].to_numpy()
+            new[name] = table.filter(pa.array((t_s >= before) & (t_s < known_s) | (np.isnan(t_s) & (known_s == 4.0))))
+        regions = Regions(flown.tables["mission"], flown.scenario.mission)
+        charts.add(known_s, new, sightings({k: new[k] for k in ("fusions", "detections", "truths")}, regions))
+        before = known_s
+    return {path: points for path, points in kept.points.items() if points and "marks" not in path}
+
+
+@pytest.fixture(params=[(4.0,), (1.0, 2.0, 3.0, 4.0)], ids=["at once", "by seconds"])
+def seconds(request: pytest.FixtureRequest) -> tuple[float, ...]:
+    found: tuple[float, ...] = request.param
+    return found
+
+
+def test_batteries_are_in_percent_and_each_drone_s_own(seconds: tuple[float, ...]) -> None:
+    made = drawn({}, seconds=seconds)
+    assert made["plots/battery/0"] == [(0, 90), (1, 89), (2, 88), (3, 87)]
+    assert made["plots/battery/1"] == [(0, 80), (1, 79), (2, 78), (3, 77)]
+
+
+def test_goodput_is_the_mean_of_the_links_that_were_ever_measured(seconds: tuple[float, ...]) -> None:
+    said = [(0.2, 0, [10.0, 30.0]), (0.7, 0, [40.0, 0.0]), (1.5, 1, [0.0, 0.0]), (2.5, 1, [5.0, 7.0])]
+    given = {"descriptors": [{"t_s": t_s, "drone": d, "goodput_mbps": links} for t_s, d, links in said], "states": []}
+    made = drawn(given, drones=3, seconds=seconds)
+    assert made["plots/goodput/0"] == [(0.2, 20.0), (0.7, 40.0)]
+    (first_s, gap), second = made["plots/goodput/1"]
+    assert (first_s, math.isnan(gap), second) == (1.5, True, (2.5, 6.0))
+    assert "plots/goodput/2" not in made
+
+
+def test_traffic_is_of_the_second_in_which_it_ended(seconds: tuple[float, ...]) -> None:
+    """Mb/s: of 125,000 B in one second, 1. A line begins with the first second in which it carries anything."""
+    sent = [
+        {"t_done_s": t_s, "drone": 0, "peer": 1, "representation": what, "status": fate, "payload_bytes": size}
+        for t_s, what, fate, size in (
+            (0.5, "features", "delivered", 125_000), (1.0, "features", "delivered", 500_000), (1.5, "features", "lost", 375_000),
+            (2.5, "detections", "expired", 12_500), (NAN, "features", "in_flight", 999_999),
+        )
+    ]  # fmt: skip
+    made = {path.removeprefix("plots/traffic/"): v for path, v in drawn({"transmissions": sent}, seconds=seconds).items() if "traffic" in path}  # fmt: skip
+    assert made == {
+        "features_delivered": [(1, 1.0), (2, 4.0), (3, 0.0), (4, 0.0)],
+        "features_lost": [(2, 3.0), (3, 0.0), (4, 0.0)],
+        "detections_expired": [(3, 0.1), (4, 0.0)],
+    }
+
+
+def test_ages_losses_and_the_channel_are_of_their_second(seconds: tuple[float, ...]) -> None:
+    ages = [
+        {"t_s": t_s, "drone": 0, "age_s": age_s} for t_s, age_s in ((0.0, 0.1), (0.99, 0.3), (1.0, 0.5), (3.5, 0.7))
+    ]
+    busy = [{"t_s": float(k), "busy_fraction": 0.125 * k} for k in range(4)]
+    made = drawn({"ages": ages, "medium": busy}, seconds=seconds)
+    assert made["plots/age/p99_ms"] == [(1, 298.0), (2, 500.0), (4, 700.0)]
+    assert made["plots/medium/busy_percent"] == [(0, 0.0), (1, 12.5), (2, 25.0), (3, 37.5)]
+    # of the rows of the record: 1 of 4 lost, 2 of 4, 1 of 2, 1 of 1
+    assert made["plots/lost/percent"] == [(1, 25.0), (2, 50.0), (3, 50.0), (4, 100.0)]
+
+
+def test_accuracy_is_of_the_scene_and_of_the_disc(seconds: tuple[float, ...]) -> None:
+    """By 1 s one of two cars is found. In the disc, from 2 s on: by 3 s one of two, by 4 s two of three."""
+    made = drawn({}, seconds=seconds)
+    assert [t_s for t_s, _ in made["plots/ap/full_scene"]] == [1, 2, 3, 4]
+    assert made["plots/ap/full_scene"][0][1] == 0.5
+    assert made["plots/ap/full_scene"][3][1] == pytest.approx(2.5 / 6)
+    assert made["plots/ap/mission"] == [(3, 0.5), (4, pytest.approx(2 / 3))]
