@@ -19,6 +19,7 @@ import sortie
 from sortie.fleet.logs.geodesy import Origin
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.worst import Worst
+from sortie.sim.cli import fly
 from sortie.sim.results import run_folder
 
 
@@ -294,3 +295,40 @@ def test_check(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert calls == [("s.yaml", ["duration_s=2"], True)]
     assert command("check", "s.yaml", "t.yaml") == 1
     assert calls[1:] == [("s.yaml", [], False), ("t.yaml", [], False)]
+
+
+def test_what_watches_a_flight_gets_its_options_and_every_second(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A viewer and an endpoint together: both hear all of it, and both are closed, also after an error."""
+    heard: list[tuple[Any, ...]] = []
+
+    class Watcher:
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            self.name = args[0] if args else "viewer"
+            heard.append(("made", self.name, args, kwargs))
+
+        def begin(self, *told: Any) -> None:
+            heard.append(("begin", self.name, *told))
+
+        def second(self, *told: Any) -> None:
+            heard.append(("second", self.name, *told))
+
+        def close(self) -> None:
+            heard.append(("close", self.name))
+
+    monkeypatch.setattr("sortie.sim.playback.viewer.LiveViewer", Watcher)
+    monkeypatch.setattr("sortie.sim.export.telemetry.MavlinkEndpoint", Watcher)
+    for pace, wanted in ((2.5, 2.5), (0.0, None)):
+        heard.clear()
+        with fly._watching(True, "udpout:a:1", pace, here / "key") as watchers:
+            assert watchers
+            watchers.begin("scenario", "scene")  # type: ignore[arg-type]
+            watchers.second(1.0, {})
+        both = ("viewer", "udpout:a:1")
+        assert heard == [
+            ("made", "viewer", (), {}), ("made", "udpout:a:1", ("udpout:a:1", wanted), {"key": bytes(range(32))}),
+            *(("begin", name, "scenario", "scene") for name in both), *(("second", name, 1.0, {}) for name in both),
+            *(("close", name) for name in both),
+        ]  # fmt: skip
+    assert not fly._watching(False, None, 1.0, None)
+    with pytest.raises(sortie.RunError, match="--mavlink-key without --mavlink"):
+        fly._watching(True, None, 1.0, here / "key")

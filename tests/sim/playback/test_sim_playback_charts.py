@@ -54,7 +54,8 @@ def drawn(given: dict[str, list[dict[str, Any]]], drones: int = 2, seconds: tupl
             if stamp not in table.column_names:
                 continue
             t_s = table[stamp].to_numpy()
-            new[name] = table.filter(pa.array((t_s >= before) & (t_s < known_s) | (np.isnan(t_s) & (known_s == 4.0))))
+            now = (t_s > before) & (t_s <= known_s)  # also what is stamped at this very instant, as in a sortie
+            new[name] = table.filter(pa.array(now | (np.isnan(t_s) & (known_s == 4.0))))
         regions = Regions(flown.tables["mission"], flown.scenario.mission)
         charts.add(known_s, new, sightings({k: new[k] for k in ("fusions", "detections", "truths")}, regions))
         before = known_s

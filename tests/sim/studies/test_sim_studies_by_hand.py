@@ -48,7 +48,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
 
     def matched(made: Any, mission: bool) -> dict[tuple[float, int], Matched]:
         hits = [made.seed == 3, made.policy == "all-4"]
-        return {(1.0 + mission, 0): Matched(np.array([0.9, 0.8]), np.array(hits), 2)}
+        return {(1.0 + mission, 0): Matched(np.array([0.9, 0.8]), np.array(hits), 2 if mission else 4)}
 
     def outcome(made: Any) -> dict[str, Any]:
         made_up = told_outcome(off=float(made.seed))
@@ -81,7 +81,10 @@ def test_every_policy_flies_every_condition_on_each_seed_within_its_budget(monke
         assert (c.data_bytes, c.energy_j) == (pytest.approx(99_000.0), pytest.approx(52_200.0))
         assert c.miss_rate == pytest.approx(0.0 if c.policy == "silence" else 0.35)
     # all-4: hit and miss at 0.9, two hits at 0.8: of four cars three. silence: hit and miss at 0.9, two misses
+    # in the whole scene there are twice as many cars
     assert cells[0].ap > cells[2].ap > 0.0
+    for in_disc, in_scene in ((0, 1), (2, 3)):
+        assert cells[in_disc].ap == pytest.approx(2 * cells[in_scene].ap)
 
 
 CELLS = [
