@@ -139,13 +139,13 @@ def test_campaign(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     }  # fmt: skip
     seen._answer = sortie.CampaignResult(here / "out", 20, 0, 0, 90.0)
     tls = ("--scheduler", "tcp://h:1", "--security", "ca.pem", "cert.pem", "key.pem")
-    assert command("campaign", "run", "c.yaml", *tls, "--no-report") == 0
+    assert command("campaign", "run", "c.yaml", *tls, "--retry-failed", "--no-report") == 0
     assert "20 runs finished, none of them now" in capsys.readouterr().out
     given = {k: v for k, v in seen.kwargs.items() if k not in ("progress", "notice")}
     assert given == {
         "out": Path("runs/campaign-named"), "workers": None, "scheduler": "tcp://h:1",
         "security": (Path("ca.pem"), Path("cert.pem"), Path("key.pem")), "worker_memory_gb": None, "wait_for_workers_s": 300.0,
-        "resume": False, "retry_failed": False,
+        "resume": False, "retry_failed": True,
     }  # fmt: skip
 
 
