@@ -77,7 +77,7 @@ def test_an_ego_far_away_and_turned_joins_by_the_errors_of_its_own_sight(weight:
     first, second = (np.array(p) for p in ((330.0, 0.0), (300.0, -90.0)))
     own = Boxes.placed(np.array([[*first, 4.5, 1.9, 0.0, 0.4], [*second, 4.5, 1.9, 0.0, 0.3]]), (0.0, 0.0, 0.0))
     theirs = Boxes.placed(
-        np.array([[*(second + [0.5, 0.3]), 4.5, 1.9, 0.0, 0.9], [*(first + [-0.4, 0.6]), 4.5, 1.9, 0.0, 0.35]]), (0.0, 0.0, 0.0)
+        np.array([[*np.add(second, [0.5, 0.3]), 4.5, 1.9, 0.0, 0.9], [*np.add(first, [-0.4, 0.6]), 4.5, 1.9, 0.0, 0.35]]), (0.0, 0.0, 0.0)
     )  # fmt: skip
     there = (360.0, -60.0, 0.0)
     sent = ROUND.covariances_m2(theirs.xy_m, theirs.score, there)
