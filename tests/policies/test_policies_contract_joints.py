@@ -6,7 +6,11 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.catalogue import adaptive
+from sortie.policies.catalogue.coverage_cells import centre_cell, disc_around
 from sortie.policies.catalogue.deputies import deputies
+from sortie.policies.catalogue.prior.hydracollab import hydracollab
+from sortie.policies.catalogue.prior.syncnet import STEPS, syncnet
+from sortie.policies.catalogue.prior.where2comm import where2comm
 from sortie.policies.contract import (
     OTHER_NETWORK,
     Directive,
@@ -121,3 +125,23 @@ def test_the_learned_policy_reads_of_a_drone_what_is_its_own(phase: TaskPhase, r
     found = adaptive.features(view._replace(descriptors=each), 0.01)
     tracking = float(phase == TaskPhase.TRACK and region is not None)
     assert found == pytest.approx((-2.0, tracking, 0.5, 2.0, 0.625))
+
+
+def test_borders_of_prior_methods() -> None:
+    """What agrees just as far as the threshold; a map that comes far too late; a drone that sees nothing well."""
+    view = fleet_of(2)
+    at = view.descriptors[0].position_m
+    grids = {
+        0: bytes([0b10_10_10_00]) + bytes(63),
+        1: bytes([0b00_10_10_10]) + bytes(63),
+    }  # two cells in common of four
+    alike = {i: d._replace(position_m=at, coverage_grid=grids[i]) for i, d in view.descriptors.items()}
+    for threshold, rung in ((0.5, FEATURES), (0.51, DETECTIONS)):
+        (d,) = hydracollab(view._replace(descriptors=alike), threshold=threshold)
+        assert d.representation == rung
+    slow = {**view.descriptors, 0: view.descriptors[0]._replace(peer_goodput_mbps=(0.5,))}
+    (d,) = syncnet(view._replace(descriptors=slow))
+    assert (d.representation, d.fusion_weight) == (FEATURES, 1 / STEPS)
+    apart = {**view.descriptors, 1: view.descriptors[1]._replace(position_m=(500.0, 0.0, 60.0))}
+    (d,) = where2comm(view._replace(descriptors=apart))
+    assert d.roi == disc_around(centre_cell(view.descriptors[0]))
