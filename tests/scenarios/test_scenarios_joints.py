@@ -10,6 +10,8 @@ Joints, each with a test below:
 6. Peers of equal overlap: each ego begins after itself.
 7. Slots of every shape: who is where, and who stays when one more comes.
 8. A flight that is shortened: what begins before its end, of every list. A campaign's largest fleet, wherever it stands.
+   A campaign and what its base expects.
+9. A class's largest backoff: at a first try and after failures.
 
 Draws that must be independent of each other: streams of another seed, replication, entity or purpose.
 """
@@ -214,6 +216,21 @@ def test_a_campaign_has_room_for_its_largest_fleet_and_longest_mission_wherever_
         assert (study.drones, study.phases) == (7, 7)
 
 
+def test_a_campaign_leaves_out_what_its_base_expects(tmp_path: Path) -> None:
+    """Of figures and of decisions alike: with fewer drones or a shorter flight it need not hold, nor make sense."""
+    base = {
+        "name": "base", "duration_s": 9.0, "fleet": {"drones": 4},
+        "expect": [{"metric": "ap50.full_scene", "at_least": 0.1}],
+        "expect_decisions": [{"drone": 3, "from_s": 6.0, "until_s": 8.0}],
+    }  # fmt: skip
+    (tmp_path / "base.yaml").write_text(json.dumps(base))
+    for changed in ({"vary": {"fleet.drones": {"kind": "grid", "values": [2, 3]}}}, {"set": {"duration_s": 5.0}}):
+        campaign = {"campaign": "c", "base": "base.yaml", "metrics": ["wall_s"], **changed}
+        (tmp_path / "c.yaml").write_text(json.dumps(campaign))
+        study = load_campaign(tmp_path / "c.yaml")
+        assert (study.base.expect, study.base.expect_decisions) == ((), ())
+
+
 # --- makes ---------------------------------------------------------------------------------------------------
 
 
@@ -327,3 +344,13 @@ def test_streams_of_another_seed_replication_entity_or_purpose_share_nothing() -
     assert np.abs(correlation).max() < 0.1
     np.testing.assert_array_equal(stream(1, 0, 0, "a").random(5), drawn[0, :5])
     np.testing.assert_array_equal(stream(1, 0, (0,), "a").random(5), drawn[0, :5])
+
+
+# --- backoff -------------------------------------------------------------------------------------------------
+
+
+def test_a_class_may_keep_its_window_after_failures_and_not_narrow_it() -> None:
+    edca = scenario("radio: {edca: {best_effort: {cw_min: 31, cw_max: 31}}}").radio.edca
+    assert (edca.best_effort.cw_min, edca.best_effort.cw_max) == (31, 31)
+    with pytest.raises(ScenarioError, match="must be at least cw_min = 31"):
+        scenario("radio: {edca: {best_effort: {cw_min: 31, cw_max: 30}}}")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import sortie.scenarios.reading.load as loader
 from sortie.scenarios.reading import strict_yaml
-from sortie.scenarios.reading.load import ScenarioError, dump, library, load, loads
+from sortie.scenarios.reading.load import ScenarioError, build, dump, library, load, loads
 from sortie.scenarios.schema import PolicySection, Scenario
 
 BROKEN = sorted((Path(__file__).parent / "broken").glob("*.yaml"))
@@ -234,6 +234,12 @@ def test_overrides_replace_and_add() -> None:
     assert scenario.policy.params == {"rho": 0.25, "k": 2}
     assert scenario.fleet.route.waypoints_m == ((0, 0), (80, 0))
     assert scenario.seed == 3, "the last one wins"
+
+
+@pytest.mark.parametrize("written", ["", "fleet:\n", "fleet: {}\n", "fleet: {drones: 4}\n"])
+def test_an_override_sets_a_field_of_a_section_whether_it_is_there_empty_or_not(written: str) -> None:
+    assert loads(f"name: mine\n{written}", overrides=("fleet.drones=3",)).fleet.drones == 3
+    assert build({"name": "mine", "fleet": None}, {"fleet.formation.spacing_m": 7.0}).fleet.formation.spacing_m == 7.0
 
 
 def test_an_override_mends_what_the_file_has_wrong() -> None:
