@@ -386,6 +386,19 @@ def test_a_dropped_context_frame_frees_the_air() -> None:
     assert [s for _, s, _ in b.heard] == [1]
 
 
+def test_what_a_sender_learned_of_a_link_counts_once() -> None:
+    b = Bench(-50.0, rate_control="minstrel")
+    flow = b.submit(0, 4).flow
+    b.run(1.0)
+    b.medium.sync()
+    assert b.medium.learned(flow).sum(axis=0).tolist() == [4, 4]
+    assert not b.medium.learned(flow).any()
+    b.submit(0, 3)
+    b.run(2.0)
+    b.medium.sync()
+    assert b.medium.learned(flow).sum(axis=0).tolist() == [3, 3]
+
+
 # --- laws ----------------------------------------------------------------------------------------------
 
 arrivals = st.lists(
