@@ -106,6 +106,19 @@ def test_cells_are_those_of_the_believed_place_and_the_scene_is_that_of_the_true
     assert (shifted.row, shifted.column) == (view.row, view.column + 2)
 
 
+@pytest.mark.parametrize("off_deg", [90.0, -90.0, 180.0])
+def test_a_wrong_heading_turns_what_is_seen_of_the_scene_with_it(off_deg: float) -> None:
+    """In the middle of a cell, and by quarters: what lies north of a drone that believes itself a quarter to the left lies west."""
+    middle = CELL_M / 2
+    true = poses(np.array([middle, middle, 60.0]))
+    wrong = true._replace(est_yaw_rad=true.yaw_rad + math.radians(off_deg))
+    ((view,),), ((turned,),) = (views(p, DENSE.height_field) for p in (true, wrong))
+    grid = unpack_grid(view.grid)[1:, 1:]  # 15 × 15 about the drone's own cell
+    expected = np.rot90(grid, -round(off_deg / 90))
+    assert (unpack_grid(turned.grid)[1:, 1:] == expected).mean() > 0.95
+    assert (grid == expected).mean() < 0.9
+
+
 def test_frames_between_rays_keep_their_lines_of_sight() -> None:
     """Within the way after which rays are followed again, the grid is nearly the one of its own frame."""
     way = np.stack([np.linspace(-20, 20, 60), np.full(60, 3.0), np.full(60, 60.0)], axis=1)

@@ -93,6 +93,25 @@ def test_gauss_markov_heads_about_its_mean_heading() -> None:
     assert np.abs(mean.mean()) < 0.15  # mean headings are drawn evenly
 
 
+def test_gauss_markov_draws_speed_heading_and_climb_apart() -> None:
+    times_s = np.arange(300) + 0.55
+    options = {
+        **WIDE,
+        "speed_sigma_mps": 1.0,
+        "heading_sigma_deg": 20,
+        "climb_sigma_mps": 0.1,
+        "height_range_m": 90,
+        "turn_time_s": 0.1,
+    }
+    way = [gauss_markov(times_s + dt, starts(100), rng(), **options) for dt in (-0.1, 0.1)]
+    velocity = (way[1] - way[0]) / 0.2
+    course = np.exp(1j * np.arctan2(velocity[..., 1], velocity[..., 0]))
+    off = np.angle(course / course.mean(axis=0))
+    drawn = np.stack([np.hypot(velocity[..., 0], velocity[..., 1]).ravel(), off.ravel(), velocity[..., 2].ravel()])
+    together = np.corrcoef(drawn)[np.triu_indices(3, 1)]
+    assert np.abs(together).max() < 0.08
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 1000), st.floats(60, 400), st.floats(0.5, 9), st.floats(0, 40), st.booleans())
 def test_no_random_model_leaves_its_fence(
