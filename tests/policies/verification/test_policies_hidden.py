@@ -12,9 +12,11 @@ from policies_hidden import HARMLESS, KEPT, LATER, ORDERS, TEXTS, K
 from sortie.policies.contract import PHASE_OF, FleetView
 from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.kept import Kept
 from sortie.policies.verification.own_constants import views_at
 from sortie.policies.verification.proof import prove
 from sortie.scenarios.plugins.user_calls import ProgramExitError, watched
+from sortie.scenarios.plugins.user_code import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::SyntaxWarning")
 
@@ -39,6 +41,28 @@ def test_what_is_kept_elsewhere_is_not_proved(tmp_path: Path, number: int, monke
         assert outcome(tmp_path, text) in ("drawn", "searched", "refuted")
     finally:
         PHASE_OF.pop("x", None)
+
+
+@pytest.mark.parametrize(
+    "keeper",
+    [
+        "def use(kept=[]):\n    kept.append(1)",
+        "def use(*, kept=[]):\n    kept.append(1)",
+        "def use():\n    use.kept = getattr(use, 'kept', 0) + 1",
+        "use = (lambda kept: lambda: kept.append(1))([])",
+        "import functools\nuse = functools.partial(list.append, [], 1)",
+        "class Use:\n    kept = []\n    def __call__(self):\n        self.kept.append(1)\nuse = Use()",
+        "class Use(list):\n    def __call__(self):\n        self.append(1)\nuse = Use()",
+    ],
+)
+def test_what_changes_is_noticed_wherever_a_function_keeps_it(tmp_path: Path, keeper: str) -> None:
+    path = tmp_path / "keeps.py"
+    path.write_text(keeper)
+    use = load(path).use
+    kept = Kept({"it": use})
+    assert kept.changed() == ""
+    use()
+    assert kept.changed() == "changes it"
 
 
 @pytest.mark.parametrize("body", HARMLESS)

@@ -46,6 +46,9 @@ def broken(line: str, view: FleetView = VIEW, directives: list[Directive] = SHAR
         ("phase == track", [None]),
         ("phase == search and cpu == 1 and gpu == 1 and not region and not targets", []),
         ("when not region: rate_hz == 10 and count_links(roi) == 1", [2]),
+        ("when rate_hz > 5: battery > 0.3", [1]),  # the condition alone is of a link
+        ("when goodput_mbps < 5: battery > 0.3", [1, 2]),
+        ("when rate_hz > 5: peers == 2", []),
     ],
 )
 def test_what_a_line_means(line: str, links: list[int | None]) -> None:

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from enum import Enum
+from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -28,7 +29,7 @@ from sortie.fleet.staleness import cap_by_age, health
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Policy, PolicyError, Representation
 from sortie.policies.damping import DampedLink, damp
-from sortie.policies.registry import POLICIES
+from sortie.policies.registry import POLICIES, resolve
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.conformance import RULES, full_view, raised_part, without_detached
 from sortie.policies.verification.views import draw_view, draw_views
@@ -367,6 +368,14 @@ def test_a_policy_that_reaches_elsewhere_is_caught(policy: Policy, what: str) ->
     with pytest.raises(Reached, match=rf"^uses {what}, which is not in its view$"):
         confined(policy)(FLEET)
     assert RULES["reads only its view"](policy, FLEET) == f"uses {what}, which is not in its view"
+
+
+@pytest.mark.parametrize("call", ["hash('a')", "id(view)", "print('a')"])
+def test_a_file_s_policy_that_asks_the_process_is_caught(call: str, tmp_path: Path) -> None:
+    path = tmp_path / "asks.py"
+    path.write_text(f"def decide(view):\n    {call}\n    return []\n")
+    name = call.partition("(")[0]
+    assert RULES["reads only its view"](resolve(f"{path}:decide"), FLEET) == f"uses {name}(…), which is not in its view"
 
 
 def remembers(view: FleetView) -> list[Directive]:

@@ -123,3 +123,12 @@ def test_the_longest_wait_for_a_link_is_proved_to_the_frame(limit_s: float, is_p
     except NotFinite:
         proved = False
     assert proved == is_proved
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_views_of_a_course_come_frame_by_frame_and_count_in_the_plane_s_periods(every: int) -> None:
+    course = Course(2, 4, 0.1, 0.1 * every, 10.0, {("lost", 1, -1): ((0, 0.0), (2, 1.0))}, {})
+    views = list(course.views())
+    assert [view.period_s for view in views] == [0.1 * every] * 4
+    assert [view.descriptors[0].stamp_ns for view in views] == [0, 100_000_000, 200_000_000, 300_000_000]
+    assert [view.age_s[1] for view in views] == pytest.approx([0.02, 0.02, 0.12, 0.22])
