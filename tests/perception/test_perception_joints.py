@@ -38,6 +38,7 @@ from recording_examples import small
 from scipy.special import ndtr
 
 from sortie.perception import budget
+from sortie.perception.detectors import make_detector
 from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.evaluation.selection import choose
 from sortie.perception.ground_truth import ground_truth
@@ -607,3 +608,41 @@ def test_the_surrogate_draws_by_seed_and_replication() -> None:
     ]
     assert same(found[0], found[3])
     assert not any(same(found[0], other) for other in found[1:3])
+
+
+def test_the_detector_that_a_scenario_names_draws_by_seed_and_replication() -> None:
+    def found(seed: int, replication: int):
+        detector = make_detector(town(), Perception(detector="surrogate"), seed, replication)
+        assert detector is not None
+        return detector.detect([(c, ()) for c in cross(0.0, 0.0, 0.3)])
+
+    first = found(3, 0)
+    assert all(map(same, found(3, 0), first))
+    assert not all(map(same, found(3, 1), first))
+    assert not all(map(same, found(4, 0), first))
+
+
+OWN = """
+class Mine:
+    def __init__(self, scene, config, seed, replication):
+        self.made = seed, replication
+
+    def count_boxes(self, capture, roi):
+        return capture.drone if roi is None else round(roi.radius_m)
+
+    def detect(self, jobs): ...
+    def truth(self, t_s, ego): ...
+    def camera_views(self, capture): ...
+"""
+
+
+def test_a_detector_of_one_s_own_is_made_for_the_replication_and_counts_in_the_region_that_is_asked_for(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(OWN)
+    detector = make_detector(town(), Perception(detector=f"{path}:Mine"), 3, 2)
+    assert detector is not None
+    assert detector.made == (3, 2)
+    assert detector.count_boxes(capture(drone=4), None) == 4
+    assert detector.count_boxes(capture(drone=4), Disc(1.0, 2.0, 9.0)) == 9

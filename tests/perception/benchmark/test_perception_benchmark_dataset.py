@@ -205,3 +205,16 @@ def test_nothing_to_load_is_refused() -> None:
 def test_the_splits_have_their_sizes() -> None:
     assert SIZES == {"train": (100, 12), "validation": (12, 6), "tau": (40, 1), "test": (240, 1)}
     assert [b.key() for b in (Benchmark(), Benchmark(3))] == ["76567db317f0", BENCH.key()]  # published weights name it
+
+
+def test_what_is_added_to_a_split_stands_beside_what_it_has(tmp_path: Path) -> None:
+    header = {"format": 1, "key": "k", "benchmark": {}}
+    manifest.add(tmp_path, header, "test", [("scene_00001.npz", {"sha256": "b"})])
+    manifest.add(tmp_path, header, "train", [("scene_00000.npz", {"sha256": "a"})])
+    manifest.add(tmp_path, header, "test", [("scene_00000.npz", {"sha256": "a"}), ("scene_00002.npz", {"sha256": "c"})])
+    found = manifest.read(tmp_path)["splits"]
+    assert {split: list(files) for split, files in found.items()} == {
+        "train": ["scene_00000.npz"], "test": [f"scene_0000{k}.npz" for k in range(3)],
+    }  # fmt: skip
+    assert [entry["sha256"] for entry in found["test"].values()] == ["a", "b", "c"]
+    assert manifest.listed(tmp_path, "test") == set(found["test"])

@@ -59,6 +59,16 @@ def test_roads_are_free_of_buildings_and_trunks_stand_on_the_pavement() -> None:
         assert (np.minimum(folded, scene.block_m - folded).min(axis=1) > KERB_M).all()
 
 
+@pytest.mark.parametrize(("style", "among_houses"), [("suburb", True), ("town", False), ("old_town", False)])
+def test_houses_of_a_green_style_have_gardens_and_others_leave_no_room(style: str, among_houses: bool) -> None:
+    """Where every lot is built on and every tree stands."""
+    found = block(Scene(style=style, building_density=1.0, tree_density=1.0), 0, 0)
+    inside = (found.trees[:, :2] > PAVEMENT_M).all(axis=1) & (found.trees[:, :2] < Scene().block_m - PAVEMENT_M).all(
+        axis=1
+    )
+    assert inside.any() == among_houses
+
+
 def test_a_denser_town_keeps_what_the_sparser_one_has() -> None:
     sparse, dense = block(Scene(parked_density=0.2), 0, 0), block(Scene(parked_density=0.8), 0, 0)
     assert {tuple(p) for p in sparse.parked} < {tuple(p) for p in dense.parked}

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from sortie.perception.metrics.ap import Matched
+from sortie.perception.study import run as study_run
 from sortie.perception.study.measure import StudyRow, from_table, optimal_f1, threshold, to_table
 from sortie.perception.study.plan import PLAN, read_plan
 from sortie.perception.study.report import FixedSettings, StudyRows, answers, flips, on_frames, report, sign
@@ -141,3 +143,32 @@ def test_every_network_that_ships_is_in_the_plan() -> None:
     assert {p.stem for p in SHIPPED.glob("*.safetensors")} <= jobs
     assert weights_of("full-0", SHIPPED) is not None
     assert weights_of("fool-0", SHIPPED) is None
+
+
+def test_a_network_is_measured_at_each_density_and_its_threshold_is_found_on_scenes_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, str, int | None]] = []
+
+    class Found:
+        def matched(self, *_: Any) -> list[Any]:
+            return []
+
+    def make_split(bench: Any, split: str, root: Path, *, scenes: int | None = None) -> list[Path]:
+        asked.append((bench.difficulty.density, split, scenes))
+        return []
+
+    stand_ins: dict[str, Any] = {
+        "make_split": make_split, "load_frames": lambda paths: paths, "evaluate": lambda *_, **__: Found(),
+        "optimal_f1": lambda *_: "f1", "rows_of": lambda *a: [(a[3], a[5])], "CarNetInstrument": lambda net: net,
+        "load_weights": lambda path: path, "weights_of": lambda job, *_: Path(job),
+    }  # fmt: skip
+    for name, made in stand_ins.items():
+        monkeypatch.setattr(study_run, name, made)
+    plan = read_plan(PLAN)
+    rows = [rows for _, rows in study_run.measure(plan, tmp_path, tmp_path, frames=7)]
+    densities = plan.measured.densities
+    assert len(densities) > 1
+    assert rows[0] == [(density, "f1") for density in densities]
+    assert asked[: len(densities) + 1] == [("default", "tau", None), *((density, "test", 7) for density in densities)]
+    assert rows[1:] == [[("default", "f1")]] * (len(list(plan.jobs())) - 1)

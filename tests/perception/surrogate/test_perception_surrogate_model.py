@@ -18,7 +18,7 @@ from scipy.special import expit
 from sortie.perception.scene.height_field import CAR_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.draws import BANDS
-from sortie.perception.surrogate.exchange import FUSED_COVARIATES, FeatureShares, covariates, pair
+from sortie.perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES, FeatureShares, covariates, pair
 from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Eyes
 from sortie.perception.surrogate.fit import BANDS as QUANTILES
 from sortie.perception.surrogate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
@@ -333,6 +333,18 @@ def test_false_alarms_beyond_what_was_fitted_are_those_at_its_edge(parameters: P
     beyond = ends + np.array([[-10.0], [10.0]], np.float32)
     np.testing.assert_array_equal(parameters.alarm_rates(beyond), parameters.alarm_rates(ends))
     assert parameters.alarm_rates(ends).sum(axis=1).max() < 300
+
+
+def test_late_and_moving_act_together_as_far_as_each_was_fitted(parameters: Parameters) -> None:
+    late, moving, gone = (ALARM_COVARIATES.index(name) for name in ("late", "moving", "gone"))
+    low, high = parameters.alarm_range
+    within = np.tile((low + high) / 2, (3, 1)).astype(np.float32)
+    within[:, late], within[:, moving] = high[late], high[moving] / 2
+    within[:, gone] = within[:, late] * within[:, moving]
+    beyond = within.copy()
+    beyond[:, late] = 2 * high[late]
+    beyond[:, gone] = beyond[:, late] * beyond[:, moving]
+    np.testing.assert_array_equal(parameters.alarm_rates(beyond), parameters.alarm_rates(within))
 
 
 def test_as_many_bands_are_counted_as_a_moment_has_draws_for() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -178,6 +179,16 @@ def test_what_is_sent_are_the_best_twelve_confirmed_tracks_of_the_region_at_the_
     assert len(content(tracker.tracks, (0.0, 80.0, 5.0), (0.0, 0.0), 1.5)) == 0
     moved = content(driving(), None, (0.0, 0.0), 4.0)
     assert moved.xy_m[moved.xy_m[:, 1] < 10.0, 0] == pytest.approx(32.0, abs=0.3)
+
+
+def test_of_more_than_twelve_tracks_the_surest_are_sent_the_surest_first() -> None:
+    tracker = One()
+    row = [(10.0 * k, 0.0) for k in range(16)]
+    for t_s in (0.0, 0.5, 1.0):
+        tracker.look(t_s, boxes(*row))
+    score = np.linspace(0.3, 0.9, 16)[np.arange(16) * 5 % 16]
+    sent = content(replace(tracker.tracks, score=score), None, (0.0, 0.0), 1.0)
+    assert sent.score == pytest.approx(np.sort(score)[:3:-1], abs=0.003)
 
 
 def test_received_tracks_go_on_and_what_stands_stays() -> None:
