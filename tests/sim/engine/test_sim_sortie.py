@@ -282,6 +282,17 @@ def test_a_battery_fault_takes_its_energy_and_is_in_the_ledger() -> None:
     assert o["battery"]["1"] < 0.6 < o["battery"]["0"]
 
 
+def test_a_battery_fault_takes_a_share_of_what_is_left_at_its_moment() -> None:
+    """Between two frames too: what was spent until then is booked to what spent it."""
+    fault = "events=[{kind: battery_fault, drone: 1, at_s: 2.07, lost_fraction: 1}]"
+    ledgers = [
+        {r["cause"]: r["energy_j"] for r in run_sortie(example(*sets)).tables["energy"].to_pylist() if r["drone"] == 1}
+        for sets in (("duration_s=3", fault), ("duration_s=2.07",))
+    ]
+    for cause in ("rotor", "avionics", "ohmic"):
+        assert ledgers[0][cause] == pytest.approx(ledgers[1][cause], rel=1e-6)
+
+
 @pytest.mark.parametrize("fault", ["battery_fault, lost_fraction: 0.5", "cell_failure"])
 def test_a_drone_that_left_the_air_loses_no_energy(fault: str) -> None:
     events = f"events=[{{kind: drone_lost, drone: 1, at_s: 2}}, {{kind: {fault}, drone: 1, at_s: 3}}]"

@@ -28,7 +28,9 @@ from sortie.sim.export.foxglove import layout
 from sortie.sim.export.messages import descriptors
 from sortie.sim.results import run_folder
 from sortie.sim.results.flown_scene import houses, scene_of
+from sortie.sim.results.link_traffic import LinkTraffic
 from sortie.sim.results.outcome import outcome
+from sortie.sim.results.palette import goodput_colours
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words
 
@@ -237,6 +239,23 @@ def test_the_scene_shows_cars_region_links_and_boxes(bag: Bag, record: SortieRec
     rows = [f for f in record.tables["fusions"].to_pylist() if f["drone"] == 2]
     for (_, (_, *each)), row in zip(boxes[2], rows, strict=True):
         assert sum(m.ns in ("found", "false") for m in each) == row["detections"]
+
+
+def test_a_link_has_the_colour_of_its_own_direction_from_the_end_of_its_sender(bag: Bag, record: SortieRecord) -> None:
+    states = record.tables["states"]
+    t_s = states["t_s"].to_numpy()[::5]
+    at_m = np.stack([states[name].to_numpy().reshape(-1, 5) for name in ("x_m", "y_m", "z_m")], axis=-1)
+    tables = record.tables["descriptors"], record.tables["transmissions"]
+    goodput, _ = LinkTraffic(5, record.scenario.context.rate_hz).add(t_s, *tables)
+    stamp_ns, message = bag["/scene/links"][-1]
+    (k,) = np.flatnonzero(np.isclose(t_s, stamp_ns * 1e-9))
+    links = message.markers[1]
+    ends = np.array([(p.x, p.y, p.z) for p in links.points])
+    sender, receiver = np.linalg.norm(ends[:, None] - at_m[k], axis=-1).argmin(axis=1).reshape(-1, 2).T
+    assert len(set(zip(sender.tolist(), receiver.tolist(), strict=True))) == 20
+    colours = np.array([(c.r, c.g, c.b, c.a) for c in links.colors])[::2] * 255
+    assert colours == pytest.approx(goodput_colours(goodput[k, sender, receiver]).astype(float), abs=0.01)
+    assert not np.allclose(colours, goodput_colours(goodput[k, receiver, sender]))
 
 
 def test_a_jammer_is_shown_while_it_is_on(tmp_path: Path) -> None:

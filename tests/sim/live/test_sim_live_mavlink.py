@@ -274,3 +274,19 @@ def test_a_key_needs_telemetry_and_an_owner(tmp_path: Path) -> None:
     path.chmod(0o644)
     done = CliRunner().invoke(app, ["live", "--mavlink", "udpin:127.0.0.1:0", "--mavlink-key", str(path)])
     assert "its mode is 644, must be 600" in str(done.exception)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_telemetry_ages_in_periods_of_a_descriptor(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = example("fleet.drones=2", f"context.publish_every={every}")
+    link = MavlinkLink("udpin:127.0.0.1:0", None)
+    link.close()
+    senses = MavlinkSenses(link, ReplaySenses(scenario, 0, traces(scenario)[0], 0.0), 0, lambda text: None)
+    senses.begin(0.0, rules_of(scenario, 0.0, 6.0))
+    link.state = link.state._replace(position_s=100.0, attitude_s=100.0)
+    muted = []
+    for periods in (9.5, 10.5):
+        monkeypatch.setattr(platform.time, "monotonic", lambda p=periods: 100.0 + p * 0.1 * every)
+        senses.sense(0)
+        muted.append(senses.muted)
+    assert muted == [False, True]

@@ -184,6 +184,25 @@ def test_a_drone_on_the_ground_hears_nothing() -> None:
     assert memory.peers == [0]
 
 
+def test_each_link_loses_descriptors_by_draws_of_its_own() -> None:
+    bus, scenario = MemoryBus(), example("fleet.drones=4")
+    rules, view = rules_of(scenario, 0.0, 6.0), fleet_of(4)
+    nodes = [LiveNode(bus, Seals(None), drone, 4, seed=0, loss=0.5) for drone in range(4)]
+    for node in nodes:
+        node.fly(Fixed(), PeerMemory(node.drone, rules, DroneStatus()), rules, lambda: (1.0,) * 3)  # type: ignore[arg-type]
+    lost: dict[tuple[int, int], list[int]] = {}
+    for k in range(60):
+        for sender in range(4):
+            bus.writer(CONTEXT).write(encode_descriptor(view.descriptors[sender]._replace(stamp_ns=10**9 + k)))
+            for node in nodes:
+                before = node.report(0.0).lost
+                node.take()
+                if node.drone != sender:
+                    lost.setdefault((sender, node.drone), []).append(node.report(0.0).lost - before)
+    assert len({tuple(each) for each in lost.values()}) == 12
+    assert all(15 < sum(each) < 45 for each in lost.values())
+
+
 def test_a_drone_that_does_not_know_where_it_is_shakes_no_hands() -> None:
     bus, scenario = MemoryBus(), example("fleet.drones=2")
     node = LiveNode(bus, Seals(None), 1, 2, seed=0)
