@@ -278,6 +278,17 @@ def test_a_make_s_codebook_is_its_own_or_that_of_the_same_network(make: dict[str
     assert [network.codebook for network in networks] == ["fleet.cb", codebook, "fleet.cb"]
 
 
+def test_an_override_changes_one_value_of_what_a_drone_s_make_gives_it() -> None:
+    fleet = scenario(
+        "fleet:\n  drones: 3\n  airframe: {mass_kg: 3.0, payload_kg: 0.5}\n"
+        "  makes: [{name: small, drones: [1, 2], airframe: {mass_kg: 1.0, disc_area_m2: 0.2}}]\n"
+        "  overrides: [{drone: 0, payload_kg: 0.1}, {drone: 1, payload_kg: 0.3}]"
+    ).fleet
+    assert [(a.mass_kg, a.disc_area_m2, a.payload_kg) for a in fleet.airframes] == [
+        (3.0, 0.503, 0.1), (1.0, 0.2, 0.3), (1.0, 0.2, 0.0),
+    ]  # fmt: skip
+
+
 def test_a_delay_of_zero_is_a_delay() -> None:
     made = scenario(
         "perception: {detector: none, compute_delay_s: 0.05}\nfleet: {drones: 3, makes: [{name: a, drones: [1], compute_delay_s: 0}]}"
