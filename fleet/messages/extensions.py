@@ -118,7 +118,8 @@ def _decode_roster(value: bytes) -> Roster:
     bits = int.from_bytes(value[4:], "little")
     if len(value) < 5 or not value[-1] or bits >> MAX_AGENT_ID + 1:
         wanted = f"an epoch of 4 B and the bits of ids up to {MAX_AGENT_ID}, the last byte not 0"
-        raise MalformedDatagram(f"roster is {reprlib.repr(value.hex())}, must be {wanted}")
+        has = value.hex() if len(value) <= 5 + MAX_AGENT_ID // 8 else f"{len(value)} B"
+        raise MalformedDatagram(f"roster is {has}, must be {wanted}")
     return Roster(int.from_bytes(value[:4], "little"), tuple(i for i in range(bits.bit_length()) if bits >> i & 1))
 
 
