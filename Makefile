@@ -7,7 +7,7 @@ SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
 
 
-.PHONY: help sortie screenshot test test-all lint check format bench bench-all figures validate-ns3 ns3 mutate clean scenarios notebooks outputs fuzz docs test-lowest
+.PHONY: help sortie screenshot test test-all lint check format bench bench-all figures validate-ns3 ns3 mavproxy mutate clean scenarios notebooks outputs fuzz docs test-lowest
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -84,6 +84,10 @@ validate-ns3: ns3 ## run the same plans through ns-3 and through the radio, and 
 
 ns3: $(STAMP) ## install ns-3's wheel (Linux on x86-64; 450 MB)
 	$(BIN)/python -m pip install --quiet --retries 1 -c constraints.txt -e '.[ns3]'
+
+mavproxy: ## install the ground station MAVProxy in .venv-mavproxy, for its test
+	test -x .venv-mavproxy/bin/python || $(PYTHON) -m venv .venv-mavproxy
+	.venv-mavproxy/bin/python -m pip install --quiet --retries 1 MAVProxy
 
 mutate: $(STAMP) ## change the code that decides figures in small ways, and count what no test notices (hours; MUTATE="--room fleet --sample 5")
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[mutate]'

@@ -1,6 +1,6 @@
 """MAVProxy, a ground station on a terminal, joins a flying fleet; it is heavy, and these tests are skipped where it is missing.
 
-`pipx install MAVProxy` installs it with an environment of its own.
+`make mavproxy` installs it in an environment of its own, and so does `pipx install MAVProxy`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ import time
 from pathlib import Path
 
 import pytest
+from places import ROOT
 from sim_examples import example
 
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.telemetry import MavlinkEndpoint
 
-MAVPROXY = shutil.which("mavproxy.py")
+MAVPROXY = shutil.which("mavproxy.py") or shutil.which(ROOT / ".venv-mavproxy/bin/mavproxy.py")
 pytestmark = pytest.mark.skipif(MAVPROXY is None, reason="MAVProxy is not installed")
 PATIENCE_S = 60.0
 
