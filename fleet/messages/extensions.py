@@ -76,17 +76,19 @@ class ExtensionField(NamedTuple):
 
 def _encode_feature_space(name: str) -> bytes:
     if not _FEATURE_SPACE.fullmatch(name):
-        raise ValueError(f"feature_space is {reprlib.repr(name)}, must be 1 to 32 letters, digits or any of _ . + -")
+        raise ValueError(_not_a_feature_space(name))
     return name.encode("ascii")
 
 
 def _decode_feature_space(value: bytes) -> str:
     name = value.decode("ascii", "replace")
     if not _FEATURE_SPACE.fullmatch(name):
-        raise MalformedDatagram(
-            f"feature_space is {reprlib.repr(name)}, must be 1 to 32 letters, digits or any of _ . + -"
-        )
+        raise MalformedDatagram(_not_a_feature_space(name))
     return name
+
+
+def _not_a_feature_space(name: str) -> str:
+    return f"feature_space is {reprlib.repr(name)}, must be 1 to 32 letters, digits or any of _ . + -"
 
 
 def _encode_roster(roster: Roster) -> bytes:
