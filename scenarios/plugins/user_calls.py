@@ -117,7 +117,7 @@ def is_guarded(function: Callable[..., Any]) -> bool:
 def watched(limit_s: float, limit: str = "") -> Iterator[None]:
     """Limit every guarded call of this thread within the block; an outer block of the same thread gives way to it.
 
-    In the main thread, the working folder is the same afterwards, so that paths of the command still mean the same.
+    In the main thread, a call leaves the working folder as it was, so that paths of the command still mean the same.
 
     Args:
         limit_s: wall-clock time for one call.
@@ -128,14 +128,11 @@ def watched(limit_s: float, limit: str = "") -> Iterator[None]:
     _WATCHES[thread] = watch = _Watch(thread, limit_s, limit or f"{limit_s:g} s")
     if outer is not None:
         watch.late = outer.late
-    here = Path.cwd() if threading.current_thread() is threading.main_thread() else None
     watch.start()
     try:
         yield
     finally:
         watch.stop()
-        if here is not None:
-            os.chdir(here)
         if outer is None:
             del _WATCHES[thread]
         else:
@@ -164,6 +161,8 @@ class _Watch:
         self._error = f"a call of the policy does not return within {limit}, and cannot be interrupted"
         self._ticks = 0
         self._lock, self._over = threading.Lock(), threading.Event()
+        main = threading.current_thread() is threading.main_thread()
+        self._here = os.getcwd() if main else None  # of the whole process: no other thread may move it
 
     def start(self) -> None:
         self._beat = _beat_of_process() if _ends_process else None
@@ -178,6 +177,7 @@ class _Watch:
         self._counter.join()
         if self._beat is not None:
             self._beat.rest()
+        self._return()  # from a call that has no limit
 
     def begin(self) -> None:
         with self._lock:
@@ -186,6 +186,11 @@ class _Watch:
     def end(self) -> None:
         with self._lock:
             self.calling = False
+        self._return()
+
+    def _return(self) -> None:
+        if self._here is not None and _working_folder() != self._here:
+            os.chdir(self._here)
 
     def _count(self) -> None:
         while not self._over.wait(TICK_S):
@@ -228,6 +233,13 @@ class _Beat:
     def _close(self) -> None:
         self._process.kill()
         self._process.communicate()
+
+
+def _working_folder() -> str | None:
+    try:
+        return os.getcwd()
+    except FileNotFoundError:  # it was removed
+        return None
 
 
 @functools.cache

@@ -144,6 +144,29 @@ def test_each_call_has_the_whole_limit() -> None:
             assert short() is False
 
 
+@pytest.mark.parametrize("gone", [False, True])
+def test_each_call_leaves_the_working_folder_as_it_was(
+    gone: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one that removes the folder it moved to. Without a limit the block's end does it."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+
+    def moves() -> None:
+        elsewhere = tmp_path / "elsewhere"
+        elsewhere.mkdir()
+        os.chdir(elsewhere)
+        if gone:
+            elsewhere.rmdir()
+
+    with watched(5.0):
+        guarded(moves)()
+        assert Path.cwd() == here
+        os.chdir(tmp_path)  # as a call does that has no limit
+    assert Path.cwd() == here
+
+
 def test_calls_of_other_threads_go_on() -> None:
     done = []
     other = threading.Thread(target=lambda: done.append(guarded(lambda: threading.Event().wait(0.6))()))
