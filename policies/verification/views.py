@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -32,6 +32,7 @@ GONE = "detached_after_periods"
 OTHER_CODEBOOK = "0" * 14
 """A digest that is not the fleet's common one: 7 bytes, as a descriptor has them."""
 
+Drawn = TypeVar("Drawn")
 _SPECIAL_SOC = (0.0, 0.05, 0.2999, 0.3, 0.5, 0.5999, 0.6, 1.0)
 _SPECIAL_GOODPUT_MBPS = (0.0, SILENT_MBPS, PROBED_MBPS, 0.01, 4.99, 5.0, 50.0, 600.0, 1e5)
 _SPECIAL_AGE_PERIODS = (0.0, 1.0, 3.0, 3.1, 10.0, 10.1, 600.0)
@@ -59,20 +60,20 @@ def draw_view(seed: int, number: int, drones: int | None = None) -> FleetView:
     n = int(rng.integers(1, MAX_DRONES + 1)) if rng.random() < 0.5 else int(rng.integers(1, 6))
     n = n if drones is None else drones
     ego = int(rng.integers(n))
-    reach = float(rng.choice([1.0, 0.7]))
+    reach = _one_of(rng, (1.0, 0.7))
     heard = [i for i in range(n) if i == ego or rng.random() < reach]
     rng.shuffle(heard)
-    period_s = float(rng.choice(_PERIODS_S))
-    spread_m = float(rng.choice([0.0, 30.0, 100.0, 2000.0]))
+    period_s = _one_of(rng, _PERIODS_S)
+    spread_m = _one_of(rng, (0.0, 30.0, 100.0, 2000.0))
     descriptors = {i: _draw_descriptor(rng, i, n, spread_m) for i in heard}
     age_s = {i: period_s * _mixed(rng, 0.0, 15.0, _SPECIAL_AGE_PERIODS) for i in heard}
     if rng.random() < 0.25:  # two makes of drone in one fleet
-        descriptors = {i: d._replace(feature_space=str(rng.choice(["", "other"]))) for i, d in descriptors.items()}
+        descriptors = {i: d._replace(feature_space=_one_of(rng, ("", "other"))) for i, d in descriptors.items()}
     if rng.random() < 0.25:  # all agree who is a member, heard by the ego or not
         members = tuple(i for i in range(n) if i in descriptors or rng.random() < 0.5)
         descriptors = {i: d.with_roster(Roster(int(rng.integers(9)), members)) for i, d in descriptors.items()}
     if rng.random() < 0.25:  # and some codes are of another codebook
-        descriptors = {i: d._replace(codebook=str(rng.choice(["", OTHER_CODEBOOK]))) for i, d in descriptors.items()}
+        descriptors = {i: d._replace(codebook=_one_of(rng, ("", OTHER_CODEBOOK))) for i, d in descriptors.items()}
     return FleetView(ego, period_s, descriptors, age_s)
 
 
@@ -86,14 +87,14 @@ def _draw_descriptor(rng: np.random.Generator, agent_id: int, drones: int, sprea
     region = None
     if rng.random() < 0.5:
         away_m = 0.0 if rng.random() < 0.5 else 3000.0  # the region is here, or far from everyone
-        region = Disc(spread_m * x_m + away_m, spread_m * y_m, float(rng.choice([1.0, 32.0, 500.0])))
+        region = Disc(spread_m * x_m + away_m, spread_m * y_m, _one_of(rng, (1.0, 32.0, 500.0)))
     return Descriptor(
         stamp_ns=int(rng.integers(0, 10**12)),
         agent_id=agent_id,
         position_m=(spread_m * x_m, spread_m * y_m, float(rng.uniform(0, 120))),
         orientation_xyzw=(0.0, 0.0, math.sin(yaw), math.cos(yaw)),
         velocity_mps=(20 * vx_mps, 20 * vy_mps, 0.0),
-        footprint_radius_m=float(rng.choice([0.0, 20.0, 42.0, 100.0])),
+        footprint_radius_m=_one_of(rng, (0.0, 20.0, 42.0, 100.0)),
         battery_soc=_mixed(rng, 0.0, 1.0, _SPECIAL_SOC),
         cpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
         gpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
@@ -102,12 +103,17 @@ def _draw_descriptor(rng: np.random.Generator, agent_id: int, drones: int, sprea
         novelty_flags=int(rng.integers(8)),
         task_phase=TaskPhase(int(rng.integers(len(TaskPhase)))),
         region=region,
-        priority_target_ids=tuple(rng.integers(0, 1000, int(rng.choice([0, 0, 1, 5]))).tolist()),
+        priority_target_ids=tuple(rng.integers(0, 1000, _one_of(rng, (0, 0, 1, 5))).tolist()),
     )
 
 
+def _one_of(rng: np.random.Generator, values: Sequence[Drawn]) -> Drawn:
+    """What `rng.choice` draws, without its array."""
+    return values[int(rng.integers(len(values)))]
+
+
 def _mixed(rng: np.random.Generator, low: float, high: float, special: tuple[float, ...]) -> float:
-    return float(rng.uniform(low, high)) if rng.random() < 0.5 else float(rng.choice(special))
+    return float(rng.uniform(low, high)) if rng.random() < 0.5 else _one_of(rng, special)
 
 
 # --- shrinking -----------------------------------------------------------------------------------
