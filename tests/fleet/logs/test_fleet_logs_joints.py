@@ -71,7 +71,14 @@ def test_the_first_estimator_is_taken() -> None:
 
 def test_a_place_on_the_equator_or_the_zero_meridian_is_a_place() -> None:
     """Both zero is what a vehicle says that knows no place."""
-    fixes = {"lat": [0, 0, 1000], "lon": [0, 2000, 0], "alt": [5000] * 3, "vx": [100] * 3, "vy": [200] * 3, "vz": [-50] * 3}
+    fixes = {
+        "lat": [0, 0, 1000],
+        "lon": [0, 2000, 0],
+        "alt": [5000] * 3,
+        "vx": [100] * 3,
+        "vy": [200] * 3,
+        "vz": [-50] * 3,
+    }
     log = assembled("MAVLink", GLOBAL_POSITION_INT=fixes)
     assert log.fix is not None
     assert log.velocity is not None
@@ -80,7 +87,11 @@ def test_a_place_on_the_equator_or_the_zero_meridian_is_a_place() -> None:
 
 
 def test_a_vehicle_that_does_not_measure_its_current_has_none() -> None:
-    status = {"voltage_battery": [16_000, 65_535, 15_000], "current_battery": [-1, 100, 1500], "battery_remaining": [-1, 50, 40]}
+    status = {
+        "voltage_battery": [16_000, 65_535, 15_000],
+        "current_battery": [-1, 100, 1500],
+        "battery_remaining": [-1, 50, 40],
+    }
     log = assembled("MAVLink", SYS_STATUS=status)
     assert log.battery is not None
     assert log.charge is not None
@@ -90,7 +101,9 @@ def test_a_vehicle_that_does_not_measure_its_current_has_none() -> None:
 
 def test_a_signal_that_is_not_known_is_none() -> None:
     log = assembled(
-        "ULog", input_rc={"rssi": [-1, 80, 90]}, battery_status={"voltage_v": [16.0], "current_a": [1.0], "remaining": [0.5]}
+        "ULog",
+        input_rc={"rssi": [-1, 80, 90]},
+        battery_status={"voltage_v": [16.0], "current_a": [1.0], "remaining": [0.5]},
     )
     assert log.rssi is not None
     assert log.rssi.values[:, 0].tolist() == [80.0, 90.0]
@@ -170,7 +183,9 @@ def test_places_side_by_side_are_moved_by_the_median_of_their_fixes() -> None:
     fixes[4:, 0] += 0.0009  # it was carried 100 m north before its estimator began, at 4 s
     fixes[4, 0] += 0.01
     time_s = np.arange(9.0)
-    anchor = flight("a.log", 1, fix=Series(time_s, np.tile([47.0, 8.0, 400.0], (9, 1))), position=series(time_s, *[[0.0] * 9] * 3))
+    anchor = flight(
+        "a.log", 1, fix=Series(time_s, np.tile([47.0, 8.0, 400.0], (9, 1))), position=series(time_s, *[[0.0] * 9] * 3)
+    )
     other = flight("a.log", 2, fix=Series(time_s, fixes), position=series(time_s[4:], *[[0.0] * 5] * 3))
     _, placed = beside([anchor, other])
     assert placed.position is not None
@@ -179,8 +194,15 @@ def test_places_side_by_side_are_moved_by_the_median_of_their_fixes() -> None:
 
 def test_a_vehicle_whose_fixes_all_lie_outside_its_places_is_placed_by_the_nearest() -> None:
     time_s = np.arange(5.0)
-    anchor = flight("a.log", 1, fix=Series(time_s, np.tile([47.0, 8.0, 400.0], (5, 1))), position=series(time_s, *[[0.0] * 5] * 3))
-    other = flight("a.log", 2, fix=Series(time_s, np.tile([47.0, 8.0, 410.0], (5, 1))), position=series([7.0, 8.0], *[[0.0] * 2] * 3))
+    anchor = flight(
+        "a.log", 1, fix=Series(time_s, np.tile([47.0, 8.0, 400.0], (5, 1))), position=series(time_s, *[[0.0] * 5] * 3)
+    )
+    other = flight(
+        "a.log",
+        2,
+        fix=Series(time_s, np.tile([47.0, 8.0, 410.0], (5, 1))),
+        position=series([7.0, 8.0], *[[0.0] * 2] * 3),
+    )
     _, placed = beside([anchor, other])
     assert placed.position is not None
     np.testing.assert_allclose(placed.position.values, [[0.0, 0.0, 10.0]] * 2, atol=1e-6)
@@ -271,15 +293,24 @@ def test_a_drone_answers_messages_to_itself_and_to_all() -> None:
 
 
 def test_a_parameter_is_asked_for_by_its_place_or_by_its_name() -> None:
-    for index, name, wanted in ((0, b"SECOND", "FIRST"), (1, b"", "SECOND"), (-1, b"SECOND", "SECOND"), (2, b"FIRST", None)):
-        said = answers(mavlink2.MAVLink_param_request_read_message(3, 1, name, index), 2, {"FIRST": 1.0, "SECOND": 2.0}, {})
+    for index, name, wanted in (
+        (0, b"SECOND", "FIRST"),
+        (1, b"", "SECOND"),
+        (-1, b"SECOND", "SECOND"),
+        (2, b"FIRST", None),
+    ):
+        said = answers(
+            mavlink2.MAVLink_param_request_read_message(3, 1, name, index), 2, {"FIRST": 1.0, "SECOND": 2.0}, {}
+        )
         assert [str(m.param_id).rstrip("\0") for m in said] == ([] if wanted is None else [wanted])
 
 
 def test_a_station_of_the_fleet_is_never_armed_and_courses_are_from_north() -> None:
     landed = replace(examples.state(3), landed=False, ground_station=True)
     parser = mavlink2.MAVLink(None)
-    said = [m for each in messages(landed, examples.ORIGIN) for m in parser.parse_buffer(Transmitter(0).pack(each)) or []]
+    said = [
+        m for each in messages(landed, examples.ORIGIN) for m in parser.parse_buffer(Transmitter(0).pack(each)) or []
+    ]
     assert said[0].base_mode == 0
     by_name = {m.get_type(): m for m in messages(examples.state(3), examples.ORIGIN)}
     assert by_name["GPS_RAW_INT"].cog == round(math.degrees(math.atan2(3, 4)) * 100)  # 3 m/s east, 4 m/s north
