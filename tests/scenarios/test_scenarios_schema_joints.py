@@ -215,7 +215,7 @@ def test_a_shield_needs_an_invariant_that_says_something() -> None:
 
 def test_bounds_may_meet_and_may_not_cross() -> None:
     assert Expectation(metric="a", at_least=0.5, at_most=0.5)
-    with pytest.raises(ValueError, match="at_most = 0.4"):
+    with pytest.raises(ValueError, match=r"at_most = 0\.4"):
         Expectation(metric="a", at_least=0.5, at_most=0.4)
     assert scenario("expect_decisions: [{drone: 0, from_s: 3, until_s: 3}]")
     refused("expect_decisions: [{drone: 0, from_s: 3, until_s: 2.9}]", "until_s: 2.9")
