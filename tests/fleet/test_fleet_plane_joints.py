@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from agent_rig import Rig, capture, descriptor, memory, payload
 
+from sortie.fleet.chart import Chart
 from sortie.fleet.clock import WINDOW, PeerClocks, oscillators
 from sortie.fleet.coverage import NOTHING_SEEN, Poses, View, footprint_radius_m, placed, views
 from sortie.fleet.flight.motion import fly
@@ -28,7 +29,7 @@ from sortie.fleet.messages.auth import Opened
 from sortie.fleet.messages.compact import Form
 from sortie.fleet.messages.wire import decode_descriptor
 from sortie.fleet.peers import PeerTable
-from sortie.fleet.plane import DroneStatus, Equipment, PlaneRules
+from sortie.fleet.plane import DroneStatus, Equipment, PlaneRules, codebooks
 from sortie.fleet.senses import FlightSenses, Sensed, believed
 from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.trust import Arrival, Standing, battery_doubt, coverage_doubt, goodput_doubt, judge
@@ -242,6 +243,26 @@ def test_a_link_that_pauses_keeps_its_slots() -> None:
     assert len(gate.due(11.0)) == 1
 
 
+def test_a_codebook_that_a_make_shares_with_the_fleet_is_the_fleet_s() -> None:
+    """It has no name of its own, wherever it lies; the file need not be there to see that."""
+    shared = loads(
+        "name: shared\nperception: {codebook: none/c.safetensors}\n"
+        "fleet: {makes: [{name: own, drones: [1], codebook: none/c.safetensors}]}"
+    )
+    assert codebooks(shared) == ("",) * 5
+
+
+def test_what_was_told_is_known_although_a_peer_knew_it_first() -> None:
+    """The peer may be out of hearing by the next look."""
+    grid, chart = b"\xaa" * 64, Chart()
+    claim = descriptor(1, position_m=(0.0, 0.0, 60.0), coverage_grid=grid)
+    at = (-8, -8)
+    assert chart.mark(grid, *at, lambda: [claim], False) == (grid, False)
+    assert chart.mark(grid, *at, lambda: [], False)[1]  # it was not told yet
+    assert chart.mark(grid, *at, lambda: [claim], True) == (grid, False)
+    assert chart.mark(grid, *at, lambda: [], True) == (grid, False)
+
+
 # --- clocks ----------------------------------------------------------------------------------------------
 
 
@@ -261,6 +282,20 @@ def test_an_offset_shows_by_the_listener_s_own_clock(mine_s: float, theirs_s: fl
         assert mine.clocks.offset_s.get(3, 0.0) == pytest.approx(skew_s - theirs_s, abs=0.051)
         assert (3 in mine.clocks.offset_s) == (skew_s != theirs_s)
         assert mine.ages_s(now_s + 0.4)[3] == pytest.approx(0.4, abs=0.051)
+
+
+@pytest.mark.parametrize("begins", [3, 15])
+def test_a_listener_s_clock_that_goes_wrong_in_flight_shows_too(begins: int) -> None:
+    """Its peers' stamps and arrivals are as before; its own clock is what makes their lags unusual."""
+    mine = memory()
+    for k in range(begins + WINDOW + 2):
+        now_s = 20 + 0.1 * k
+        mine.status.clock_skew_s = 2.0 if k >= begins else 0.0
+        assert mine.hear(Opened(descriptor(3, now_s), None, 0), now_s + 0.03) is None
+        if k == begins - 1:
+            assert mine.clocks.offset_s == {}
+    assert mine.clocks.offset_s == {3: pytest.approx(2.0, abs=0.051)}
+    assert mine.ages_s(now_s + 0.4)[3] == pytest.approx(0.4, abs=0.051)
 
 
 def test_a_clock_that_agrees_again_is_no_longer_watched() -> None:
