@@ -10,11 +10,14 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from radio_examples import CROSS_M, still
+from radio_flights import Hover, trace
 
 from sortie.radio.channel.antenna import antenna_loss_db
 from sortie.radio.channel.bursts import PairStates, bad_share
@@ -207,6 +210,23 @@ def test_pairs_change_once_a_step_and_lose_by_their_state() -> None:
     assert bad == pytest.approx(bad_share(0.3, 0.3), abs=0.04)
 
 
+def test_a_step_as_long_as_a_frame_is_one_in_every_frame() -> None:
+    """However the multiples of a tenth are rounded: pairs that change at each step change a hundred times."""
+    pairs = PairStates(BurstSettings(good_to_bad=1.0, bad_to_good=1.0, step_s=0.1), 3, 1, 0, 0.1)
+    states = [bool(pairs.advance()[0, 1]) for _ in range(101)]
+    assert [a != b for a, b in pairwise(states)] == [True] * 100
+
+
+@pytest.mark.parametrize("rows", [("0,0,1,,0,", "0,1,0,,0,"), ("0,0,1,,,30", "0,1,0,,,30")])
+def test_descriptors_of_links_that_are_traced_both_ways_go_by_the_trace(rows: tuple[str, ...], tmp_path: Path) -> None:
+    """However weak the model's signal is there: neither link is the other's way back."""
+    settings = AirSettings(shadowing_sigma_db=0.0, tx_power_dbm=-60.0, trace=trace(tmp_path, *rows))
+    flight = Hover(settings)
+    flight.fly(1.0, lambda k: [flight.publish(i) for i in (0, 1)])
+    assert [ids for _, _, ids in flight.heard] == [(1 - who,) for _, who, _ in flight.heard]
+    assert len(flight.heard) == 20
+
+
 # --- the channel ---------------------------------------------------------------------------------------
 
 
@@ -375,6 +395,18 @@ def test_a_traced_goodput_is_that_of_its_own_class_of_traffic(name: str) -> None
     assert Service(few, -88.0).use(0, 1, 0.0, 30.0, 30.0, False, LinkNow(0.0, math.nan, 300.0)).link.frames <= 64
 
 
+def test_a_sample_was_given_the_channel_in_all_its_passes(tmp_path: Path) -> None:
+    """Repairs included: what its sender has transmitted, it was given at least, and no more than passed meanwhile."""
+    settings = AirSettings(retry_limit=0, trace=trace(tmp_path, "0,0,1,,0.5,", "0,1,0,,0,"))
+    flight = Hover(settings)
+    flight.air.advance()
+    flight.send(0, 1, 40_000, reliable=True, deadline_s=2.0)
+    flight.env.run(until=2.0)
+    (row,) = flight.rows
+    assert row.repairs > 1
+    assert flight.air.airtime_s[0] <= row.airtime_s < row.t_done_s - row.t_start_s
+
+
 def test_a_measurement_begins_anew_with_another_rate_alone() -> None:
     service = Service(CALM, -88.0)
     s = sample(3000, 3)
@@ -415,6 +447,14 @@ def test_a_route_has_no_more_hops_than_are_left_and_a_direct_link_wins_a_tie() -
     assert routes.path(0, 3) == [0, 2, 3]
     routes.renew(np.where(cost == 1.0, 50.0, np.where(cost > 0, 1.0, 0.0)))
     assert routes.path(0, 3) == [0, 1, 2, 3]
+    row = np.array([[{0: 0.0, 1: 100.0, 2: 12.0, 3: 5.0, 4: 2.0}[abs(i - j)] for j in range(5)] for i in range(5)])
+    routes.renew(row)
+    path, left = [0], 3
+    while path[-1] != 4:
+        path.append(routes.next_hop(path[-1], 4, left))
+        left -= 1
+    assert routes.path(0, 4) == path
+    assert len(path) == 4
     two = Routes(2)
     two.renew(np.where(cost == 1.0, 50.0, np.where(cost > 0, 1.0, 0.0)))
     assert len(two.path(0, 3)) <= 3
