@@ -91,7 +91,7 @@ def test_near_the_edge_a_drone_turns_to_the_middle_of_its_own_fence() -> None:
     """Of a fence that does not hold the origin in its middle."""
     fence = {"west_m": 0.0, "south_m": -50.0, "east_m": 600.0, "north_m": 550.0}
     way = gauss_markov(
-        np.arange(60.0, 600.0, 5.0), np.tile([300.0, 250.0, 60.0], (8, 1)), np.random.default_rng(3), **fence,
+        np.arange(60.0, 400.0, 5.0), np.tile([300.0, 250.0, 60.0], (6, 1)), np.random.default_rng(3), **fence,
         margin_m=150.0,
     )  # fmt: skip
     mean = way[..., :2].mean(axis=(0, 1))
