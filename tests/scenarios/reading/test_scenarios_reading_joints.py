@@ -220,6 +220,7 @@ def test_a_name_with_another_unit_is_the_nearest() -> None:
     assert nearest("altitude_ft", ["shape", "spacing_m", "altitude_m"]) == "altitude_m"
     assert nearest("altitude", ["shape", "altitude_m"]) == "altitude_m"
     assert nearest("spacing", ["pose_spacing_x", "altitude_m"]) == "pose_spacing_x"
+    assert nearest("loss_furlongs", ["cross_furlong", "loss_db"]) == "loss_db"  # and not the one that is spelt alike
     assert nearest("zzz", ["shape"]) is None
 
 
