@@ -25,6 +25,7 @@ from sortie.policies.catalogue.coverage_cells import centre_cell, disc_around
 from sortie.policies.catalogue.other_representations import codes, uncertain_boxes
 from sortie.policies.catalogue.prior.where2comm import where2comm
 from sortie.policies.catalogue.vantage import NEAR_M, over_region, vantage
+from sortie.policies.catalogue.worked import worked
 from sortie.policies.checks import check_reposition, find_inexact
 from sortie.policies.contract import (
     PERSON_FLAG,
@@ -36,11 +37,17 @@ from sortie.policies.contract import (
     Representation,
     TaskPhase,
 )
+from sortie.policies.damping import SAME_DISC_M, is_switch
 from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.registry import modules_of, own_fusion, resolve, viewpoint_of, within_budget
 from sortie.scenarios.plugins.user_calls import Guarded
 
 VIEW = fleet_of(4)
+
+
+def _pickled(view: FleetView) -> FleetView:
+    found: FleetView = pickle.loads(pickle.dumps(view))  # noqa: S301 - written a moment before
+    return found
 
 
 def _with(view: FleetView, drone: int, **fields: object) -> FleetView:
@@ -55,7 +62,7 @@ def test_a_frozen_view_is_read_only_throughout_and_a_copy_is_all_of_it() -> None
         view.frozen.descriptors[0] = VIEW.descriptors[1]  # type: ignore[index]
     with pytest.raises(TypeError):
         view.frozen.age_s[0] = 1.0  # type: ignore[index]
-    for other in (pickle.loads(pickle.dumps(view.frozen)), copy.deepcopy(view.frozen), copy.copy(view.frozen)):
+    for other in (_pickled(view.frozen), copy.deepcopy(view.frozen), copy.copy(view.frozen)):
         assert other == view
         assert (type(other.descriptors), type(other.age_s)) == (dict, dict)
 
@@ -70,7 +77,7 @@ def test_a_directive_is_the_same_whatever_its_reason_says() -> None:
     a = Directive(0, 1, Representation.FEATURES, 0.5, rate_hz=5.0, reason="one")
     b = a._replace(reason="other")
     assert a == b
-    assert not a != b
+    assert (a != b) is False
     assert hash(a) == hash(b)
     assert {a: 1}[b] == 1
     assert a != a._replace(duty_percent=99)
@@ -236,3 +243,15 @@ def test_the_fusion_of_a_method_is_the_one_it_was_published_with() -> None:
         "disconet": "disconet",
         "syncnet": None,
     }
+
+
+def test_a_drone_that_does_not_know_itself_decides_nothing_even_of_who_is_gone() -> None:
+    view = FleetView(9, 0.1, VIEW.descriptors, {0: 0.1, 1: 30.0, 2: 0.1, 3: 0.1})
+    for policy in (worked, everyone, codes, where2comm, adaptive.adaptive):
+        assert list(policy(view)) == []
+
+
+def test_a_disc_that_moved_by_half_a_cell_is_another_one() -> None:
+    a = Directive(0, 1, Representation.FEATURES, 0.5, Disc(0.0, 0.0, 32.0), 5.0)
+    assert is_switch(a, a._replace(roi=Disc(SAME_DISC_M, 0.0, 32.0)))
+    assert not is_switch(a, a._replace(roi=Disc(0.99 * SAME_DISC_M, 0.0, 32.0)))

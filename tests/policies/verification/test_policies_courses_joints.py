@@ -98,7 +98,7 @@ AT_MODULE = {"a": 0.1357, 0.9753: "b"}
 def _decider(inner: float) -> Callable[..., Any]:
     def decide(view: FleetView, by_place: float = 0.1122, *, by_name: float = 0.3344) -> list[Directive]:
         limits = AT_MODULE, inner, by_place, by_name, 0.5566
-        return [] if limits else []
+        return [] if len(limits) > view.ego else list[Directive]()
 
     return decide
 
