@@ -1,0 +1,324 @@
+"""What stands between a record and its readers: the facts that explain a metric, a run's folder, slices of traffic, discs, sightings, rosters and views."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import record_by_hand as by_hand
+from sim_examples import example
+
+from sortie.policies.contract import Roster
+from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results import rosters
+from sortie.sim.results.accuracy import score
+from sortie.sim.results.box_rows import fusion_blocks, fusions_of
+from sortie.sim.results.explain import explain_metric
+from sortie.sim.results.flown_scene import scene_of, vehicles
+from sortie.sim.results.link_traffic import LinkTraffic
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.regions import Regions
+from sortie.sim.results.run_folder import OtherRunError, ensure_same, in_place_of, load, save
+from sortie.sim.results.sightings import sightings
+from sortie.sim.results.spool import InTime, in_blocks
+
+FATES = "payloads: 6 delivered, 3 expired/deadline_queued, 1 lost/retries of 10, medium 13 % busy"
+FUSED = "0.8 peers' payloads a fusion, 0.26 s old at the median"
+GONE = "left the air: drone 1 at 2 s (low)"
+LOST = "descriptors lost: 5.0 % collisions with payloads, 3.0 % collisions with descriptors, 2.0 % own transmissions, 1.0 % hidden senders"
+REFUSED = "descriptors refused: 2 replay, 1 bad_tag"
+SPENT = "energy rotor 8.1 kJ, compute 2.3 kJ, radio 1.2 kJ"
+EVER = "decided because of 'b' ×2, 'a' ×1; happened: 1 s jam, 2 s landed"
+
+
+@pytest.mark.parametrize(
+    ("metric", "facts"),
+    [
+        ("ap50.mission", [GONE, FUSED, FATES]),
+        ("mission.flown_share", [GONE, FUSED]),
+        ("data_age_s.p50", [FUSED, FATES]),
+        ("phases.0.data_rate_mbps", [FUSED, FATES]),
+        ("bytes.data_sent", [FATES]),
+        ("deadline_miss_rate", [FATES]),
+        ("medium_busy_fraction", [FATES]),
+        ("context.lost", [LOST]),
+        ("age_s.p99", [LOST, REFUSED]),
+        ("descriptor_drops.replay", [REFUSED]),
+        ("energy_j.total", [SPENT]),
+        ("battery.1", [SPENT]),
+        ("drones.1.soc", [SPENT]),
+        ("switches", []),
+    ],
+)
+def test_a_metric_is_explained_by_the_facts_that_it_hangs_on(metric: str, facts: list[str]) -> None:
+    rows = by_hand.rows()
+    rows["events"] = [
+        {"t_s": 1.0, "drone": -1, "kind": "jam", "text": "on"},
+        {"t_s": 2.0, "drone": 1, "kind": "landed", "text": "low"},
+    ]
+    rows["directives"] = [row | {"reason": reason} for row, reason in zip(rows["directives"], "bab", strict=True)]
+    told = by_hand.told_outcome() | {"descriptor_drops": {"bad_tag": 1, "replay": 2, "other_fleet": 0}}
+    # 0.8 peers: three fusions of 1, 2 and 1 payloads, and one of none
+    rows["fusions"].append(rows["fusions"][2] | {"t_s": 3.9})
+    assert explain_metric(metric, by_hand.record(tables=by_hand.tables_of(rows)), told) == "; ".join([*facts, EVER])
+
+
+def test_of_many_who_left_the_air_the_first_are_named() -> None:
+    rows = by_hand.rows()
+    kinds = ("landed", "drone_lost", "power_lost", "landed", "drone_joins", "landed")
+    rows["events"] = [{"t_s": k + 0.5, "drone": k, "kind": kind, "text": "t"} for k, kind in enumerate(kinds)]
+    rows["directives"] = []
+    told = explain_metric("mission.flown_share", by_hand.record(tables=by_hand.tables_of(rows)), by_hand.told_outcome())
+    assert told.startswith(
+        "left the air: drone 0 at 0.5 s (t), drone 1 at 1.5 s (t), drone 2 at 2.5 s (t) and 2 more; "
+    )
+    assert told.endswith("happened: 0.5 s landed, 1.5 s drone_lost, 2.5 s power_lost")
+
+
+# --- rows in blocks and slices -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 20])
+def test_blocks_hold_every_fusion_once_and_all_of_one_time_together(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sortie.sim.results.box_rows.BLOCK_FUSIONS", size)
+    t_s = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 2.0, 3.0, 3.0, 3.0, 3.0])
+    blocks = list(fusion_blocks(t_s))
+    assert [k for here, _ in blocks for k in range(len(t_s))[here]] == list(range(len(t_s)))
+    firsts = [t_s[here][0] for here, _ in blocks]
+    assert [until_s for _, until_s in blocks] == [*firsts[1:], math.inf]
+    assert len(set(t_s.tolist())) == sum(len(set(t_s[here].tolist())) for here, _ in blocks)
+
+
+def test_rows_belong_to_the_fusion_of_their_time_and_their_drone() -> None:
+    rows = {"t_s": np.array([1.0, 1.0, 1.0, 2.0, 2.0, 3.0]), "drone": np.array([0, 1, 1, 1, 0, 0])}
+    keys = [(1.0, 0), (1.0, 1), (2.0, 1), (3.0, 0)]
+    assert fusions_of(keys, rows).tolist() == [0, 1, 1, 2, -1, 3]
+    assert fusions_of(keys, {name: values[:0] for name, values in rows.items()}).tolist() == []
+
+
+def _pieces(values: list[float], cuts: list[int]) -> dict[str, pa.Table]:
+    parts = [values[a:b] for a, b in zip([0, *cuts], [*cuts, len(values)], strict=True)]
+    return {"x": pa.table({"t_s": pa.chunked_array([pa.array(p, pa.float64()) for p in parts])})}
+
+
+@pytest.mark.parametrize("cuts", [[], [1], [2, 4], [3], [1, 2, 3, 4, 5]])
+def test_a_table_comes_in_time_and_in_blocks_however_it_is_cut(cuts: list[int]) -> None:
+    values = [0.0, 1.0, 1.0, 2.0, 3.0, 3.0]
+    table = InTime(_pieces(values, cuts), "x")
+    assert [table.before(t)["t_s"].to_pylist() for t in (0.0, 1.0, 1.5, 2.0, 3.0, math.inf)] == [
+        [], [0.0], [1.0, 1.0], [], [2.0], [3.0, 3.0],
+    ]  # fmt: skip
+    blocks = [piece["t_s"].to_pylist() for piece in in_blocks(_pieces(values, cuts), "x", ["t_s"], 4)]
+    assert blocks == [values[:4], values[4:]]
+
+
+DESCRIBED = [(0.5, 0, 10.0), (1.0, 1, 20.0), (1.5, 0, 30.0), (3.0, 0, 40.0)]
+"""When a drone of two published, and its goodput to the other."""
+SENT = [(0.2, 0, 1, 1000), (0.6, 1, 0, 500), (0.9, 0, 1, 3000), (2.5, 0, 1, 700), (math.nan, 0, 1, 10**6)]
+"""When a payload was settled, from whom to whom, bytes; the last one is still on its way."""
+
+
+def _traffic_in(slices: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """Goodput and traffic of frames at 2 Hz, told slice by slice."""
+    taken = LinkTraffic(2, 2.0)
+    out = []
+    for begin_s, end_s in slices:
+        t_s = np.array([t for t in np.arange(8) / 2 if begin_s <= t < end_s])
+        d = [row for row in DESCRIBED if begin_s <= row[0] < end_s]
+        s = [row for row in SENT if begin_s <= row[0] < end_s or (math.isnan(row[0]) and begin_s == 0.0)]
+        descriptors = pa.table(
+            {
+                "t_s": pa.array([r[0] for r in d], pa.float64()),
+                "drone": pa.array([r[1] for r in d], pa.int32()),
+                "goodput_mbps": pa.array([[r[2]] for r in d], pa.list_(pa.float64())),
+            }
+        )
+        names = ("t_done_s", "drone", "peer", "payload_bytes")
+        sent = pa.table({n: pa.array([float(r[k]) for r in s], pa.float64()) for k, n in enumerate(names)})
+        out.append(taken.add(t_s, descriptors, sent))
+    goodput, recent = zip(*out, strict=True)
+    return np.concatenate(goodput), np.concatenate(recent)
+
+
+@pytest.mark.parametrize(
+    "slices",
+    [[(0, 4)], [(0, 1), (1, 2), (2, 3), (3, 4)], [(0, 2), (2, 4)], [(0, 0.75), (0.75, 0.95), (0.95, 4)]],
+)
+def test_a_link_carried_what_was_settled_in_the_second_before(slices: list[tuple[float, float]]) -> None:
+    """Frames each half second; also where a slice has no frame, what came in it counts."""
+    goodput, recent = _traffic_in(slices)
+    assert goodput[:, 0, 1].tolist() == [0, 0, 10, 10, 30, 30, 30, 40]
+    assert goodput[:, 1, 0].tolist() == [0, 0, 0, 20, 20, 20, 20, 20]
+    kilobytes = recent / 8e-6 / 1e3
+    assert kilobytes[:, 0, 1] == pytest.approx([0, 1, 4, 3, 0, 0, 0.7, 0.7])
+    assert kilobytes[:, 1, 0] == pytest.approx([0, 0, 0.5, 0.5, 0, 0, 0, 0])
+    assert not recent[:, [0, 1], [0, 1]].any()
+
+
+def test_a_scene_is_made_of_all_the_ways_that_were_flown() -> None:
+    """The record's states come in several batches."""
+    tables = by_hand.tables_of(by_hand.rows())
+    whole = by_hand.record(tables=tables)
+    cut = pa.concat_tables([tables["states"].slice(0, 3), tables["states"].slice(3)])
+    assert scene_of(by_hand.record(tables=tables | {"states": cut})).rect == scene_of(whole).rect
+    assert scene_of(whole).rect[2] - scene_of(whole).rect[0] > by_hand.FAR_M
+
+
+def test_stations_are_no_vehicles_whether_they_have_cameras_or_not() -> None:
+    station = "{drone: %d, position_m: [0, 0, 2], camera: %s}"
+    fleet = example("fleet.drones=4", f"fleet.ground=[{station % (1, 'true')}, {station % (3, 'false')}]").fleet
+    assert vehicles(fleet) == [0, 2]
+
+
+# --- accuracy --------------------------------------------------------------------------------------
+
+
+def test_a_fusion_at_the_begin_of_a_time_is_of_it_and_one_at_its_end_is_not() -> None:
+    pool = score(by_hand.record(), [0]).pools[0, "full_scene"]
+    assert pool.ap(0.5, 2.5) == pool.ap(0.0, 2.4)
+    assert pool.ap(2.5, 3.5) == pool.ap(2.4, 3.4)
+    assert pool.ap(3.5) == 1.0
+    assert pool.ap(0.5, 2.5) != pool.ap(2.5, 3.5)
+    assert list(score(by_hand.record(), [0], begin_s=2.5).pools[0, "full_scene"].by_fusion()) == [
+        (2.5, 0), (2.5, 1), (3.5, 0),
+    ]  # fmt: skip
+
+
+def test_people_about_a_drone_that_is_gone_are_no_cars_that_it_missed() -> None:
+    tables = by_hand.tables_of(by_hand.rows())
+    cars = score(by_hand.record(tables=tables), [0]).grounded
+    assert dict(cars) == {"full_scene": 1, "mission": 1}
+    truths = tables["truths"].append_column("kind", pa.array([0] * 6 + [2], pa.int8()))
+    found = tables["detections"].append_column("kind", pa.array([0] * 4, pa.int8()))
+    people = score(by_hand.record(tables=tables | {"truths": truths, "detections": found}), [0]).grounded
+    assert dict(people) == {"full_scene": 0, "mission": 0}
+
+
+def test_a_fleet_without_a_flying_drone_found_none_of_the_cars_there() -> None:
+    """Nothing was scored, so that AP is nothing; with those that are gone counted as blind it is 0."""
+    rows = by_hand.rows() | {"fusions": [], "detections": []}
+    scored = score(by_hand.record(tables=by_hand.tables_of(rows)), [0])
+    assert scored.ap(0) == {"full_scene": None, "mission": None}
+    assert scored.grounded_blind() == {"full_scene": 0.0, "mission": 0.0}
+
+
+def test_a_sighting_takes_its_own_boxes_and_its_own_cars() -> None:
+    record = by_hand.record()
+    regions = Regions(record.tables["mission"], record.scenario.mission)
+    told = [(s.t_s, s.drone, len(s.hits), len(s.false), len(s.missed)) for s in sightings(record.tables, regions)]
+    assert told == [(0.5, 0, 1, 1, 1), (2.5, 0, 1, 0, 1), (2.5, 1, 0, 0, 1), (3.5, 0, 1, 0, 0)]
+    several = list(sightings(record.tables, regions))
+    assert several[0].hits.score.tolist() == pytest.approx([0.9])
+    assert several[0].false.xy_m.tolist() == [[60.0, 0.0]]
+    assert several[1].missed.xy_m.tolist() == [[40.0, 0.0]]
+    assert [s.mission is None for s in several] == [True, False, False, False]
+
+
+def test_hits_are_told_from_false_boxes_whatever_the_order_of_scores() -> None:
+    rows = by_hand.rows()
+    rows["detections"][0]["score"], rows["detections"][1]["score"] = 0.2, 0.8  # the hit is the less sure one
+    record = by_hand.record(tables=by_hand.tables_of(rows))
+    first = next(sightings(record.tables, Regions(record.tables["mission"], record.scenario.mission)))
+    assert (first.hits.xy_m.tolist(), first.false.xy_m.tolist()) == ([[0.0, 0.0]], [[60.0, 0.0]])
+
+
+# --- rosters ---------------------------------------------------------------------------------------
+
+
+def test_a_roster_is_the_latest_from_its_instant_on_and_kept_where_it_changes() -> None:
+    log = rosters.RosterLog()
+    one, other = Roster(1, (0, 1)), Roster(2, (0, 1, 2))
+    for t_s, drone, roster in ((0.0, 0, one), (0.5, 1, one), (1.0, 0, one), (2.0, 0, other), (3.0, 0, other)):
+        log.published(t_s, drone, roster)
+    table = log.table()
+    assert table["t_s"].to_pylist() == [0.0, 0.5, 2.0]
+    at = rosters.of({rosters.TABLE: table})
+    assert [at(0, t) for t in (-0.1, 0.0, 1.9, 2.0, 9.0)] == [None, one, one, other, other]
+    assert [at(1, t) for t in (0.4, 0.5)] == [None, one]
+    assert rosters.of({})(0, 1.0) is None
+
+
+# --- a run's folder --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def flown() -> SortieRecord:
+    return run_sortie(example("duration_s=0.5", "mission.phases=[{at_s: 0, phase: search}]", "fleet.drones=2"))
+
+
+def _ensure(path: Path, flown: SortieRecord, **changes: Any) -> None:
+    given = {"scenario": flown.scenario, "seed": flown.seed, "replication": 0, "files": {}}
+    ensure_same(path, **(given | changes))
+
+
+def test_a_folder_takes_the_same_sortie_again_and_names_what_differs(tmp_path: Path, flown: SortieRecord) -> None:
+    path = tmp_path / "run"
+    _ensure(path, flown)  # nothing there
+    save(replace(flown, own_files={"p.py": "aa"}), path)
+    _ensure(path, flown, files={"p.py": "aa"})
+    other = flown.scenario.model_copy(
+        update={"policy": flown.scenario.policy.model_copy(update={"params": {"rho": 0.5}})}
+    )
+    for changes, told in (
+        ({}, "own_files.p.py is 'aa' there and None here"),
+        ({"files": {"p.py": "bb"}}, "own_files.p.py is 'aa' there and 'bb' here"),
+        ({"files": {"p.py": "aa", "q.py": "c"}}, "own_files.q.py is None there and 'c' here"),
+        ({"files": {"p.py": "aa"}, "seed": 9}, "seed is 1 there and 9 here"),
+        ({"files": {"p.py": "aa"}, "replication": 2}, "replication is 0 there and 2 here"),
+        ({"files": {"p.py": "aa"}, "scenario": other}, "policy.params.rho is 0.25 there and 0.5 here"),
+    ):
+        with pytest.raises(OtherRunError, match=re.escape(f"holds another run: {told}; ")):
+            _ensure(path, flown, **changes)
+
+
+def test_a_run_in_place_of_another_is_told_and_its_own_is_none(tmp_path: Path, flown: SortieRecord) -> None:
+    path = tmp_path / "run"
+    assert in_place_of(path, "x") == ""
+    save(flown, path)
+    assert in_place_of(path, flown.fingerprint) == ""
+    assert in_place_of(path, "x") == f"a run of example under {flown.policy}, seed 1"
+    (path / "outcome.json").write_text("{}")
+    assert in_place_of(path, flown.fingerprint) == "a run that cannot be read"
+
+
+def test_a_run_comes_back_whole(tmp_path: Path, flown: SortieRecord, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in many row groups, and with all that is told beside the tables."""
+    monkeypatch.setattr("sortie.sim.results.run_folder._ROW_GROUP_BYTES", 100)
+    states = flown.tables["states"]
+    cut = {**flown.tables, "states": pa.concat_tables([states.slice(k, 2) for k in range(0, states.num_rows, 2)])}
+    told = replace(flown, tables=cut, calibration="fit 7", metrics={"m": None, "n": 2.0}, own_files={"a": "b"})
+    save(told, tmp_path / "run")
+    back = load(tmp_path / "run")
+    for name in ("policy", "seed", "replication", "version", "detector", "calibration", "metrics", "own_files"):
+        assert getattr(back, name) == getattr(told, name)
+    assert (back.totals, back.wall) == (flown.totals, flown.wall)
+    assert back.fingerprint == flown.fingerprint
+    assert back.tables["states"].equals(states.combine_chunks())
+
+
+def test_a_run_that_lacks_a_table_that_its_scenario_keeps_is_damaged(tmp_path: Path) -> None:
+    kept = ("record.views=true", "record.beliefs=true", "context.roster=true", "record.disagreement=true")
+    scenario = example("duration_s=0.3", "mission.phases=[{at_s: 0, phase: search}]", "fleet.drones=2", *kept)
+    save(run_sortie(scenario), tmp_path / "run")
+    assert {"views", "beliefs", "rosters", "disagreement"} < load(tmp_path / "run").tables.keys()
+    for name in ("views", "view_descriptors", "view_directives", "beliefs", "rosters", "disagreement", "states"):
+        file = tmp_path / "run" / f"{name}.parquet"
+        whole = file.read_bytes()
+        file.unlink()
+        with pytest.raises(ValueError, match=f"the run is damaged: .*{name}.parquet"):
+            load(tmp_path / "run")
+        first = pq.read_schema(pa.BufferReader(whole)).names[0]
+        pq.write_table(pq.read_table(pa.BufferReader(whole)).drop_columns([first]), file)
+        with pytest.raises(ValueError, match=f"{name}.parquet has no column {first}"):
+            load(tmp_path / "run")
+        file.write_bytes(whole)
+    about = json.loads((tmp_path / "run" / "record.json").read_text())
+    assert about["seed"] == 1
