@@ -1,0 +1,236 @@
+"""Which folders and files are refused before the work, which are replaced, and what the digests of a user's files take in."""
+
+from __future__ import annotations
+
+import functools
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sim_examples import example
+
+from sortie.sim import identity
+from sortie.sim.folders import (
+    RunError,
+    ensure_between,
+    ensure_files,
+    ensure_folder,
+    put_between,
+    replacing,
+    settled,
+    write_text,
+)
+
+# --- folders -----------------------------------------------------------------------------------------
+
+
+def test_an_empty_folder_may_be_used_and_one_with_other_things_may_not(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    ensure_folder(path, "a.json", "run")
+    path.mkdir()
+    ensure_folder(path, "a.json", "run")
+    (path / "notes.txt").touch()
+    with pytest.raises(RunError, match=r"holds files but no a.json; a run would replace them"):
+        ensure_folder(path, "a.json", "run")
+    (path / "a.json").touch()
+    ensure_folder(path, "a.json", "run")
+    with pytest.raises(RunError, match=r"holds notes\.txt, which no run wrote"):
+        ensure_folder(path, "a.json", "run", {"a.json"})
+    ensure_folder(path, "a.json", "run", {"a.json", "notes.txt"})
+
+
+def test_what_nobody_wrote_is_named_also_in_folders_within(tmp_path: Path) -> None:
+    for name in ("a.json", "bag/b.mcap", ".DS_Store"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    written = {"a.json", "bag/b.mcap"}
+    ensure_folder(tmp_path, "a.json", "run", written)
+    (tmp_path / "bag" / "mine.txt").touch()
+    with pytest.raises(RunError, match=r"holds bag/mine\.txt, which no run wrote"):
+        ensure_folder(tmp_path, "a.json", "run", written)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RunError, match=r"holds bag/mine\.txt and 1 more, which no run wrote"):
+        ensure_folder(tmp_path, "a.json", "run", written)
+
+
+def test_a_place_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="is a file, a run needs a folder"):
+        ensure_folder(tmp_path / "file", "a.json", "run")
+    with pytest.raises(RunError, match=r"cannot make its folder: .*/file is a file"):
+        ensure_files(None, tmp_path / "file" / "x" / "y.txt")
+    with pytest.raises(RunError, match="is a folder, must be a file"):
+        ensure_files(tmp_path / "new.txt", tmp_path)
+    ensure_files(tmp_path / "new" / "new.txt", None)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
+    there, link = tmp_path / "there", tmp_path / "link"
+    there.mkdir()
+    (there / "old").touch()
+    link.symlink_to(there)
+    with replacing(link) as partial:
+        (partial / "new").touch()
+    assert link.is_symlink()
+    assert [p.name for p in there.iterdir()] == ["new"]
+
+
+def test_a_block_or_a_check_that_fails_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    path.mkdir()
+    (path / "old").touch()
+
+    def refuse() -> None:
+        raise ValueError("not now")
+
+    with pytest.raises(ValueError, match="not now"), replacing(path, refuse) as partial:
+        (partial / "new").touch()
+    with pytest.raises(KeyError), replacing(path) as partial:
+        raise KeyError
+    assert [p.name for p in path.iterdir()] == ["old"]
+    assert [p.name for p in tmp_path.iterdir()] == ["run"], "nothing is left beside it"
+
+
+@pytest.mark.parametrize("name", ["run[1]", "run*", "a?b"])
+def test_what_stepped_aside_is_found_whatever_the_name(name: str, tmp_path: Path) -> None:
+    """Brackets and stars in a name are no patterns."""
+    path = tmp_path / name
+    aside = tmp_path / f".{name}.01234567.old"
+    aside.mkdir()
+    (aside / "kept").touch()
+    partial = tmp_path / f".{name}.01234567.partial"
+    partial.mkdir()
+    with suppress(KeyError), replacing(path):
+        assert (path / "kept").exists()
+        assert not partial.exists()
+        raise KeyError
+    aside.mkdir()
+    with replacing(path) as new:
+        (new / "new").touch()
+    assert [p.name for p in path.iterdir()] == ["new"]
+    assert not aside.exists(), "an older one is not needed where the folder is there"
+
+
+def test_a_folder_that_nobody_may_write_beside_is_read_without_a_lock(tmp_path: Path) -> None:
+    with settled(tmp_path / "not" / "there"):
+        pass
+    assert not (tmp_path / "not").exists()
+    with settled(tmp_path / "run"):
+        assert [p.name for p in tmp_path.iterdir()] == [".run.lock"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_section_is_put_between_its_markers_alone(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("above\n<b>\nold\n<e>\nbelow\n")
+    ensure_between(None, "<b>", "<e>")
+    ensure_between(page, "<b>", "<e>")
+    assert page.read_text() == "above\n<b>\nold\n<e>\nbelow\n"
+    put_between(page, "<b>\nnew\n<e>", "<b>", "<e>")
+    assert page.read_text() == "above\n<b>\nnew\n<e>\nbelow\n"
+    for wrong in (tmp_path / "none.md", page):
+        with pytest.raises(RunError, match=f"{wrong.name}: "):
+            ensure_between(wrong, "<x>", "<e>")
+    write_text(tmp_path / "deep" / "page.md", "text")
+    assert (tmp_path / "deep" / "page.md").read_text() == "text"
+
+
+# --- names and digests -------------------------------------------------------------------------------
+
+
+def decide(view: Any, *args: Any, **params: Any) -> list[Any]:
+    return []
+
+
+class Finds:
+    """A detector or a policy; a subclass may do something else."""
+
+    name = "finds"
+
+    def __call__(self, view: Any) -> list[Any]:
+        return []
+
+
+class FindsMore(Finds): ...
+
+
+def test_a_bound_function_is_named_with_its_arguments_the_same_in_every_process() -> None:
+    here = __name__
+    assert identity.name_of(functools.partial(decide, None, True, 0.5, rho=1, by="x", of=Finds())) == (
+        f"{here}.decide(None, True, 0.5, rho=1, by='x', of=finds)"
+    )
+    assert identity.name_of(functools.partial(functools.partial(decide, a=1), b=decide)) == (
+        f"{here}.decide(a=1, b={here}.decide)"
+    )
+    assert identity.name_of(Finds()) == "finds"
+    assert identity.name_of(FindsMore()) == f"{here}.FindsMore"
+    own = FindsMore()
+    own.name = "own"
+    assert identity.name_of(own) == "own"
+
+
+def test_a_file_is_read_again_once_it_has_changed_be_it_as_long_as_before(tmp_path: Path) -> None:
+    file = tmp_path / "a.bin"
+    file.write_bytes(b"one")
+    os.utime(file, ns=(1, 1))
+    first = identity._digest(file)
+    file.write_bytes(b"two")
+    os.utime(file, ns=(2, 2))
+    assert identity._digest(file) != first
+    assert identity._digest(file) == identity.file_digest(file)[:16]
+
+
+def test_the_digest_of_a_folder_takes_names_places_and_contents(tmp_path: Path) -> None:
+    def digest(**files: str) -> str:
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        for name, text in files.items():
+            place = folder / name.replace("__", "/")
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(text)
+        return identity._digest(folder)
+
+    one = digest(a="1", b="2")
+    assert digest(b="2", a="1") == one
+    others = [
+        digest(a="2", b="1"),
+        digest(a="1", c="2"),
+        digest(a="1", sub__b="2"),
+        digest(a="1", b="3"),
+        digest(a="1"),
+    ]
+    assert len({one, *others}) == 6
+
+
+def test_the_files_of_all_that_is_passed_in_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    mine, scenario = Path(__file__).name, example()
+    for policy, detector in (
+        (decide, None),
+        (functools.partial(decide, a=1), None),
+        (Finds(), None),
+        (None, Finds()),
+        ("worked", Finds()),
+    ):
+        assert mine in {Path(name).name for name in identity.own_files(scenario, policy, detector)}
+    assert identity.own_files(scenario, None, None) == {}
+
+
+def test_a_policy_that_is_asked_for_by_name_takes_the_place_of_the_scenario_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("own.py", "other.py"):
+        Path(name).write_text("def decide(view):\n    return []\n")
+    scenario = example("policy.name='own.py:decide'", "policy.params={}")
+    assert list(identity.own_files(scenario)) == ["own.py"]
+    assert list(identity.own_files(scenario, "own.py:decide")) == ["own.py"]
+    assert list(identity.own_files(scenario, "other.py:decide")) == ["other.py"]
+    assert list(identity.own_files(scenario, "worked")) == []
+    assert identity.runs_user_code(scenario)
+    assert not identity.runs_user_code(example())
+    Path("own.py").unlink()
+    with pytest.raises(ValueError, match=r"own.py"):
+        identity.own_files(scenario)
