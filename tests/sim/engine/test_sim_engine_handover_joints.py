@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,8 +14,9 @@ import simpy
 from agent_rig import capture, descriptor, memory, payload
 from sim_examples import example
 
+from sortie.fleet.flight.steering import GoTo, Velocity
 from sortie.fleet.memory import Received
-from sortie.fleet.messages.wire import encode_descriptor
+from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
@@ -25,11 +27,13 @@ from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine import mixed as mixed_module
 from sortie.sim.engine import tracking as tracking_module
+from sortie.sim.engine.events import _Begin
 from sortie.sim.engine.mixed import Mixed, MixedMany, mixed
 from sortie.sim.engine.people import KEPT_S, People
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.scoring import Scorer
 from sortie.sim.engine.sortie import build
+from sortie.sim.engine.steering import Steering, area_m
 from sortie.sim.engine.tracking import FleetTracking, captures_ahead
 from sortie.sim.engine.transport import Transport
 from sortie.sim.results.record import HANDSHAKE, Recorder
@@ -543,3 +547,117 @@ def test_a_detector_of_many_moments_waits_until_there_are_enough(monkeypatch: py
         rows.append(len(recorder.rows["fusions"]))
     scorer.flush()
     assert [*rows, len(recorder.rows["fusions"])] == [0, 0, 6, 6, 8]
+
+
+# --- planners ----------------------------------------------------------------------------------------
+
+GOES = f"fleet.mobility={Path(__file__).parent / 'own_models.py'}:Goes"
+APART = (
+    "fleet.drones=4",
+    "fleet.formation={shape: line, spacing_m: 20}",
+    "fleet.motion={pose_jitter_m: 0, pose_error_m: 0}",
+)
+
+
+def _steering(*sets: str) -> tuple[Steering, Any]:
+    scenario = example("duration_s=20", GOES, "fleet.mobility_params={x_m: 0}", *APART, *sets)
+    parts = build(scenario, plan_for(scenario), 1)
+    return parts.steering, parts.world
+
+
+def _command(steering: Steering, world: Any, **wishes: Any) -> list[str]:
+    """Give commands by drone in one frame, and return what is said of them."""
+    before = len(world._recorder.rows["events"])
+    steering._wishes = {int(name[1:]): wish for name, wish in wishes.items()}
+    steering.renew(0)
+    return [f"{row[1]} {row[3]}" for row in world._recorder.rows["events"][before:]]
+
+
+def test_of_two_commands_of_one_frame_the_second_keeps_clear_of_what_the_first_was_granted() -> None:
+    steering, world = _steering("fleet.steering.separation_m=10")
+    start_m = world.motion.position_m[0].copy()
+    middle_m = (start_m[0] + start_m[1]) / 2
+    said = _command(steering, world, d1=GoTo(*middle_m.tolist()), d0=GoTo(*middle_m.tolist()))
+    end_m = world.motion.position_m[-1]
+    np.testing.assert_allclose(end_m[0], middle_m, atol=1e-6)
+    assert np.linalg.norm(end_m[1] - end_m[0]) >= 10.0 - 1e-6
+    assert said[0] == "0 Goes: GoTo"
+    np.testing.assert_array_equal(end_m[2:], start_m[2:])
+
+
+def test_who_is_in_the_way_is_named_by_its_number_and_who_is_gone_is_not_in_the_way() -> None:
+    steering, world = _steering("fleet.steering.separation_m=19")
+    start_m = world.motion.position_m[0]
+    world.remove(0, "drone_lost", "fell silent")
+    (said,) = _command(steering, world, d1=GoTo(*(start_m[3] + 0.2 * (start_m[1] - start_m[3])).tolist()))
+    assert said == "1 Goes: GoTo refused, it would come too near drone 3"
+    assert _command(steering, world, d1=GoTo(*start_m[0].tolist())) == ["1 Goes: GoTo"]
+
+
+def test_a_drone_that_goes_home_or_is_down_takes_no_commands() -> None:
+    steering, world = _steering()
+    world.homebound.add(0)
+    world.remove(1, "drone_lost", "fell silent")
+    hold = Velocity(1.0, 0.0)
+    assert _command(steering, world, d0=hold, d1=hold, d2=hold) == ["2 Goes: Velocity"]
+    moved = world.motion.position_m[-1] - world.motion.position_m[0]
+    assert (np.abs(moved).max(axis=1) > 1.0).tolist() == [False, False, True, False]
+
+
+def test_the_scene_reaches_as_far_as_drones_fly_as_planned_and_as_they_may_be_steered() -> None:
+    fleet = example(GOES, "fleet.mobility_params={x_m: 0}", "fleet.steering.fence_m=[-90, -60, 20, 60]").fleet
+    assert area_m(fleet, (-10.0, -500.0, 700.0, 5.0)) == (-90.0, -500.0, 700.0, 60.0)
+    assert area_m(example().fleet, (-1.0, -2.0, 3.0, 4.0)) == (-1.0, -2.0, 3.0, 4.0)
+
+
+# --- attackers ---------------------------------------------------------------------------------------
+
+
+def _spoofed(attack: str, *sets: str) -> list[tuple[float, bytes, list[int]]]:
+    """What an attacker of drone 1 puts before whom: the drone publishes from 0.3 s on, each 0.2 s."""
+    until = "" if sets else ", until_s: 0.8"
+    event = f"events=[{{kind: spoof, at_s: 0, drone: 1, attack: {attack}, rate_hz: 5{until}}}]"
+    scenario = example("duration_s=1.5", "fleet.drones=4", event, "mission.phases=[{at_s: 0, phase: search}]", *sets)
+    env, put = simpy.Environment(), list[tuple[float, bytes, list[int]]]()
+    transport = SimpleNamespace(
+        last_datagram={}, inject=lambda data, to: put.append((round(env.now, 3), data, list(to)))
+    )
+    world = SimpleNamespace(env=env, note=lambda *_: None)
+    _Begin(scenario, world, transport, None, None, scenario.events[0], 0, 1, 0)()  # type: ignore[arg-type]
+
+    def publish() -> Any:
+        yield env.timeout(0.3)
+        for k in range(10):
+            transport.last_datagram = {1: _datagram(k), 0: b"another's"}
+            yield env.timeout(0.2)
+
+    env.process(publish())
+    env.run(until=scenario.duration_s)
+    return put
+
+
+def _datagram(k: int) -> bytes:
+    return encode_descriptor(descriptor(1, 0.3 + 0.2 * k, coverage_grid=bytes(64), battery_soc=0.5))
+
+
+OPEN = "context.authentication=false"
+
+
+def test_an_attacker_replays_the_first_datagram_that_it_heard_to_all_but_its_victim() -> None:
+    put = _spoofed("replayed")
+    assert [t for t, *_ in put] == [0.4, 0.6]
+    assert {data for _, data, _ in put} == {_datagram(0)}
+    assert [to for *_, to in put] == [[0, 2, 3]] * 2
+    assert [t for t, *_ in _spoofed("replayed", OPEN)] == [0.4, 0.6, 0.8, 1.0, 1.2, 1.4], "to the end, if it has none"
+
+
+def test_other_attacks_follow_the_latest_datagram() -> None:
+    put = _spoofed("oversized")
+    assert [data for _, data, _ in put] == [_datagram(k) + bytes(2000) for k in (0, 1)]
+    put = _spoofed("malformed")
+    assert [len(data) for _, data, _ in put] == [len(_datagram(0))] * 2
+    assert put[0][1] != put[1][1]
+    lies = [decode_descriptor(data) for _, data, _ in _spoofed("forged", OPEN)]
+    assert [lie.stamp_ns for lie in lies[:2]] == [decode_descriptor(_datagram(k)).stamp_ns for k in (0, 1)]
+    assert {lie.battery_soc for lie in lies} == {0.0}
+    assert {g for lie in lies for g in lie.peer_goodput_mbps} == {0.0}
