@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 import simpy
 from agent_rig import capture
@@ -15,6 +16,7 @@ from sortie.fleet.flight.viewpoints import Move
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Directive, FleetView, Reposition, Representation, TaskPhase
 from sortie.policies.verification.invariants import parse
+from sortie.scenarios.schema import PolicyChange
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.own_boxes import OwnBoxes
@@ -27,8 +29,6 @@ from sortie.sim.results.record import Recorder
 
 def _box(of: Capture) -> Boxes:
     """A box that names the capture it is of."""
-    import numpy as np
-
     return Boxes(np.array([[of.t_s, float(of.drone)]]), np.array([[4.5, 1.9]]), np.zeros(1), np.ones(1))
 
 
@@ -239,8 +239,6 @@ def test_who_takes_over_looks_from_its_own_viewpoint_or_from_its_slot() -> None:
 
 
 def test_of_two_changes_before_one_decision_the_later_in_the_list_stays_and_the_next_decision_begins_anew() -> None:
-    from sortie.scenarios.schema import PolicyChange
-
     own, other = NamedPolicy("own", Reads("own", looks=False)), NamedPolicy("other", Reads("other", looks=False))
     late = NamedPolicy("late", Reads("late", looks=False))
     changes = tuple((PolicyChange(phase=phase, name=p.name), p) for phase, p in (("search", own), ("track", other)))
@@ -279,6 +277,7 @@ def test_on_views_that_are_shown_a_link_without_a_directive_and_a_rise_by_age_al
     both = [_link(1), _link(2)]
     assert _failures([both], [view]) == []
     assert _failures([[_link(2)]], [view]) == [(1, "one directive a link")]
+    assert _failures([[_link(1)]], [view]) == [(2, "one directive a link")]
     assert _failures([both, both], [view, older]) == []
     assert _failures([both, [_link(1), _link(2, 9.0)]], [view, older]) == [(-1, "age-monotone")]
     assert _failures([both, [_link(1), _link(2, 9.0)]], [older, view]) == [], "an age fell"
