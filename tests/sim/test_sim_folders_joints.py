@@ -114,13 +114,17 @@ def test_what_stepped_aside_is_found_whatever_the_name(name: str, tmp_path: Path
     assert not aside.exists(), "an older one is not needed where the folder is there"
 
 
-def test_a_folder_that_nobody_may_write_beside_is_read_without_a_lock(tmp_path: Path) -> None:
+def test_a_folder_that_nobody_may_write_beside_is_read_without_a_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with settled(tmp_path / "not" / "there"):
         pass
     assert not (tmp_path / "not").exists()
     with settled(tmp_path / "run"):
         assert [p.name for p in tmp_path.iterdir()] == [".run.lock"]
-    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with settled(tmp_path / "run"):
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_a_section_is_put_between_its_markers_alone(tmp_path: Path) -> None:

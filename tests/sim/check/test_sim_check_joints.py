@@ -225,3 +225,9 @@ def test_a_file_whose_name_begins_with_another_file_s_name_is_renamed_whole(tmp_
         "policy": "here/a.py:decide",
         "n": 3,
     }
+    Path("b").mkdir()
+    Path("c.py").touch()
+    assert with_relative_files(tmp_path, {"x": "b", "y": "b/../c.py"}, ["b", "b/../c.py"]) == {
+        "x": "here/b",
+        "y": "here/c.py",
+    }

@@ -369,6 +369,9 @@ def test_networks_that_do_many_moments_do_so_where_all_can(kinds: tuple[type[Net
     assert isinstance(fleet, MixedMany) == (kinds == (ManyNet, ManyNet))
     assert made == ["surrogate", "torch"]
     assert [fleet.count_boxes(capture(d, 0.0), None) for d in range(3)] == [0, 1, 0]
+    early = example("perception.detector=surrogate", "fleet.drones=3", makes)
+    made.clear()
+    assert mixed(maker, None, early, 3, 4)._sends == [None, None]  # type: ignore[arg-type, union-attr]
     assert [s is not None for s in fleet._sends] == [False, True], (
         "late fusion's torch drones send confident boxes alone"
     )

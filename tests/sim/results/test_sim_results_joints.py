@@ -14,21 +14,28 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import record_by_hand as by_hand
+import simpy
+from policies_examples import fleet_of
 from sim_examples import example
 
-from sortie.policies.contract import Roster
+from sortie.fleet.staleness import LinkHealth
+from sortie.policies.contract import Directive, Disc, FleetView, Representation, Roster
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results import rosters
 from sortie.sim.results.accuracy import score
 from sortie.sim.results.box_rows import fusion_blocks, fusions_of
+from sortie.sim.results.disagreement import measure
 from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.flown_scene import scene_of, vehicles
 from sortie.sim.results.link_traffic import LinkTraffic
-from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.mission_outcome import _looked_lately
+from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.run_folder import OtherRunError, ensure_same, in_place_of, load, save
 from sortie.sim.results.sightings import sightings
 from sortie.sim.results.spool import InTime, in_blocks
+from sortie.sim.results.views import Decision, Journal, decisions
 
 FATES = "payloads: 6 delivered, 3 expired/deadline_queued, 1 lost/retries of 10, medium 13 % busy"
 FUSED = "0.8 peers' payloads a fusion, 0.26 s old at the median"
@@ -167,7 +174,7 @@ def test_a_scene_is_made_of_all_the_ways_that_were_flown() -> None:
     """The record's states come in several batches."""
     tables = by_hand.tables_of(by_hand.rows())
     whole = by_hand.record(tables=tables)
-    cut = pa.concat_tables([tables["states"].slice(0, 3), tables["states"].slice(3)])
+    cut = pa.concat_tables([tables["states"].slice(0, 6), tables["states"].slice(6)])  # at the end all are far off
     assert scene_of(by_hand.record(tables=tables | {"states": cut})).rect == scene_of(whole).rect
     assert scene_of(whole).rect[2] - scene_of(whole).rect[0] > by_hand.FAR_M
 
@@ -322,3 +329,89 @@ def test_a_run_that_lacks_a_table_that_its_scenario_keeps_is_damaged(tmp_path: P
         file.write_bytes(whole)
     about = json.loads((tmp_path / "run" / "record.json").read_text())
     assert about["seed"] == 1
+
+
+# --- what is written down and read back ------------------------------------------------------------
+
+
+def test_a_directive_is_kept_as_it_is_enforced_beside_what_was_asked() -> None:
+    recorder = Recorder()
+    notes = AgentNotes(recorder, lambda drone: f"policy of {drone}", 3)
+    asked = Directive(2, 0, Representation.FEATURES, 0.5, None, 10.0, deadline_s=0.3, reason="asked")
+    enforced = Directive(
+        2, 1, Representation.DETECTIONS, 0.25, Disc(1.0, 2.0, 3.0), 4.0, deadline_s=0.2, fusion_weight=0.5
+    )
+    notes.directive(1.5, asked, enforced, LinkHealth.DEGRADED, "why")
+    (row,) = recorder.finish()["directives"].to_pylist()
+    assert row == {
+        "t_s": 1.5, "drone": 2, "peer": 1, "representation": "detections", "rho": 0.25, "roi_x_m": 1.0, "roi_y_m": 2.0,
+        "roi_radius_m": 3.0, "rate_hz": 4.0, "deadline_s": 0.2, "fusion_weight": 0.5, "duty_percent": enforced.duty_percent,
+        "asked": "features", "asked_rate_hz": 10.0, "link": "degraded", "reason": "why", "policy": "policy of 2",
+    }  # fmt: skip
+
+
+def test_what_is_kept_beside_the_record_is_no_part_of_its_fingerprint() -> None:
+    record = by_hand.record()
+    more = replace(record, tables={**record.tables, "views": record.tables["energy"]}, wall={"wall_s": 9.0})
+    assert more.fingerprint == record.fingerprint
+    assert replace(record, totals={**record.totals, "decisions": 1}).fingerprint != record.fingerprint
+
+
+def test_a_view_comes_back_with_each_drone_s_own_age_in_whatever_order_they_stood() -> None:
+    journal = Journal(simpy.Environment())
+    view = fleet_of(3)._replace(age_s={2: 0.3, 0: 0.1, 1: 0.2}, detached_after_periods=7.0)
+    journal.decided(0, "p", view, [], None)
+    (decision,) = decisions(journal.tables())
+    assert dict(decision.view.age_s) == {0: 0.1, 1: 0.2, 2: 0.3}
+    assert decision.view.detached_after_periods == 7.0
+
+
+def test_an_episode_in_which_one_would_once_not_send_is_one_about_sending() -> None:
+    """In the first frame they differ about whether drone 0 sends at all, then about how often."""
+
+    def policy(view: FleetView) -> list[Directive]:
+        assert view.me is not None
+        soc = view.me.battery_soc
+        rung = Representation.NONE if soc < 0.3 else Representation.DETECTIONS
+        return [Directive(view.ego, p, rung, rate_hz=10.0 if soc > 0.6 else 2.0) for p in view.peers]
+
+    def seen(drone: int, soc: float) -> FleetView:
+        view = fleet_of(2)
+        known = {i: d._replace(battery_soc=soc) if i == 0 else d for i, d in view.descriptors.items()}
+        return view._replace(ego=drone, descriptors=known)
+
+    told = [
+        Decision(0.1 * frame, drone, "p", seen(drone, 0.9 if drone == 0 else soc), ())
+        for frame, soc in enumerate((0.2, 0.5, 0.9))
+        for drone in (0, 1)
+    ]
+    (pair,) = measure(told, lambda decision: policy, 0.1)
+    (episode,) = pair.episodes
+    assert (episode.source, episode.destination, episode.begin_s, episode.sends) == (0, 1, 0.0, True)
+    assert episode.duration_s == pytest.approx(0.2)
+
+
+def test_a_look_counts_for_its_frames_and_the_last_frame_does_as_the_one_before() -> None:
+    """Looks before each of five frames: drone 0 looks in each, drone 1 in the first alone, drone 2 in the one before the last."""
+    looks = np.array([[0, 0, 0], [1, 1, 0], [2, 1, 0], [3, 1, 0], [4, 1, 1]], np.int32)
+    assert _looked_lately(looks, 1).T.tolist() == [[True] * 5, [True] + [False] * 4, [False] * 3 + [True] * 2]
+    assert _looked_lately(looks, 2).T.tolist() == [[True] * 5, [True] * 2 + [False] * 3, [False] * 3 + [True] * 2]
+    assert _looked_lately(looks[:1], 3).tolist() == [[True] * 3]
+
+
+def test_accuracy_is_sampled_no_oftener_than_frames_come_and_fused_as_the_detector_that_flew() -> None:
+    record = by_hand.record()
+
+    def ap(flown: str = "surrogate", **changes: Any) -> dict[str, Any]:
+        perception = record.scenario.perception.model_copy(update=changes)
+        scenario = record.scenario.model_copy(update={"perception": perception})
+        return outcome(replace(record, scenario=scenario, detector=flown))["ap50"]  # type: ignore[no-any-return]
+
+    assert ap()["sample_rate_hz"] == 1.0
+    assert ap()["fusion"] == record.scenario.perception.fusion
+    assert ap("another")["fusion"] is None
+    assert ap("mine.py:Finds", detector="mine.py:Finds")["fusion"] is None
+    assert ap(recorded_fusion="late")["fusion"] == "late"
+    often = record.scenario.context.model_copy(update={"rate_hz": 0.5})
+    slow = replace(record, scenario=record.scenario.model_copy(update={"context": often}))
+    assert outcome(slow)["ap50"]["sample_rate_hz"] == 0.5
