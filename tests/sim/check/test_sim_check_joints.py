@@ -12,15 +12,20 @@ import record_by_hand as by_hand
 from policies_examples import fleet_of
 from sim_examples import example
 
+from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.views import from_json
 from sortie.scenarios.schema import DecisionExpectation, Expectation
 from sortie.sim.check.checking import Checked
+from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes
 from sortie.sim.check.counterexample import replay_scenario, unused
+from sortie.sim.check.discovery import is_scenario
 from sortie.sim.check.expectations import Verdict, check
 from sortie.sim.check.golden import differences, with_relative_files, write_golden
 from sortie.sim.check.junit import Suite, junit
+from sortie.sim.check.model_rules import Subject as RuleSubject
+from sortie.sim.check.model_rules import conform
 from sortie.sim.check.once import Flown, flown_once
 from sortie.sim.check.over_time import Subject, course_scenario, flights_of
 
@@ -231,3 +236,44 @@ def test_a_file_whose_name_begins_with_another_file_s_name_is_renamed_whole(tmp_
         "x": "here/b",
         "y": "here/c.py",
     }
+
+
+def test_a_period_is_that_of_publishing_and_a_frame_that_of_deciding() -> None:
+    times = PlaneTimes.of(example("context.rate_hz=5", "context.publish_every=3"))
+    assert (times.frame_s, times.period_s) == pytest.approx((0.2, 0.6))
+
+
+@pytest.mark.parametrize(("age_s", "cause"), [(0.1, "policy"), (5.0, "staleness")])
+def test_the_step_that_breaks_a_line_is_named_in_a_closed_loop_too(age_s: float, cause: str) -> None:
+    """A policy that sends at 5 Hz, and where its peer's descriptor is too old nothing is sent."""
+    times = PlaneTimes(0.1, 0.1, 0.0, 3.0, 10.0, shielded=False)
+    line = "rate_hz <= 4" if cause == "policy" else "rate_hz >= 4"
+
+    def policy(view: FleetView) -> list[Directive]:
+        return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=5.0, reason="r") for p in view.peers]
+
+    loop = ClosedLoop(policy, parse(line), times)
+    view = fleet_of(2)._replace(age_s={0: 0.1, 1: age_s})
+    assert [v.cause for v in loop.step(view, 0.0)] == [cause]
+
+
+def test_a_scenario_is_of_a_run_where_its_outcome_lies_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "scenario.yaml"
+    path.write_text("name: x\nexpect: []\n")
+    assert is_scenario(path)
+    (tmp_path / "record.json").touch()
+    assert is_scenario(path)
+    (tmp_path / "outcome.json").touch()
+    assert not is_scenario(path)
+
+
+def test_a_model_that_draws_when_it_is_loaded_gives_another_answer_when_it_is_loaded_anew() -> None:
+    numbers = iter(range(100))
+
+    def load() -> RuleSubject:
+        drawn = next(numbers)
+        return RuleSubject(lambda case: drawn, {"a": 0, "b": 1})
+
+    assert {check.name: check.holds for check in conform(load)} == {
+        "answers": True, "same answer again": False, "no memory": True, "arguments unchanged": True,
+    }  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,17 @@ from sim_examples import example
 
 from sortie.fleet.flight.viewpoints import Move
 from sortie.perception.types import Boxes, Capture
-from sortie.policies.contract import Directive, FleetView, Reposition, Representation, TaskPhase
+from sortie.policies.contract import Directive, Disc, FleetView, Reposition, Representation, TaskPhase
 from sortie.policies.verification.invariants import parse
 from sortie.scenarios.schema import PolicyChange
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.choreography import Choreography
+from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.own_boxes import OwnBoxes
+from sortie.sim.engine.own_events import FleetHandle
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, Replay, plan_for
 from sortie.sim.engine.sortie import build
+from sortie.sim.engine.world import OwnSenses
 from sortie.sim.results.record import Recorder
 
 # --- own detections ----------------------------------------------------------------------------------
@@ -284,3 +288,61 @@ def test_on_views_that_are_shown_a_link_without_a_directive_and_a_rise_by_age_al
     other = fleet_of(3, soc=0.4)._replace(age_s=older.age_s)
     assert _failures([both, [_link(1), _link(2, 9.0)]], [view, other]) == [], "other descriptors"
     assert _failures([[_link(1), _link(2, 25.0)]], [view]) == [(2, "rate_hz <= 20")]
+
+
+# --- the world ---------------------------------------------------------------------------------------
+
+
+def _world(*sets: str) -> Any:
+    scenario = example("duration_s=1", "fleet.drones=3", "mission.phases=[{at_s: 0, phase: search}]", *sets)
+    return build(scenario, plan_for(scenario), 1).world
+
+
+@pytest.mark.parametrize(("at_s", "frame"), [(0.2, 2), (0.25, 2), (0.299, 2), (0.3, 3)])
+def test_a_drone_stays_where_it_was_in_the_frame_in_which_it_left_the_air(at_s: float, frame: int) -> None:
+    world = _world()
+    world.env.run(until=at_s)
+    world.ground(1)
+    world.ground(1)  # it is down already
+    assert world._down == {1: [(frame, 10)]}
+
+
+def test_losses_of_events_and_of_a_user_s_events_add_up() -> None:
+    world = _world()
+    assert world._loss_db() is None
+    world.add_loss(0, 1, 10.0)
+    world.own_losses_db[0] = np.full((3, 3), 5.0)
+    world.own_losses_db[4] = np.full((3, 3), 2.0)
+    assert world._loss_db()[[0, 1, 0, 2], [1, 0, 2, 1]].tolist() == [17.0, 17.0, 7.0, 7.0]
+    world.add_loss(0, 1, -10.0)
+    assert world.extra_loss_db is None
+
+
+def test_people_that_are_sent_are_those_within_the_region() -> None:
+    world = _world()
+    found = Boxes(np.array([[0.0, 0.0], [30.0, 0.0]]), np.ones((2, 2)), np.zeros(2), np.ones(2))
+    world.people.found = lambda capture: found
+    senses = OwnSenses(world, 0, None)  # type: ignore[arg-type]
+    assert len(senses.people_in(capture(0, 0.0), None)) == 2
+    assert senses.people_in(capture(0, 0.0), Disc(29.0, 0.0, 5.0)).xy_m.tolist() == [[30.0, 0.0]]
+
+
+def test_an_event_of_one_s_own_sees_the_drones_of_the_frame_and_weakens_a_link_one_way() -> None:
+    world = _world()
+    its = FleetHandle(world, world._scenario, SimpleNamespace(model="mine"), 3)  # type: ignore[arg-type]
+    for t_s, frame in ((0.27, 2), (0.3, 3)):
+        world.env.run(until=t_s)
+        np.testing.assert_array_equal(its.positions_m, world.motion.position_m[frame])
+    one_way = np.zeros((3, 3))
+    one_way[0, 2] = 9.0
+    its.set_loss_db(one_way)
+    one_way[0, 2] = 1.0  # it keeps a copy
+    assert world._loss_db()[0, 2] == 9.0
+    assert world._loss_db().sum() == 9.0
+    its.set_loss_db(4.0)
+    assert world._loss_db().tolist() == [[0.0, 4.0, 4.0], [4.0, 0.0, 4.0], [4.0, 4.0, 0.0]]
+
+
+def test_a_phase_begins_with_its_frame_whatever_the_clock_rounds() -> None:
+    plan = MissionPlan(example().mission, 2)
+    assert [plan.at(t_s)[0].phase for t_s in (2.9, 3.0 - 1e-12, 3.0)] == ["search", "track", "track"]
