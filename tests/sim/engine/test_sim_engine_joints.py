@@ -18,6 +18,7 @@ from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Directive, Disc, FleetView, Reposition, Representation, TaskPhase
 from sortie.policies.verification.invariants import parse
 from sortie.scenarios.schema import PolicyChange
+from sortie.sim.engine import sortie as engine
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.mission import MissionPlan
@@ -25,6 +26,7 @@ from sortie.sim.engine.own_boxes import OwnBoxes
 from sortie.sim.engine.own_events import FleetHandle
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, Replay, plan_for
 from sortie.sim.engine.sortie import build
+from sortie.sim.engine.tracking import FleetTracking
 from sortie.sim.engine.world import OwnSenses
 from sortie.sim.results.record import Recorder
 
@@ -346,3 +348,42 @@ def test_an_event_of_one_s_own_sees_the_drones_of_the_frame_and_weakens_a_link_o
 def test_a_phase_begins_with_its_frame_whatever_the_clock_rounds() -> None:
     plan = MissionPlan(example().mission, 2)
     assert [plan.at(t_s)[0].phase for t_s in (2.9, 3.0 - 1e-12, 3.0)] == ["search", "track", "track"]
+
+
+def test_every_part_draws_by_the_seed_and_the_replication_that_fly_and_not_by_the_scenario_s(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+
+    got: dict[str, tuple[Any, Any]] = {}
+
+    def noted(name: str, place: Callable[[Any, Any], tuple[Any, Any]]) -> None:
+        made = getattr(engine, name)
+        monkeypatch.setattr(engine, name, lambda *a, **k: (got.__setitem__(name, place(a, k)), made(*a, **k))[1])
+
+    noted("People", lambda a, k: a[-1])
+    noted("Air", lambda a, k: (k["seed"], k["replication"]))
+    noted("schedule", lambda a, k: (k["seed"], k["replication"]))
+    for name in ("OwnEvents", "Steering", "oscillators", "sensor_errors", "flown_motion", "mixed"):
+        noted(name, lambda a, k: a[-2:])
+    scenario = example("seed=1", "duration_s=0.2", "mission.phases=[{at_s: 0, phase: search}]", "fleet.drones=2")
+    build(scenario, plan_for(scenario), 9, 4)
+    assert got == dict.fromkeys(got, (9, 4))
+    assert len(got) == 9
+
+
+def test_after_a_rest_a_tracker_takes_one_look_and_then_those_that_are_due() -> None:
+    scenario = example("duration_s=10", "perception.detector=surrogate")
+    looks_s = [frame * scenario.frame_s for frame in scenario.tracked_frames]
+    seen: list[float] = []
+    tracking = FleetTracking(
+        scenario, lambda captures: seen.extend(c.t_s for c in captures) or [Boxes.empty() for _ in captures]
+    )  # type: ignore[func-returns-value]
+    due, last_s = list[float](), -1.0
+    for t_s in (0.1 * frame for frame in (*range(5), *range(30, 40))):
+        tracking.perceived(capture(0, t_s))
+        if any(last_s < look_s <= t_s + 1e-6 for look_s in looks_s):
+            due.append(t_s)
+            last_s = t_s + 1e-6
+    tracking.tracks(0)
+    assert seen == due
+    assert len(due) < 5
