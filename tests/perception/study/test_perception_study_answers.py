@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -153,3 +154,24 @@ def test_what_others_begin_from_is_trained_before_them() -> None:
     recipe = plan.variants[1].recipe_for(1)
     assert (recipe.warm_start, recipe.seed, recipe.steps) == ("full-1.safetensors", 1, 7)
     assert plan.variants[0].recipe_for(1).warm_start == ""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            '"model", "f1", 0.01',
+            '"model", "f1", 0.0',
+            r"evaluation\.taus has 0\.0, must be model, f1 or above 0 and below 1",
+        ),
+        ('"model", "f1", 0.01', '"model", "f1", 1.0', r"evaluation\.taus has 1\.0, must be"),
+        ('"model", "f1", 0.01', '"model", "f1", 1', r"evaluation\.taus has 1, must be"),
+        ("seeds = [0, 1, 2]", "seeds = [0, 1]", "variant dropout has seeds that full has not"),
+    ],
+)
+def test_a_plan_that_cannot_be_measured_or_trained_is_named(old: str, new: str, message: str, tmp_path: Path) -> None:
+    text = PLAN.read_text("utf-8")
+    assert old in text
+    (tmp_path / "plan.toml").write_text(text.replace(old, new, 1), "utf-8")
+    with pytest.raises(ValueError, match=message):
+        read_plan(tmp_path / "plan.toml")
