@@ -13,7 +13,7 @@ from recording_examples import score_map, small
 from sortie.perception.evaluation.contract import Exchange
 from sortie.perception.lateness import map_weight, reach_m, still_right
 from sortie.perception.recordings.detector import RecordedDetector
-from sortie.perception.recordings.exchange import fusion_hash
+from sortie.perception.recordings.exchange import Sent, fusion_hash, received_boxes
 from sortie.perception.recordings.instrument import RecordedInstrument, content_hash, evaluate_recording, frames_of
 from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Capture, Share
@@ -234,3 +234,29 @@ def test_bytes_are_of_all_columns_of_a_cell(tmp_path: Path) -> None:
     found = evaluate_recording(path)
     full = found.conditions[-1]
     assert found.payload_bytes[full].tolist() == [2 * 4096 * 24] * 9
+
+
+def test_received_boxes_lie_in_the_ego_s_frame_and_square_and_came_with_their_cells(tmp_path: Path) -> None:
+    """A box beyond the sender's grid has no cell; one beyond the ego's square is not the ego's; a box turns with its frame."""
+    far = np.concatenate([box(0.0, 40.0), box(5.0, -101.0), box(110.0, 0.0), box(-101.0, -101.0)])
+    rec = open_recording(recorded(tmp_path / "r.npz", [[box(8.0), far, NONE]] * 3))
+    cells = np.ones((64, 64), bool)
+    here, there = (0.0, 0.0, 0.5), (30.0, -20.0, 0.5 + np.pi / 2)
+    sent = [Sent(0, 1, cells, there, 0.5)]
+    found = received_boxes(rec, (0, 0), here, sent)
+    turn = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    middle = turn @ [30.0, -20.0]
+    np.testing.assert_allclose(found[0], box(8.0)[0])
+    expected = [
+        (middle[0] - 40.0, middle[1]),
+        (middle[0] + 101.0, middle[1] + 5.0),
+        (middle[0] + 101.0, middle[1] - 101.0),
+    ]
+    inside = [at for at in expected if max(map(abs, at)) < 102.4]
+    np.testing.assert_allclose(found[1:, :2], inside)
+    assert len(inside) == 1
+    assert found[1:, 4] == pytest.approx(0.1 + np.pi / 2)
+    assert found[1:, 5] == pytest.approx(0.4)
+    assert len(received_boxes(rec, None, here, sent)) == 1
+    wide = received_boxes(rec, None, there, [Sent(0, 1, cells, there)])
+    assert wide[:, 0].tolist() == [0.0, 5.0, -101.0]

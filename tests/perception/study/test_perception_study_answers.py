@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from sortie.perception.network.model import ModelConfig
+from sortie.perception.study import run as study_run
 from sortie.perception.study.measure import StudyRow
 from sortie.perception.study.plan import PLAN, MeasuredGrid, StudyPlan, Variant, read_plan
 from sortie.perception.study.report import FixedSettings, StudyRows, answers, flips, networks, short, thresholds
@@ -175,3 +178,39 @@ def test_a_plan_that_cannot_be_measured_or_trained_is_named(old: str, new: str, 
     (tmp_path / "plan.toml").write_text(text.replace(old, new, 1), "utf-8")
     with pytest.raises(ValueError, match=message):
         read_plan(tmp_path / "plan.toml")
+
+
+def test_a_network_is_trained_as_the_plan_says_from_the_weights_that_it_begins_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From one's own weights before those that ship; what has weights in either place is not trained again."""
+    asked: list[Any] = []
+
+    def train(out: Path, recipe: Any, model: Any, **rest: Any) -> str:
+        asked.append((out, recipe, model, rest["root"], rest["work"], rest["warm_start"]))
+        return "trained"
+
+    monkeypatch.setattr(study_run, "train", train)
+    mine, shipped, root = tmp_path / "mine", tmp_path / "shipped", tmp_path / "bench"
+    mine.mkdir()
+    shipped.mkdir()
+    (shipped / "full-0.safetensors").write_bytes(b"")
+    signed = next(v for v in PLANNED.variants if v.name == "signed")
+
+    def trained(job: str) -> Any:
+        return study_run.train_job(PLANNED, job, mine, root, shipped=shipped)
+
+    assert trained("full-0") is None
+    assert study_run.train_job(PLANNED, "full-0", mine, root) == "trained"
+    for folder in (shipped, mine):
+        (folder / "full-0.safetensors").write_bytes(b"")
+        assert trained("signed-0") == "trained"
+        assert asked.pop() == (
+            mine / "signed-0.safetensors", signed.recipe_for(0), ModelConfig(exchange="signed"), root, mine / "signed-0",
+            folder / "full-0.safetensors",
+        )  # fmt: skip
+    assert asked == [
+        (mine / "full-0.safetensors", PLANNED.variants[0].recipe_for(0), ModelConfig(), root, mine / "full-0", None)
+    ]
+    (mine / "signed-0.safetensors").write_bytes(b"")
+    assert trained("signed-0") is None
