@@ -1,0 +1,100 @@
+"""What joining takes of a share and of its ego: which pose, which time, whose age, which variance, whose common part."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from perception_examples import capture
+
+from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
+from sortie.perception.lateness import CARS, reach_m, still_right
+from sortie.perception.motion import Tracks
+from sortie.perception.types import Boxes, Share
+from sortie.perception.uncertainty import BoxErrors
+
+HERE = (0.0, 0.0, 0.0)
+ERRORS = BoxErrors((0.4, -0.1, 0.0, 0.2, 0.0), (-1.2, 0.0, 0.1, 0.1, 0.0), 0.9)
+
+
+def boxes_at(*rows: tuple[float, float, float]) -> Boxes:
+    """Cars by x, y and score, heading east."""
+    return Boxes.placed(np.array([(x, y, 4.5, 1.9, 0.0, score) for x, y, score in rows]), HERE)
+
+
+def test_boxes_are_as_uncertain_as_they_look_from_where_the_sender_believed_to_be() -> None:
+    """What was sent was worked out by the sender, who knows no truth."""
+    boxes = boxes_at((40.0, 10.0, 0.8), (-20.0, 35.0, 0.3))
+    seen = capture(0.0, 0.0, yaw=0.0, est=(15.0, -12.0, 60.0, 0.4))
+    got = source_of(Share(seen, "uncertain_boxes", 1.0, None, 1.0), boxes, ERRORS).covariance_m2
+    assert got is not None
+    np.testing.assert_array_equal(got, ERRORS.covariances_m2(boxes.xy_m, boxes.score, (15.0, -12.0, 0.4)))
+    assert np.abs(got - ERRORS.covariances_m2(boxes.xy_m, boxes.score, HERE)).max() > 0.01
+
+
+def test_a_late_box_goes_with_the_track_that_was_there_when_it_was_seen() -> None:
+    """A track at 12 m/s is compared with the box where it was at the capture, not where it is at the fusion."""
+    track = Tracks(
+        owner=np.array([0]), id=np.array([1]), t_s=np.array([6.0]), xy_m=np.array([[30.0, 5.0]]),
+        velocity_mps=np.array([[12.0, 0.0]]), covariance=np.array([[0.1, 0.0, 0.1]]), size_m=np.array([[4.5, 1.9]]),
+        yaw_rad=np.zeros(1), score=np.array([0.8]), hits=np.array([9]), looks=np.array([9]), seen_s=np.array([6.0]),
+        confirmed=np.array([True]),
+    )  # fmt: skip
+    boxes = boxes_at((30.0 - 12.0, 5.0, 0.7), (30.0, 5.0, 0.6))
+    share = Share(capture(t_s=5.0), "detections", 1.0, None, 1.0, age_s=1.0, tracks=track)
+    got = source_of(share, boxes).velocity_mps
+    assert got is not None
+    np.testing.assert_array_equal(got, [[12.0, 0.0], [np.nan, np.nan]])
+
+
+@pytest.mark.parametrize(
+    ("looked", "fused", "counts"), [(True, False, True), (False, True, True), (False, False, False)]
+)
+def test_an_ego_without_a_look_counts_where_maps_were_fused_for_it(looked: bool, fused: bool, counts: bool) -> None:
+    ego = capture()._replace(looked=looked)
+    found = EgoSources.of(ego, (), boxes_at((5.0, 5.0, 0.9)), fused, [])
+    assert found.looked is counts
+    assert len(found.sources()) == counts
+
+
+@pytest.mark.parametrize("rule", ["nms", "average"])
+def test_boxes_lose_by_their_whole_age_where_the_ego_has_no_look(rule: str) -> None:
+    """There is no look of its own that they could be compared with, however late all of them are."""
+    lone = boxes_at((20.0, 0.0, 0.8))
+    ego = EgoSources(HERE, Boxes.empty(), False, [SourceBoxes(lone, 1.0, HERE, age_s=0.7)], looked=False)
+    assert ego.freshest_s == 0.0
+    (found,) = joined_many([ego], rule)  # type: ignore[arg-type]
+    assert found.score == pytest.approx(0.8 * still_right(reach_m(lone.size_m), 0.7), rel=1e-5)
+
+
+def test_a_known_variance_stays_with_its_box_however_boxes_are_sorted() -> None:
+    """A place counts by score and inverse variance beside the fresh one; the best box is not the first that came."""
+    own = boxes_at((20.0, 0.0, 0.6), (-20.0, 0.0, 0.5))
+    theirs, variance = boxes_at((-19.6, 0.0, 0.55), (20.4, 0.0, 0.9)), np.array([0.5, 3.0])
+    ego = EgoSources(HERE, own, False, [SourceBoxes(theirs, 1.0, HERE, age_s=0.4, variance_m2=variance)])
+    (found,) = joined_many([ego], "average")
+    wanted = []
+    for mine, its, known, at in ((0.6, 0.9, 3.0, 20.0), (0.5, 0.55, 0.5, -20.0)):
+        part = its * float(CARS.sigma0_m2) / known
+        wanted.append(at + 0.4 * part / (mine + part))
+    assert sorted(found.xy_m[:, 0].tolist()) == pytest.approx(sorted(wanted), abs=1e-5)
+
+
+def test_what_places_have_in_common_is_the_callers_share_or_the_detectors_or_all() -> None:
+    """None leaves it to the ego's errors, and without those everything may be in common; 0 is a share like any other."""
+    own, theirs = boxes_at((20.0, 0.0, 0.6)), boxes_at((20.6, 0.5, 0.8))
+    sent = np.array([[0.05, 0.0, 0.6]])
+    source = SourceBoxes(theirs, 0.5, HERE, covariance_m2=sent)
+
+    def place(errors: BoxErrors | None, common: float | None) -> np.ndarray:
+        (found,) = joined_many([EgoSources(HERE, own, False, [source], errors=errors)], "nms", common)
+        return found.xy_m[0]
+
+    np.testing.assert_array_equal(place(None, None), place(None, 1.0))
+    np.testing.assert_array_equal(place(ERRORS, None), place(ERRORS, ERRORS.common))
+    assert np.abs(place(None, None) - place(None, 0.0)).max() > 0.01
+    assert np.abs(place(ERRORS, 0.0) - place(ERRORS, None)).max() > 0.001
+    # independent: each axis is the mean by weight and inverse variance
+    variances = np.array([float(CARS.sigma0_m2)] * 2), sent[0, [0, 2]]
+    weights = 1.0 / variances[0], 0.5 / variances[1]
+    wanted = (weights[0] * own.xy_m[0] + weights[1] * theirs.xy_m[0]) / (weights[0] + weights[1])
+    np.testing.assert_allclose(place(None, 0.0), wanted, atol=1e-4)
