@@ -60,7 +60,7 @@ def test_an_ego_without_a_look_counts_where_maps_were_fused_for_it(looked: bool,
 def test_boxes_lose_by_their_whole_age_where_the_ego_has_no_look(rule: str) -> None:
     """There is no look of its own that they could be compared with, however late all of them are."""
     lone = boxes_at((20.0, 0.0, 0.8))
-    ego = EgoSources(HERE, Boxes.empty(), False, [SourceBoxes(lone, 1.0, HERE, age_s=0.7)], looked=False)
+    ego = EgoSources(HERE, Boxes.empty(), False, [SourceBoxes(lone, 1.0, HERE, age_s=0.7)], age_s=0.3, looked=False)
     assert ego.freshest_s == 0.0
     (found,) = joined_many([ego], rule)  # type: ignore[arg-type]
     assert found.score == pytest.approx(0.8 * still_right(reach_m(lone.size_m), 0.7), rel=1e-5)
@@ -69,11 +69,11 @@ def test_boxes_lose_by_their_whole_age_where_the_ego_has_no_look(rule: str) -> N
 def test_a_known_variance_stays_with_its_box_however_boxes_are_sorted() -> None:
     """A place counts by score and inverse variance beside the fresh one; the best box is not the first that came."""
     own = boxes_at((20.0, 0.0, 0.6), (-20.0, 0.0, 0.5))
-    theirs, variance = boxes_at((-19.6, 0.0, 0.55), (20.4, 0.0, 0.9)), np.array([0.5, 3.0])
+    theirs, variance = boxes_at((-19.6, 0.0, 0.3), (20.4, 0.0, 0.9)), np.array([3.0, 0.3])
     ego = EgoSources(HERE, own, False, [SourceBoxes(theirs, 1.0, HERE, age_s=0.4, variance_m2=variance)])
     (found,) = joined_many([ego], "average")
     wanted = []
-    for mine, its, known, at in ((0.6, 0.9, 3.0, 20.0), (0.5, 0.55, 0.5, -20.0)):
+    for mine, its, known, at in ((0.6, 0.9, 0.3, 20.0), (0.5, 0.3, 3.0, -20.0)):
         part = its * float(CARS.sigma0_m2) / known
         wanted.append(at + 0.4 * part / (mine + part))
     assert sorted(found.xy_m[:, 0].tolist()) == pytest.approx(sorted(wanted), abs=1e-5)
