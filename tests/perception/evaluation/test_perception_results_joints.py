@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from harness_examples import MadeFrames, MadeInstrument, made_frames
 
-from sortie.perception.evaluation import selection
+from sortie.perception.evaluation import scores, selection
 from sortie.perception.evaluation.condition import SINGLE, Sharing, Ways
 from sortie.perception.evaluation.evaluate import (
     REGION_M,
@@ -29,6 +29,7 @@ from sortie.perception.metrics.bootstrap import rank
 from sortie.perception.types import Boxes
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.intervals import resamples
+from sortie.scenarios.streams import stream
 
 WAYS = Ways("zeros", "region_first")
 SHARED = Sharing(0.1, "best-2")
@@ -70,32 +71,37 @@ def test_scores_of_one_threshold_and_disc_are_not_those_of_another(two_egos: Eva
 
 @pytest.mark.parametrize("by", ["frame", "scene"])
 def test_draws_and_halves_are_of_the_bootstraps_own_seed_and_groups(two_egos: Evaluation, by: str) -> None:
-    scores = Bootstrap(two_egos, "zero", "norm", by=by, draws=9, seed=5, ways=WAYS)  # type: ignore[arg-type]
+    its = Bootstrap(two_egos, "zero", "norm", by=by, draws=9, seed=5, ways=WAYS)  # type: ignore[arg-type]
     ranked = rank(two_egos.matched(UNDER), two_egos.groups("full", by))  # type: ignore[arg-type]
     groups = {"frame": 5, "scene": 3}[by]
-    np.testing.assert_array_equal(scores.draws(SHARED, "full"), ranked.ap(resamples(groups, 9, 5)))
+    np.testing.assert_array_equal(its.draws(SHARED, "full"), ranked.ap(resamples(groups, 9, 5)))
     for resampled in (False, True):
         both = [ranked.ap(w) for w in split(groups, 9, 5, resampled=resampled)]
-        got = scores.halves(SHARED, "full", resampled=resampled)
+        got = its.halves(SHARED, "full", resampled=resampled)
         np.testing.assert_array_equal(got, np.stack(both, axis=1))
 
 
 def test_the_bytes_of_a_frame_are_those_of_its_egos_without_the_index(two_egos: Evaluation) -> None:
     """Two egos, each with a tenth of four maps; two silent peers send nothing."""
-    scores = Bootstrap(two_egos, "zero", "norm", ways=WAYS)
-    assert scores.fleet_frame_bytes(SHARED) == [2 * 1638 * 160.0] * 5
+    its = Bootstrap(two_egos, "zero", "norm", ways=WAYS)
+    assert its.fleet_frame_bytes(SHARED) == [2 * 1638 * 160.0] * 5
     assert two_egos.index_bytes[UNDER].tolist() == [1024] * 10
 
 
-def test_resampled_halves_are_drawn_by_other_numbers_than_the_split() -> None:
-    """The first draw of a half would otherwise be known from who is in it."""
-    first, second = split(40, 300, 3, resampled=True)
-    plain = split(40, 300, 3, resampled=False)
-    for drawn, member in zip((first, second), plain, strict=True):
-        assert ((drawn > 0) <= (member > 0)).all()
-        assert (drawn.sum(axis=1) == 20).all()
-        counts = drawn[member > 0]
-        assert counts.var() == pytest.approx(0.95, abs=0.06), "each of 20 drawn 20 times: 1 − 1/20"
+def test_resampled_halves_are_drawn_by_other_numbers_than_the_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who is in a half would otherwise say how often it is drawn. The halves are those of the plain split."""
+    names: list[str] = []
+
+    def noted(seed: int, replication: int, key: tuple[int, ...], name: str) -> np.random.Generator:
+        names.append(name)
+        return stream(seed, replication, key, name)
+
+    monkeypatch.setattr(scores, "stream", noted)
+    drawn, plain = split(40, 30, 3, resampled=True), split(40, 30, 3, resampled=False)
+    for some, member in zip(drawn, plain, strict=True):
+        assert ((some > 0) <= (member > 0)).all()
+        assert (some.sum(axis=1) == 20).all()
+    assert names[0] == names[2] != names[1]
 
 
 def test_exchanges_go_by_what_drones_believe_and_by_the_settings_seed() -> None:

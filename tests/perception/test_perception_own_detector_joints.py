@@ -1,0 +1,97 @@
+"""A detector of one's own: what it is made of, and what it computes in the background, is checked as everything else is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from perception_examples import EMPTY, capture
+
+from sortie.perception.detectors import make_detector
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.types import Boxes
+from sortie.scenarios.plugins.reference import PluginError
+from sortie.scenarios.schema import Perception
+
+CODE = """
+import numpy as np
+from sortie.perception.types import Boxes
+
+
+class Ahead:
+    def __init__(self, scene, config, seed, replication, *, what="right"):
+        self.made_of, self.what = (scene, config, seed, replication), what
+
+    def detect(self, jobs):
+        return [Boxes.empty() for _ in jobs]
+
+    def begin(self, jobs):
+        def finish():
+            if self.what == "fails":
+                raise RuntimeError("out of memory")
+            found = self.detect(jobs)
+            if self.what == "infinite":
+                found[0] = Boxes(np.array([[np.inf, 0.0]]), np.ones((1, 2)), np.zeros(1), np.ones(1))
+            if self.what == "half":
+                found[0] = Boxes(np.array([[np.nan, 0.0], [1.0, 0.0]]), np.ones((2, 2)), np.zeros(2), np.ones(2))
+            return found[1:] if self.what == "short" else found
+
+        return finish
+
+    def truth(self, t_s, ego):
+        return None if self.what == "truth" else Boxes.empty()
+
+    def count_boxes(self, capture, roi):
+        return -1 if self.what == "count" else 0
+
+    def camera_views(self, capture):
+        raise ValueError("none")
+"""
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Callable[[str], Any]:
+    path = tmp_path / "mine.py"
+    path.write_text(CODE)
+    scene = SceneModel(EMPTY, None, (-9.0, -9.0, 9.0, 9.0))
+
+    def make(what: str) -> Any:
+        config = Perception(detector=f"{path}:Ahead", detector_params={"what": what})
+        return make_detector(scene, config, 3, 4)
+
+    return make
+
+
+def test_it_is_given_scene_section_seed_replication_and_its_parameters(made: Callable[[str], Any]) -> None:
+    found = made("right")
+    _, config, seed, replication = found.made_of
+    assert (seed, replication, found.what) == (3, 4, "right")
+    assert config.detector.endswith(":Ahead")
+    jobs = [(capture(), []), (capture(drone=1), [])]
+    assert [len(b) for b in found.begin(jobs)()] == [len(b) for b in found.detect(jobs)] == [0, 0]
+    assert found.count_boxes(capture(), None) == 0
+    assert isinstance(found.truth(5.0, capture()), Boxes)
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("fails", "out of memory"),
+        ("short", "must be Boxes for each of the jobs"),
+        ("infinite", "xy_m that is not finite"),
+        ("half", "xy_m that is not finite"),
+    ],
+)
+def test_what_it_computes_in_the_background_is_checked(made: Callable[[str], Any], what: str, message: str) -> None:
+    finish = made(what).begin([(capture(), [])])
+    with pytest.raises(PluginError, match=message):
+        finish()
+
+
+def test_its_truth_and_its_count_are_checked(made: Callable[[str], Any]) -> None:
+    with pytest.raises(PluginError, match="truth returns None, must be Boxes"):
+        made("truth").truth(5.0, capture())
+    with pytest.raises(PluginError, match="count_boxes returns -1, must be a whole number"):
+        made("count").count_boxes(capture(), None)
