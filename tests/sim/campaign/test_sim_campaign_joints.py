@@ -110,14 +110,17 @@ def test_speed_and_time_left_are_of_what_this_driver_flew() -> None:
 
 
 class Engine:
-    """Gives results by twos."""
+    """Gives some results at a time."""
 
     workers = 1
 
+    def __init__(self, at_once: int = 2) -> None:
+        self.at_once = at_once
+
     def results(self, code: str, tasks: Iterator[Any]) -> Iterator[list[RunResult]]:
         runs = [RunResult(run, "", "done", "", "", (0.5,)) for run, _ in tasks]
-        for k in range(0, len(runs), 2):
-            yield runs[k : k + 2]
+        for k in range(0, len(runs), self.at_once):
+            yield runs[k : k + self.at_once]
 
 
 class Store:
@@ -163,6 +166,16 @@ def test_a_driver_tells_all_that_it_flew_and_no_more_than_it_keeps(at_least: int
     else:
         assert (known, store.dropped) == ([(2, 8, 0), (4, 8, 2), (6, 8, 4), (8, 8, 6)], [])
         assert (last.finished, last.of, last.flown) == (8, 8, 6)
+
+
+def test_what_was_flown_beyond_the_end_is_not_among_what_is_finished() -> None:
+    asked = StopWhen(metric=AP, half_width=0.2, at_least=2)
+    of = SimpleNamespace(
+        campaign=SimpleNamespace(stop_when=asked), policies=["a", "b"], runs=8, code="", task=lambda run: ""
+    )
+    store = Store()
+    last = _drive(of, store, Engine(6), lambda p: None)  # type: ignore[arg-type]
+    assert (last.finished, last.of, last.flown, store.dropped) == (6, 6, 6, [2])
 
 
 def test_failed_runs_that_are_dropped_are_counted_no_more(tmp_path: Path) -> None:

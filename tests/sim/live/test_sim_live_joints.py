@@ -28,9 +28,9 @@ from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.live import platform
 from sortie.sim.live.bench import Bench
 from sortie.sim.live.node import _HEADER, LiveNode
-from sortie.sim.live.payload_message import unpack_bytes
+from sortie.sim.live.payload_message import pack_bytes, unpack_bytes
 from sortie.sim.live.platform import MavlinkSenses
-from sortie.sim.live.policy_process import Ask, _decide, _plain, take_notices
+from sortie.sim.live.policy_process import Ask, Decision, _decide, _plain, take_notices
 from sortie.sim.live.reports import Notice
 from sortie.sim.live.rules import rules_of
 from sortie.sim.live.seals import Seals
@@ -189,6 +189,10 @@ def test_a_node_waits_for_the_readers_of_those_that_are_present_and_of_the_bench
     assert not first.all_found({0, 1, 2})
     node(bus, 2)
     assert first.all_found({0, 1, 2})
+    for topic in (CONTEXT, Topic(ORDER, 0, 1), Topic(FEATURES, 0, 2)):
+        gone = bus.readers[topic].pop()
+        assert not first.all_found({0, 1, 2}), topic
+        bus.readers[topic].append(gone)
 
 
 def test_a_report_is_not_changed_by_what_comes_later() -> None:
@@ -199,8 +203,18 @@ def test_a_report_is_not_changed_by_what_comes_later() -> None:
     made.note("second")
     made.handshake(1, 24, CAPTURE, 0.3)
     assert [notice.text for notice in told.new.notices] == ["first"]
-    assert told.sent[FEATURES].samples == 0
-    assert [notice.text for notice in made.report(2.0).new.notices] == ["second"]
+    made._on_payload(pack_bytes(content(1, 49.9, directive(1, 0))), bus.readers[Topic(FEATURES, 1, 0)][0])
+    assert (told.sent[FEATURES].samples, told.received[FEATURES].samples) == (0, 0)
+    later = made.report(2.0)
+    assert ([notice.text for notice in later.new.notices], later.received[FEATURES].samples) == (["second"], 1)
+
+
+def test_the_time_of_a_decision_that_was_not_used_is_no_time_of_a_decision() -> None:
+    made = node(MemoryBus())
+    for elapsed_ns, text in ((7, "a"), (0, "b"), (9, "c")):
+        made.decided(Decision(1, elapsed_ns=elapsed_ns, notices=(Notice(1.0, 0, text),)))
+    told = made.report(2.0).new
+    assert (told.decide_ns, [notice.text for notice in told.notices]) == ([7, 9], ["a", "b", "c"])
 
 
 # --- a vehicle ------------------------------------------------------------------------------------------------------

@@ -272,6 +272,8 @@ def test_drones_fly_as_far_apart_as_the_farthest_of_those_in_the_air() -> None:
         made, scenario=made.scenario.model_copy(update={"fleet": fleet}), tables=tables_of({"states": states})
     )
     assert spread_m(flown) == pytest.approx(10.0)
+    often = [{**s, "x_m": 1000.0 + 100.0 * (s["drone"] == 1)} if s["t_s"] < 4 else s for s in states]
+    assert spread_m(replace(flown, tables=tables_of({"states": often}))) == pytest.approx(50.0)
     three = [{**s, "airborne": True, "y_m": 0.0, "x_m": (0.0, 30.0, 90.0)[s["drone"]]} for s in states]
     assert spread_m(replace(flown, tables=tables_of({"states": three}))) == pytest.approx(50.0)
 
