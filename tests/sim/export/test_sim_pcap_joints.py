@@ -16,7 +16,7 @@ from record_by_hand import record, tables_of
 
 from sortie.fleet.tiles import cut
 from sortie.radio.mac.airtime import sample_wire
-from sortie.sim.export.pcap import KEPT_BYTES, _datagram, _payload_packets, address
+from sortie.sim.export.pcap import GROUP, KEPT_BYTES, _datagram, _payload_packets, address
 from sortie.sim.export.topics import TopicKind
 
 BEGIN_NS = 7_000_000_000
@@ -80,6 +80,15 @@ def test_of_a_payload_that_was_broken_off_as_much_is_there_as_went() -> None:
     ]  # fmt: skip
 
 
+def test_a_fragment_that_did_not_go_whole_is_not_there() -> None:
+    """Two bytes are lacking to the second of three; the last of another payload is shorter than what is kept of it."""
+    _, once = sample_wire(3000, 1344)
+    made = packets(
+        [row(0, 1, "features", 3000, 1.0, 2.0, wire_bytes=2 * once // 3 - 2), row(0, 1, "features", 1350, 2.0, 3.0)]
+    )
+    assert [(p["t_s"], p["bytes"]) for p in made] == [(2.0, 1344), (2.5, 1344), (3.0, 6)]
+
+
 def test_samples_are_numbered_by_sender_and_topic_and_requests_go_with_boxes() -> None:
     made = packets([
         row(0, 1, "features", 500, 0.1, 0.2), row(0, 2, "features", 600, 0.2, 0.3), row(1, 0, "features", 700, 0.3, 0.4),
@@ -120,7 +129,8 @@ def test_the_checksum_of_every_header_is_the_complement_of_its_sum() -> None:
         made = record()
         tables = tables_of({"transmissions": [row(drone, peer, "features", size, 0.1, 0.2)]})
         (packet,) = _payload_packets(replace(made, tables=tables), BEGIN_NS)
-        header = _datagram(packet)[:20]
-        total = sum(struct.unpack(">10H", header))
-        assert (total & 0xFFFF) + (total >> 16) == 0xFFFF
-        assert (header[12:16], header[16:20], header[8]) == (address(drone), address(peer), 64)
+        for ends, hops in ((packet.destination, 64), ((GROUP, 7401), 1)):
+            header = _datagram(packet._replace(destination=ends))[:20]
+            total = sum(struct.unpack(">10H", header))
+            assert (total & 0xFFFF) + (total >> 16) == 0xFFFF
+            assert (header[12:16], header[16:20], header[8]) == (address(drone), ends[0], hops)
