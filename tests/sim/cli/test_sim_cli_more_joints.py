@@ -272,6 +272,7 @@ def test_study(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
 def test_the_doses_of_the_study(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    stand_in(monkeypatch, "sortie.perception.study.dose_figure", draw=None)
     from sortie.perception.study import doses
 
     def effect(value: float) -> Any:
