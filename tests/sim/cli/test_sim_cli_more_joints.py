@@ -463,12 +463,14 @@ def verified(monkeypatch: pytest.MonkeyPatch, proved: str = "proved", judged: st
 
 def test_verify(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (here / "lines").write_text("representation >= detections\nwithin 0.5 s: representation >= detections\n")
-    seen = verified(monkeypatch)
+    seen, resolved = verified(monkeypatch), Seen(lambda view: [])
+    monkeypatch.setattr(verify_command, "resolve", resolved)
     options = (
         "--invariants", "lines", "--drones", "3", "--budget", "4", "--views", "50", "--scenario", "s.yaml", "--courses", "6",
         "--flights", "7",
     )  # fmt: skip
     assert command("verify", "best-2(received_budget=0.25)", *options) == 0
+    assert resolved.args == ("best-2", {"received_budget": 0.25})
     assert seen["conform"].kwargs == {"count": 50}
     decide, rules = seen["prove"].args
     assert seen["prove"].kwargs == {"max_drones": 3, "budget_s": 4.0}
