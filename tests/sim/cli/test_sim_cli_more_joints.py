@@ -391,6 +391,7 @@ def test_the_best_of_a_condition_is_bold_in_whichever_table_it_stands(
 
 
 def test_learn(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
     lessons = [Lesson((0.0,), (0.5, 0.25, 0.0), "a"), Lesson((0.0,), (0.25, 0.5, 0.5), "b")]
     flown, saved = Seen(lessons), Seen(True)
     found = {
