@@ -23,11 +23,17 @@ import sortie
 from sortie.perception.evaluation.condition import Sharing
 from sortie.policies.verification.invariants import Invariant
 from sortie.scenarios.intervals import Estimate
+from sortie.sim.cli import console
 from sortie.sim.cli import paper as paper_command
 from sortie.sim.cli import verify as verify_command
 from sortie.sim.cli.options import loaded, split_policies
 from sortie.sim.studies.conditions import Cell
 from sortie.sim.studies.learn import Lesson
+
+
+@pytest.fixture(autouse=True)
+def _wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console.out, "width", 200)  # tables as they are, whatever the terminal's width
 
 
 class Seen:
@@ -74,7 +80,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a scenario."""
     (tmp_path / "s.yaml").write_text(BASE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
     return tmp_path
 
 
@@ -391,7 +396,6 @@ def test_the_best_of_a_condition_is_bold_in_whichever_table_it_stands(
 
 
 def test_learn(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
     lessons = [Lesson((0.0,), (0.5, 0.25, 0.0), "a"), Lesson((0.0,), (0.25, 0.5, 0.5), "b")]
     flown, saved = Seen(lessons), Seen(True)
     found = {
@@ -428,7 +432,6 @@ def test_learn(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
 
 
 def test_overhead(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
     row = SimpleNamespace(
         policy="p", context_bytes_per_s=2500.0, data_bytes_per_s=3_500_000.0, context_share=0.125, p50_ms=0.25, p99_ms=0.75,
     )  # fmt: skip
