@@ -25,7 +25,7 @@ from sortie.fleet.logs.fields import from_dataflash, from_tlog, from_ulog, utc_a
 from sortie.fleet.logs.flightlog import FlightLog, Series, _assemble
 from sortie.fleet.logs.ground_station import answers
 from sortie.fleet.logs.identify import hovering, predicted_voltage, voltage_error
-from sortie.fleet.logs.logtrace import beside, context_trace, on_one_clock
+from sortie.fleet.logs.logtrace import _resampled, beside, context_trace, on_one_clock
 from sortie.fleet.logs.mavlink import Transmitter, messages
 from sortie.fleet.logs.vehicle import VehicleState, after
 from sortie.scenarios.schema import Battery
@@ -318,3 +318,13 @@ def test_a_station_of_the_fleet_is_never_armed_and_courses_are_from_north() -> N
     gnss = mavlink2.MAV_SYS_STATUS_SENSOR_GPS
     assert by_name["SYS_STATUS"].onboard_control_sensors_health & gnss
     assert not lost["SYS_STATUS"].onboard_control_sensors_health & gnss
+
+
+def test_a_value_that_is_unknown_for_a_while_is_a_gap_of_its_own_column() -> None:
+    """The other column of the same series goes on; a short pause is bridged, and nothing is known after a column's end."""
+    time_s = np.arange(11.0) / 2
+    holed, ends, whole = (np.arange(11.0) for _ in range(3))
+    holed[3:8] = np.nan  # 1.5 to 3.5 s, from 1.0 s to 4.0 s without a sample
+    ends[9:] = np.nan
+    found = _resampled(series(time_s, holed, ends, whole), np.array([0.75, 2.5, 4.25, 4.75]))
+    np.testing.assert_array_equal(found, [(1.5, 1.5, 1.5), (np.nan, 5.0, 5.0), (8.5, np.nan, 8.5), (9.5, np.nan, 9.5)])
