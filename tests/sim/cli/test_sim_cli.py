@@ -392,6 +392,20 @@ def test_check_passes_with_code_0(scenario: Path) -> None:
     assert CliRunner().invoke(app, ["check", str(scenario)]).exit_code == 0
 
 
+@pytest.mark.parametrize("order", ["bad good", "good bad", "bad good bad", "good good"])
+def test_what_fails_in_any_of_several_scenarios_fails_the_check(order: str, tmp_path: Path) -> None:
+    """Two expectations fail in each bad one."""
+    bounds = {"good": ("at_least: 0", "at_least: 0"), "bad": ("at_most: -1", "at_most: -2")}
+    files = []
+    for number, kind in enumerate(order.split()):
+        expected = ", ".join(f"{{metric: bytes.data_sent, {bound}}}" for bound in bounds[kind])
+        files.append(tmp_path / f"{number}.yaml")
+        files[-1].write_text(BASE.replace("duration_s: 6", "duration_s: 3.5") + f"expect: [{expected}]\n")
+    done = CliRunner().invoke(app, ["check", *map(str, files)])
+    bad = order.split().count("bad")
+    assert (done.exit_code, done.stderr) == ((1, f"{2 * bad} expectations failed\n") if bad else (0, ""))
+
+
 def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: Path, tmp_path: Path) -> None:
     (tmp_path / "README.md").write_text("# Mine\n\n<!-- compare:begin -->old<!-- compare:end -->\n\nSee below.\n")
     done = sortie(
