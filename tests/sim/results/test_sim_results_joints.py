@@ -415,3 +415,19 @@ def test_accuracy_is_sampled_no_oftener_than_frames_come_and_fused_as_the_detect
     often = record.scenario.context.model_copy(update={"rate_hz": 0.5})
     slow = replace(record, scenario=record.scenario.model_copy(update={"context": often}))
     assert outcome(slow)["ap50"]["sample_rate_hz"] == 0.5
+
+
+@pytest.mark.parametrize("duration_s", [2.0, 4.0])
+def test_a_phase_that_the_end_cuts_short_ends_with_the_sortie(duration_s: float) -> None:
+    """The plan begins its second phase at 3 s and its third one at 10 s."""
+    phases = "mission.phases=[{at_s: 0, phase: search}, {at_s: 3, phase: track}, {at_s: 10, phase: search}]"
+    record = run_sortie(example(f"duration_s={duration_s}", phases))
+    flown = outcome(record)["phases"]
+    ends_s = [3.0, duration_s] if duration_s > 3 else [duration_s]
+    assert [phase["end_s"] for phase in flown] == ends_s
+    begin_s = flown[-1]["begin_s"]
+    rows = record.tables["transmissions"].select(["captured_s", "payload_bytes"]).to_pylist()
+    sent_bytes = sum(row["payload_bytes"] for row in rows if row["captured_s"] >= begin_s)
+    rate_mbps = sent_bytes * 8e-6 / (duration_s - begin_s)
+    assert flown[-1]["data_rate_mbps"] == pytest.approx(rate_mbps)
+    assert rate_mbps > 0
