@@ -528,6 +528,24 @@ def test_receivers_lose_a_descriptor_each_by_a_draw_of_its_own() -> None:
         assert np.abs(off).max() < 0.25
 
 
+def test_a_burst_takes_its_share_of_the_fragments_that_the_signal_lets_through() -> None:
+    """On a link that loses some by itself, a burst of a half takes half of the rest."""
+
+    def lost(loss: float) -> float:
+        config = AirSettings(
+            shadowing_sigma_db=0.0, tx_power_dbm=-11.5, rician_k_db=30.0, retry_limit=0,
+            preamble_detection_dbm=-120.0, bursts=BurstSettings(loss_good=loss),
+        )  # fmt: skip
+        flight = Hover(config, n=2)
+        flight.fly(20.0, lambda k: flight.send(0, 1, 13_000))
+        assert {r.mcs for r in flight.rows} == {1}
+        return sum(r.fragments_lost for r in flight.rows) / sum(r.fragments for r in flight.rows)
+
+    alone = lost(0.0)
+    assert 0.1 < alone < 0.3
+    assert lost(0.5) == pytest.approx(alone + 0.5 * (1 - alone), abs=0.03)
+
+
 def test_a_burst_takes_its_share_of_the_descriptors_that_the_signal_lets_through() -> None:
     """Two causes, a draw each: of descriptors that half come by their signal, a burst of a half leaves a quarter, not none."""
 
