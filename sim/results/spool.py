@@ -86,6 +86,9 @@ class SpooledTables(Mapping[str, pa.Table]):
     def __getitem__(self, name: str) -> pa.Table:
         return pa.Table.from_batches(list(self.batches(name)), self._schemas[name])
 
+    def __contains__(self, name: object) -> bool:
+        return name in self._schemas  # without reading it
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._schemas)
 

@@ -102,6 +102,14 @@ def test_an_observer_gets_every_row_once(monkeypatch: pytest.MonkeyPatch) -> Non
         assert repr(rows) == repr(run.tables[name].to_pylist()), name  # NaN equals itself as text
 
 
+def test_whether_there_is_a_table_is_known_without_reading_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    tables = flown("views").tables
+    monkeypatch.setattr(spool.SpooledTables, "batches", lambda *_: pytest.fail("read"))
+    assert "states" in tables
+    assert "nothing" not in tables
+    assert set(TABLES) <= set(tables)
+
+
 def test_a_table_has_few_row_groups(tmp_path: Path) -> None:
     run_folder.save(usual("boxes")[0], tmp_path / "run")
     assert pq.ParquetFile(tmp_path / "run/states.parquet").num_row_groups == 1
