@@ -108,7 +108,7 @@ def score(record: SortieRecord, kinds: Sequence[TargetClass], begin_s: float = 0
         (kind, scope): [] for kind in kinds for scope in (FULL_SCENE, MISSION)
     }
     grounded = dict.fromkeys((FULL_SCENE, MISSION), 0)
-    for here, until_s in fusion_blocks(t_s):
+    for here, until_s in fusion_blocks(t_s, record.scenario.duration_s):
         keys = list(zip(t_s[here].tolist(), drone[here].tolist(), strict=True))
         discs = regions.at(t_s[here], drone[here])
         block = _Block(keys, discs, columns_of(found.before(until_s)), columns_of(truth.before(until_s)))

@@ -12,25 +12,31 @@ from numpy.typing import NDArray
 Key = tuple[float, int]
 """A scored fusion: its time and its ego."""
 Columns = dict[str, NDArray[Any]]
-BLOCK_FUSIONS = 1024
+BLOCK_FUSIONS = 256
 """Fusions worked out at once."""
+REST_S = 60.0
+"""How much of the time behind the last fusion is worked out at once."""
 
 
-def fusion_blocks(t_s: NDArray[np.float64]) -> Iterator[tuple[slice, float]]:
-    """Fusions in blocks, and the time before which a block's boxes stand; those of one time stay together."""
+def fusion_blocks(t_s: NDArray[np.float64], end_s: float = 0.0) -> Iterator[tuple[slice, float]]:
+    """Fusions in blocks, and the time before which a block's boxes stand; those of one time stay together.
+
+    Behind the last fusion come blocks without any, up to `end_s`: drones that no longer fuse may still have truths.
+    """
     begin, count = 0, len(t_s)
-    while True:
+    while begin + BLOCK_FUSIONS < count:
         after = begin + BLOCK_FUSIONS
-        if after >= count:
-            yield slice(begin, count), float("inf")
-            return
         end = int(np.searchsorted(t_s, t_s[after]))
         if end == begin:  # so many at one time
             end = int(np.searchsorted(t_s, t_s[after], side="right"))
-        yield slice(begin, end), float(t_s[end]) if end < count else float("inf")
         if end >= count:
-            return
+            break
+        yield slice(begin, end), float(t_s[end])
         begin = end
+    last_s = float(t_s[-1]) if count else 0.0
+    for until_s in (*np.arange(last_s + REST_S, end_s, REST_S).tolist(), float("inf")):
+        yield slice(begin, count), until_s
+        begin = count
 
 
 def columns_of(rows: pa.Table) -> Columns:

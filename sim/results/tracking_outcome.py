@@ -28,7 +28,7 @@ def tracking_outcome(record: SortieRecord) -> dict[str, float | None]:
     tables = record.tables
     if not tables["fusions"].num_rows or not _is_known(tables):
         return nothing
-    value = hota_of(_followed(tables, record.scenario.fleet.drones))
+    value = hota_of(_followed(tables, record.scenario.fleet.drones, record.scenario.duration_s))
     return nothing if value is None else value._asdict()
 
 
@@ -41,13 +41,15 @@ def _is_known(tables: Mapping[str, pa.Table]) -> bool:
     return True
 
 
-def _followed(tables: Mapping[str, pa.Table], drones: int) -> Iterator[tuple[Followed, Followed]]:
+def _followed(tables: Mapping[str, pa.Table], drones: int, end_s: float) -> Iterator[tuple[Followed, Followed]]:
     """What was there at the fusions that were scored, and what every drone's tracker makes of its boxes."""
     fusions = tables["fusions"]
     t_s, drone = fusions["t_s"].to_numpy(), fusions["drone"].to_numpy()
     truths, detections = InTime(tables, "truths"), InTime(tables, "detections")
     tracks, next_id, first = Tracks.empty(), np.zeros(drones, np.int64), 0
-    for here, until_s in fusion_blocks(t_s):
+    for here, until_s in fusion_blocks(t_s, end_s):
+        if here.start == here.stop:
+            return  # the rest belongs to no fusion
         instants, instant = np.unique(t_s[here], return_inverse=True)
         keys = list(zip(t_s[here].tolist(), drone[here].tolist(), strict=True))
         frames = (first + instant) * drones + drone[here]  # of each fusion

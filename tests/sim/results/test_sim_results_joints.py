@@ -104,6 +104,13 @@ def test_blocks_hold_every_fusion_once_and_all_of_one_time_together(size: int, m
     assert len(set(t_s.tolist())) == sum(len(set(t_s[here].tolist())) for here, _ in blocks)
 
 
+def test_behind_the_last_fusion_blocks_without_one_go_on_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sortie.sim.results.box_rows.REST_S", 2.0)
+    blocks = list(fusion_blocks(np.array([0.0, 1.0]), 6.0))
+    assert blocks == [(slice(0, 2), 3.0), (slice(2, 2), 5.0), (slice(2, 2), math.inf)]
+    assert list(fusion_blocks(np.zeros(0), 3.0)) == [(slice(0, 0), 2.0), (slice(0, 0), math.inf)]
+
+
 def test_rows_belong_to_the_fusion_of_their_time_and_their_drone() -> None:
     rows = {"t_s": np.array([1.0, 1.0, 1.0, 2.0, 2.0, 3.0]), "drone": np.array([0, 1, 1, 1, 0, 0])}
     keys = [(1.0, 0), (1.0, 1), (2.0, 1), (3.0, 0)]

@@ -26,6 +26,8 @@ from sortie.sim.results.record import TABLES, SortieRecord
 WALL = ("wall_s", "realtime_factor", "policy_eval_us")
 SCENARIOS = {
     "boxes": ["track_target", "perception.detector=surrogate", "duration_s=7"],
+    "all land": ["track_target", "perception.detector=surrogate", "duration_s=3",
+                 "events=[{kind: drone_lost, at_s: 1, drone: 0}, {kind: drone_lost, at_s: 1, drone: 1}, {kind: drone_lost, at_s: 1, drone: 2}, {kind: drone_lost, at_s: 1, drone: 3}, {kind: drone_lost, at_s: 1, drone: 4}]"],
     "people": ["person_crossing", "duration_s=8", "events=[]"],
     "drones that land": ["track_target", "perception.detector=surrogate", "duration_s=6",
                          "events=[{kind: drone_lost, at_s: 2, drone: 1}]"],
@@ -53,7 +55,7 @@ def make_tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name, value in (
         (scratch, "IN_MEMORY_BYTES", 0), (scratch, "TAPE_IN_MEMORY_BYTES", 0), (scratch, "BLOCK_BYTES", 1),
         (record, "BATCH_BYTES", 1), (record, "FIRST_ROWS", 1), (spool, "_READ_BYTES", 1), (selection, "IN_MEMORY", 0),
-        (box_rows, "BLOCK_FUSIONS", 3), (mission_outcome, "BLOCK_FRAMES", 2), (scoring, "WAITING_EGOS", 1),
+        (box_rows, "BLOCK_FUSIONS", 3), (box_rows, "REST_S", 0.25), (mission_outcome, "BLOCK_FRAMES", 2), (scoring, "WAITING_EGOS", 1),
         (run_folder, "_ROW_GROUP_BYTES", 1),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, value)
