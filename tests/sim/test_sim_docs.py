@@ -43,7 +43,9 @@ def examples(page: Path) -> list[Example]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("page", GUIDE, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, id=p.stem, marks=[pytest.mark.slow] * (p.stem == "learn")) for p in GUIDE]
+)
 def test_every_example_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order, in one folder: `# file:` names what is written there, other Python runs, and so does each command."""
     monkeypatch.chdir(tmp_path)

@@ -64,6 +64,7 @@ def test_frames_are_what_was_drawn(made: Path) -> None:
     assert frames.images.nbytes / len(frames) < 1.4e6
 
 
+@pytest.mark.slow
 def test_a_file_is_the_same_in_another_process_with_another_count_of_threads(made: Path, tmp_path: Path) -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(2)

@@ -147,7 +147,7 @@ def lively(config: ModelConfig) -> CarNet:
 
 
 @pytest.mark.parametrize("exchange", ["rectified", "signed"])
-@pytest.mark.parametrize("decoder", ["shallow", "deep"])
+@pytest.mark.parametrize("decoder", ["shallow", pytest.param("deep", marks=pytest.mark.slow)])
 def test_the_network_that_flies_is_the_one_that_was_trained(exchange: str, decoder: str) -> None:
     net = lively(ModelConfig(exchange=exchange, decoder=decoder))  # type: ignore[arg-type]
     quick = folded(net)

@@ -19,7 +19,7 @@ LEVEL = 0.01
 
 @pytest.fixture(
     scope="module",
-    params=[rule if rule == "average" else pytest.param(rule, marks=pytest.mark.slow) for rule in get_args(Rule)],
+    params=[pytest.param(rule, marks=pytest.mark.slow) for rule in get_args(Rule)],
 )
 def gains(request: pytest.FixtureRequest) -> dict[Case, np.ndarray]:
     return late_shares.gains(request.param, TOWNS)

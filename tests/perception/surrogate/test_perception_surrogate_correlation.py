@@ -36,7 +36,9 @@ def test_a_detector_whose_misses_hang_together_more_gets_a_larger_factor() -> No
     assert factors[1] <= 3.5
 
 
-@pytest.mark.parametrize(("part", "low", "high"), [(0.0, 0.0, 0.1), (0.5, 0.25, 0.5)])
+@pytest.mark.parametrize(
+    ("part", "low", "high"), [pytest.param(0.0, 0.0, 0.1, marks=pytest.mark.slow), (0.5, 0.25, 0.5)]
+)
 def test_the_part_of_the_cars_that_lie_off_for_all_is_found_again(part: float, low: float, high: float) -> None:
     parameters = replace(load(SHIPPED), alike=BASE)
     theirs = detector_runs(replace(parameters, alike=np.append(BASE[:3], np.float32(part))), 20)

@@ -351,6 +351,7 @@ def test_as_many_bands_are_counted_as_a_moment_has_draws_for() -> None:
     assert len(QUANTILES) == BANDS == NETS["alarms"][1]
 
 
+@pytest.mark.slow
 def test_scores_are_found_as_they_are_spread_above_the_floor_below_which_they_are_not_told() -> None:
     """Two heaps of scores, the lower one half hidden; what is found, and the scores' quantiles, come back."""
     n, floor = 30_000, -1.0

@@ -245,6 +245,7 @@ def test_a_failing_run_is_recorded_and_the_rest_goes_on(tmp_path: Path, monkeypa
     )
 
 
+@pytest.mark.slow
 def test_failed_runs_are_flown_again_on_the_command_line(tmp_path: Path) -> None:
     cause = tmp_path / "cause"
     cause.touch()

@@ -242,6 +242,7 @@ def test_another_sortie_than_the_files_own_is_never_its_golden_outcome(tmp_path:
     assert (code, lines[-2:]) == (0, [f"golden outcome written: {golden_path(path)}", "1 passed"])
 
 
+@pytest.mark.slow
 def test_a_golden_outcome_that_is_not_compared_is_skipped(tmp_path: Path) -> None:
     path = tmp_path / "short.yaml"
     path.write_text(SHORT)
@@ -352,6 +353,7 @@ def project(folder: Path) -> None:
         )
 
 
+@pytest.mark.slow
 def test_a_scenario_is_flown_once_whatever_the_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "tmp").mkdir()
     (tmp_path / "project").mkdir()
@@ -380,6 +382,7 @@ def test_verdicts_come_to_the_other_workers_as_they_were(tmp_path: Path) -> None
     assert len(calls) == 4
 
 
+@pytest.mark.slow
 def test_the_ini_option_says_which_files_are_scenarios(tmp_path: Path) -> None:
     inside = tmp_path / "scenarios" / "more"
     inside.mkdir(parents=True)

@@ -44,7 +44,7 @@ def test_the_same_sortie_twice_is_the_same_record(base: SortieRecord) -> None:
 WITH_NANS = {"descriptors", "directives", "mission", "transmissions"}  # NaN ≠ NaN; the fingerprint compares their bytes
 
 
-@pytest.mark.parametrize("kernels", ["", "Haswell", "Prescott"])
+@pytest.mark.parametrize("kernels", ["", "Haswell", pytest.param("Prescott", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("extra", [[], ["perception.detector=surrogate", "radio.shadowing_distance_m=30"]])
 def test_another_process_gives_the_same_fingerprint_whatever_matrix_kernels_its_machine_has(
     extra: list[str], kernels: str, base: SortieRecord

@@ -75,9 +75,11 @@ def test_an_exact_receiver_does_not_forget_the_weaker_frame_that_came_first() ->
 
 def _crashes_until(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     """In place of the driver: a program that crashes with any other seed."""
-    program = tmp_path / "driver"
+    program, code = tmp_path / "driver", tmp_path / "driver.py"
     program.write_text(
-        f"#!{sys.executable}\n"
+        f'#!/bin/sh\nexec "{sys.executable}" "{code}" "$@"\n'
+    )  # quoted: a folder's name may have a space
+    code.write_text(
         "import sys\n"
         "options = dict(word[2:].split('=', 1) for word in sys.argv[1:])\n"
         f"if options['run'] != '{seed}':\n"
