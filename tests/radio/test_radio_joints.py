@@ -528,15 +528,19 @@ def test_receivers_lose_a_descriptor_each_by_a_draw_of_its_own() -> None:
         assert np.abs(off).max() < 0.25
 
 
+def faint(loss: float, **more: Any) -> AirSettings:
+    """Links at the edge of what can be received, in bursts of so much loss."""
+    return AirSettings(
+        shadowing_sigma_db=0.0, tx_power_dbm=-11.5, rician_k_db=30.0, preamble_detection_dbm=-120.0,
+        bursts=BurstSettings(loss_good=loss), **more,
+    )  # fmt: skip
+
+
 def test_a_burst_takes_its_share_of_the_fragments_that_the_signal_lets_through() -> None:
     """On a link that loses some by itself, a burst of a half takes half of the rest."""
 
     def lost(loss: float) -> float:
-        config = AirSettings(
-            shadowing_sigma_db=0.0, tx_power_dbm=-11.5, rician_k_db=30.0, retry_limit=0,
-            preamble_detection_dbm=-120.0, bursts=BurstSettings(loss_good=loss),
-        )  # fmt: skip
-        flight = Hover(config, n=2)
+        flight = Hover(faint(loss, retry_limit=0), n=2)
         flight.fly(20.0, lambda k: flight.send(0, 1, 13_000))
         assert {r.mcs for r in flight.rows} == {1}
         return sum(r.fragments_lost for r in flight.rows) / sum(r.fragments for r in flight.rows)
@@ -550,11 +554,7 @@ def test_a_burst_takes_its_share_of_the_descriptors_that_the_signal_lets_through
     """Two causes, a draw each: of descriptors that half come by their signal, a burst of a half leaves a quarter, not none."""
 
     def heard(loss: float) -> float:
-        config = AirSettings(
-            shadowing_sigma_db=0.0, tx_power_dbm=-11.5, rician_k_db=30.0, group_rate_mbps=24.0,
-            preamble_detection_dbm=-120.0, bursts=BurstSettings(loss_good=loss),
-        )  # fmt: skip
-        flight = Hover(config, n=5)
+        flight = Hover(faint(loss, group_rate_mbps=24.0), n=5)
         flight.fly(12.0, lambda k: flight.publish(0))
         return sum(len(ids) for _, _, ids in flight.heard) / (4 * len(flight.heard))
 
