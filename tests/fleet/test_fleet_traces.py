@@ -34,9 +34,9 @@ def test_charge_runs_linearly_and_holds_at_both_ends(tmp_path: Path) -> None:
 
 
 def test_a_charge_that_rises_by_rounding_is_held(tmp_path: Path) -> None:
-    battery = read_traces(written(tmp_path, "t_s,soc\n0,0.9\n1,0.900005\n2,0.8\n"), 1)[0].battery
+    battery = read_traces(written(tmp_path, "t_s,soc\n0,0.9\n1,0.900005\n2,0.8\n3,0.800005\n4,0.7\n"), 1)[0].battery
     assert battery is not None
-    assert battery.soc == [0.9, 0.9, 0.8]
+    assert battery.soc == [0.9, 0.9, 0.8, 0.8, 0.7]
 
 
 def test_without_a_drone_column_everything_is_drone_0s(tmp_path: Path) -> None:

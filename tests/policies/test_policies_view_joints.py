@@ -39,7 +39,7 @@ from sortie.policies.contract import (
 )
 from sortie.policies.damping import SAME_DISC_M, is_switch
 from sortie.policies.geometry import peers_by_overlap
-from sortie.policies.registry import modules_of, own_fusion, resolve, viewpoint_of, within_budget
+from sortie.policies.registry import modules_of, resolve, viewpoint_of, within_budget
 from sortie.scenarios.plugins.user_calls import Guarded
 
 VIEW = fleet_of(4)
@@ -232,17 +232,6 @@ def test_a_budget_goes_to_the_parameter_that_a_policy_has() -> None:
     for name, parameter in wanted.items():
         assert within_budget(resolve(name), 0.1) == {parameter: 0.1}
     assert within_budget(resolve("silence"), 0.1) == {}
-
-
-def test_the_fusion_of_a_method_is_the_one_it_was_published_with() -> None:
-    fusions = {name: own_fusion(f"{name}-style") for name in ("who2com", "when2com", "v2vnet", "disconet", "syncnet")}
-    assert fusions == {
-        "who2com": "when2com",
-        "when2com": "when2com",
-        "v2vnet": "v2vnet",
-        "disconet": "disconet",
-        "syncnet": None,
-    }
 
 
 def test_a_drone_that_does_not_know_itself_decides_nothing_even_of_who_is_gone() -> None:

@@ -448,15 +448,17 @@ def test_a_late_function_is_not_called_again_within_a_watch_of_the_same_thread(t
             resolve("power", name)()
 
 
-def test_a_call_within_a_call_is_one_call_and_each_call_has_its_own_time() -> None:
-    inner = Guarded(lambda: 1)
-    outer = Guarded(lambda: inner() + inner())
+def test_a_call_within_a_call_is_one_call() -> None:
+    """The working folder is restored where the outer one returns, not before."""
+    here, inner = Path.cwd(), Guarded(lambda: os.chdir("/"))
+
+    def outer() -> Path:
+        inner()
+        return Path.cwd()
+
     with watched(60.0):
-        assert outer() == 2
-    here = Path.cwd()
-    with watched(60.0):
-        Guarded(lambda: os.chdir("/"))()
-    assert Path.cwd() == here
+        assert Guarded(outer)() == Path("/")
+        assert Path.cwd() == here
 
 
 def test_a_guard_counts_no_time_where_it_is_told_not_to() -> None:

@@ -45,13 +45,16 @@ def test_a_drone_that_is_reflected_keeps_its_new_heading() -> None:
         times_s, np.tile([10.0, -5.0, 60.0], (6, 1)), np.random.default_rng(5), alpha=0.0, heading_sigma_deg=0.0,
         speed_mps=8.0, speed_sigma_mps=0.0, margin_m=0.0, turn_time_s=1e-3,
     )  # fmt: skip
-    velocity = steps_of(times_s, way)[2:]
+    assert np.abs(way[..., :2]).max() <= 150.0 + 1e-6
+    velocity, reflected = steps_of(times_s, way)[2:], 0
     assert np.hypot(velocity[..., 0], velocity[..., 1]).max() < 8.0 + 1e-6
     for drone in range(6):
         for axis in (0, 1):
             speed = float(np.median(np.abs(velocity[:, drone, axis])))
             turns = np.flatnonzero(np.diff(np.sign(velocity[:, drone, axis])) != 0)
             assert all(gap >= 300 / speed - 3 for gap in np.diff(turns))
+            reflected += len(turns)
+    assert reflected > 20
 
 
 def test_rests_are_drawn_evenly_up_to_the_longest() -> None:

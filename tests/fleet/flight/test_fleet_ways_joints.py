@@ -282,10 +282,3 @@ def test_a_traced_drone_believes_with_the_errors_of_its_model(tmp_path: Path) ->
     np.testing.assert_allclose(turn[1], turn[0], atol=1e-9)
     assert np.abs(flown.est_yaw_rad).max() <= np.pi
     assert np.ptp(turn[0]) > 0.1
-
-
-def test_a_charge_that_rises_by_rounding_is_held(tmp_path: Path) -> None:
-    rows = ["0,0.9", "1,0.8", "2,0.800005", "3,0.7"]
-    battery = read_traces(trace(tmp_path, "t_s,soc", *rows), 1)[0].battery
-    assert battery is not None
-    assert battery.soc == [0.9, 0.8, 0.8, 0.7]

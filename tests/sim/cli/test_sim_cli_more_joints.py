@@ -33,7 +33,7 @@ from sortie.sim.studies.learn import Lesson
 
 @pytest.fixture(autouse=True)
 def _wide(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console.out, "width", 200)  # tables as they are, whatever the terminal's width
+    monkeypatch.setattr(console.out, "_width", 200)  # tables as they are, whatever the terminal's width
 
 
 class Seen:
@@ -172,7 +172,9 @@ def test_an_error_of_the_surrogate_is_as_bad_below_as_above(
     from sortie.sim.cli import calibrate
 
     stand_in(monkeypatch, "sortie.perception.surrogate.judge", WITHIN=0.02)
-    monkeypatch.setattr(calibrate, "out", Console(force_terminal=True, width=100, color_system="standard"))
+    monkeypatch.setattr(
+        calibrate, "out", Console(force_terminal=True, width=100, color_system="standard", no_color=False)
+    )
     errors = (0.02, 0.03, -0.02, -0.03)
     levels = [SimpleNamespace(condition="c", torch=0.5, surrogate=0.5, error=error) for error in errors]
     calibrate._tell(SimpleNamespace(levels=levels, orders=[]), Path("o"))  # type: ignore[arg-type]

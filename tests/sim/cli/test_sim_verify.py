@@ -187,7 +187,7 @@ def quits(view):
 def test_a_policy_that_gives_no_directives_is_a_broken_one(
     name: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(console.out, "width", 1000)
+    monkeypatch.setattr(console.out, "_width", 1000)
     path = tmp_path / "broken.py"
     path.write_text(BROKEN)
     assert command("verify", f"{path}:{name}", "--views", 20, "--drones", 2, "--out", tmp_path / "out") == 1
@@ -279,7 +279,7 @@ def test_a_scenario_is_flown_for_a_line_about_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only in flight: a peer is detached after 1 s of silence, which no course of one decision has."""
-    monkeypatch.setattr(console.out, "width", 1000)
+    monkeypatch.setattr(console.out, "_width", 1000)
     (tmp_path / "dropping.yaml").write_text(FLOWN)
     rules, out = tmp_path / "rules.txt", tmp_path / "out"
     rules.write_text("within 0.3 s: age_s < 0.9\n")
