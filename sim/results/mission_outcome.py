@@ -40,9 +40,9 @@ _INSTANT_S = 1e-6
 def mission_outcome(record: SortieRecord) -> dict[str, float | None]:
     """The section `mission` of the outcome."""
     n = record.scenario.fleet.drones
-    t_s, flying, looks = _flown(record.tables, n)
+    t_s, flying, looked = _flown(record.tables, n)
     width_s = np.diff(t_s, append=record.scenario.duration_s)
-    looking = flying & _looked_lately(looks, _frames_a_look(record))
+    looking = flying & _lately(looked, _frames_a_look(record))
     groups = _groups(record.tables["mission"])
     tracks = _tracked(groups, len(t_s))
     in_view, region_share = _seen(record, groups, tracks, looking, t_s)
@@ -66,14 +66,20 @@ def _flown_share(flying: Bools, width_s: Floats) -> float:
     return 1.0 - float(width_s @ (~flying).sum(axis=1)) / every_s if every_s else 1.0
 
 
-def _flown(tables: Mapping[str, pa.Table], n: int) -> tuple[Floats, Bools, NDArray[np.int32]]:
-    """When the frames began [T], and of each drone whether it flew and how often it had looked [T, N]."""
-    parts = [
-        (piece["t_s"].to_numpy()[::n], *(np.reshape(piece[c].to_numpy(), (-1, n)) for c in ("airborne", "looks")))
-        for piece in in_blocks(tables, "states", ["t_s", "airborne", "looks"], n * BLOCK_FRAMES)
-    ]
-    t_s, flying, looks = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return t_s, flying, looks
+def _flown(tables: Mapping[str, pa.Table], n: int) -> tuple[Floats, Bools, Bools]:
+    """When the frames began [T], and of each drone whether it flew and whether its perception ran [T, N].
+
+    A frame's rows say how often it had run before. So what it did in the last frame is not known: the one before stands
+    for it.
+    """
+    parts, before = [], np.zeros((0, n), np.int32)
+    for piece in in_blocks(tables, "states", ["t_s", "airborne", "looks"], n * BLOCK_FRAMES):
+        flying, looks = (np.reshape(piece[c].to_numpy(), (-1, n)) for c in ("airborne", "looks"))
+        parts.append((piece["t_s"].to_numpy()[::n], flying, np.diff(np.concatenate([before, looks]), axis=0) > 0))
+        before = looks[-1:]
+    t_s, flying, looked = (np.concatenate(each) for each in zip(*parts, strict=True))
+    last = looked[-1:] if len(looked) else np.ones((len(t_s), n), bool)
+    return t_s, flying, np.concatenate([looked, last])
 
 
 def _frames_a_look(record: SortieRecord) -> int:
@@ -229,18 +235,9 @@ def _share_and_gap(targets: Iterable[tuple[Bools, Bools, Floats]]) -> tuple[floa
     return (1.0 - missed_s / counted_s, longest_s) if counted_s else (None, None)
 
 
-def _looked_lately(looks: NDArray[np.int32], frames: int) -> Bools:
-    """Whether a drone's perception ran in a frame, or in one of the `frames` - 1 frames before it: [T, N].
-
-    Args:
-        looks: [T, N] frames before this one in which it ran. What it did in the last frame is not in it: the one before
-            stands for it.
-        frames: how many a look is good for.
-    """
-    after = 2 * looks[-1:] - looks[-2:-1] if len(looks) > 1 else looks[-1:] + 1
-    since = np.maximum(np.arange(1, len(looks) + 1) - frames, 0)
-    lately = np.empty(looks.shape, bool)
-    for drone in range(looks.shape[1]):
-        own = np.append(looks[:, drone], after[:, drone])
-        lately[:, drone] = own[1:] > own[since]
+def _lately(looked: Bools, frames: int) -> Bools:
+    """Whether something was so in a frame, or in one of the `frames` - 1 frames before it: [T, N]."""
+    lately = looked.copy()
+    for back in range(1, min(frames, len(looked))):
+        lately[back:] |= looked[:-back]
     return lately

@@ -27,7 +27,7 @@ from sortie.sim.results.disagreement import measure
 from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.flown_scene import scene_of, vehicles
 from sortie.sim.results.link_traffic import LinkTraffic
-from sortie.sim.results.mission_outcome import _looked_lately
+from sortie.sim.results.mission_outcome import _flown, _lately
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 from sortie.sim.results.regions import Regions
@@ -395,12 +395,25 @@ def test_an_episode_in_which_one_would_once_not_send_is_one_about_sending() -> N
     assert episode.duration_s == pytest.approx(0.2)
 
 
-def test_a_look_counts_for_its_frames_and_the_last_frame_does_as_the_one_before() -> None:
+@pytest.mark.parametrize("block", [1, 2, 3, 9])
+def test_a_look_counts_for_its_frames_and_the_last_frame_does_as_the_one_before(
+    block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Looks before each of five frames: drone 0 looks in each, drone 1 in the first alone, drone 2 in the one before the last."""
+    monkeypatch.setattr("sortie.sim.results.mission_outcome.BLOCK_FRAMES", block)
     looks = np.array([[0, 0, 0], [1, 1, 0], [2, 1, 0], [3, 1, 0], [4, 1, 1]], np.int32)
-    assert _looked_lately(looks, 1).T.tolist() == [[True] * 5, [True] + [False] * 4, [False] * 3 + [True] * 2]
-    assert _looked_lately(looks, 2).T.tolist() == [[True] * 5, [True] * 2 + [False] * 3, [False] * 3 + [True] * 2]
-    assert _looked_lately(looks[:1], 3).tolist() == [[True] * 3]
+
+    def looked(frames: int) -> Any:
+        rows = {
+            "t_s": np.repeat(np.arange(frames) / 10, 3),
+            "airborne": [True] * 3 * frames,
+            "looks": looks[:frames].ravel(),
+        }
+        return _flown({"states": pa.table(rows)}, 3)[2]
+
+    assert _lately(looked(5), 1).T.tolist() == [[True] * 5, [True] + [False] * 4, [False] * 3 + [True] * 2]
+    assert _lately(looked(5), 2).T.tolist() == [[True] * 5, [True] * 2 + [False] * 3, [False] * 3 + [True] * 2]
+    assert _lately(looked(1), 3).tolist() == [[True] * 3]
 
 
 def test_accuracy_is_sampled_no_oftener_than_frames_come_and_fused_as_the_detector_that_flew() -> None:
