@@ -326,8 +326,6 @@ def _worked_over_silence() -> Tables:
 
 ADAPTIVE = ("adaptive", "boxes", "learned", "worked")
 SLOWLY = "perception.sample_rate_hz=0.5"
-SUPPRESSED = "perception.join=nms"
-"""Figures that were measured when suppression was the default name it, so that their commands still give their numbers."""
 
 
 def _held_out() -> Tables:
@@ -381,11 +379,11 @@ def _learned_example() -> Tables:
 
 
 def _arms() -> Tables:
-    """As `sortie learn --by-torch --set perception.join=nms`, which fitted the policy `learned`."""
+    """The training conditions of `sortie learn --by-torch`, which fits the policy `learned`."""
     from sortie.policies.catalogue.adaptive import ARMS
     from sortie.sim.studies.learn import BUDGETS, fly_lessons, gains
 
-    lessons = fly_lessons(0, 100, sets=[SUPPRESSED], by_torch=True, workers=2)
+    lessons = fly_lessons(0, 100, by_torch=True, workers=2)
     rows: list[list[Any]] = []
     for k, arm in enumerate(ARMS[1:], start=1):
         found = gains(lessons, k)
@@ -404,7 +402,7 @@ def _arms() -> Tables:
 
 
 def _surrogate_in_flight() -> Tables:
-    """As `sortie calibrate --fly conditions_fourth --towns 10` with suppressed boxes; a run that was cut off goes on after its last condition."""
+    """As `sortie calibrate --fly conditions_fourth --towns 10`; a run that was cut off goes on after its last condition."""
     from sortie.perception.surrogate.model import SHIPPED
     from sortie.sim.identity import code_version
     from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means
@@ -418,7 +416,7 @@ def _surrogate_in_flight() -> Tables:
     ]
     write_text(kept, "".join(line for line in text.splitlines(keepends=True) if line[-1] == "\n"))  # one was cut off
     done = {row.condition for rows in found for row in rows}
-    new = flights("conditions_fourth", SHIPPED, None, 0.5, policies, None, 10, leave_out=done, sets=[SUPPRESSED])
+    new = flights("conditions_fourth", SHIPPED, None, 0.5, policies, None, 10, leave_out=done)
     for _, rows in itertools.groupby(new, key=lambda row: row.condition):
         found.append(list(rows))
         with kept.open("a", encoding="utf-8") as file:

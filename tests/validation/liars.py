@@ -82,7 +82,6 @@ def _flown(policy: str, seed: int, duration_s: float, trust: str, *more: str) ->
             "expect=[]", "expect_decisions=[]", "fleet.formation.shape=line", "mission.phases=[{at_s: 0, phase: search}]",
             f"policy.name={policy}", f"policy.params={within_budget(resolve(policy), BUDGET)}", f"duration_s={duration_s:g}",
             "perception.detector=surrogate", f"context.trust={trust}",
-            "perception.join=nms",  # the default when the stored table was measured
             *more,
         ],
     )  # fmt: skip

@@ -71,7 +71,6 @@ def measure(
 
 def _flown(policy: str, seed: int, duration_s: float, settings: Sequence[str]) -> SortieRecord:
     fixed = [f"duration_s={duration_s:g}", "perception.detector=surrogate", "expect=[]", "expect_decisions=[]"]
-    fixed.append("perception.join=nms")  # the default when the stored table was measured
     return run_sortie(load(SCENARIO, [*fixed, *settings]), policy, seed)
 
 

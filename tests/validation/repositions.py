@@ -129,7 +129,6 @@ def scenario_of(policy: str, seed: int, duration_s: float, mission: str) -> Scen
         SCENARIO,
         [
             "expect=[]", "expect_decisions=[]", "perception.detector=surrogate", f"duration_s={duration_s:g}",
-            "perception.join=nms",  # the default when the stored table was measured
             "fleet.airframe.power_model=momentum", f"perception.scene.seed={1000 + seed}",
             f"fleet.route.waypoints_m=[[-150, 0], [{2 * half_m - 150:g}, 0]]",
             f"mission.phases=[{{at_s: 0, phase: search}}, {{at_s: {TRACKING_FROM_S:g}, phase: track, region: {{radius_m: {RADIUS_M:g}}}}}]",

@@ -38,8 +38,8 @@ FLOWN = (0.05, 0.28)
 
 
 def fleet(*settings: str) -> Scenario:
-    """Five drones at 20 m that share a tenth of their cells with all; boxes are joined as when the tables were stored."""
-    return loads(FLEET, overrides=["perception.join=nms", *settings])
+    """Five drones at 20 m that share a tenth of their cells with all."""
+    return loads(FLEET, overrides=settings)
 
 
 # --- (1 − q)^k -------------------------------------------------------------------------------------
