@@ -182,7 +182,7 @@ class Agent:
         self._busy, self._at_rest, self._blamed = table.busy[row], table.at_rest[row], table.blamed[row]
         self._find_overdue = loops().overdue
         self._alert = False  # whether it knows of a person in its region
-        self._published: Descriptor | None = None
+        self._last_own: Descriptor | None = None  # published or not
         self._roster = Roster(0, (self.drone,))
         self._chart = Chart()
         self._clock_off_s = 0.0
@@ -272,10 +272,10 @@ class Agent:
         )
         if roster is not None:
             descriptor = descriptor.with_roster(roster)
-        if self._published is not None:
+        if self._last_own is not None:
             # by the publisher, not by those who hear it: what they read would depend on which packets they lost
-            descriptor = apply_hysteresis(self._published, descriptor, self._rules.hysteresis)
-        self._published = descriptor
+            descriptor = apply_hysteresis(self._last_own, descriptor, self._rules.hysteresis)
+        self._last_own = descriptor
         if not due:
             return decode_descriptor(self._encode(descriptor))
         claimed = descriptor

@@ -33,7 +33,7 @@ def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float
     min(u, max(value published before, u / (1 + h))).
 
     Args:
-        before: what the drone published last, before the wire rounded it.
+        before: its last descriptor, published or not, before the wire rounded it: its own decisions read each of them.
         measured: what it measures now.
         hysteresis: h, the share by which a quantity must rise before its rise is published, ≥ 0.
 
