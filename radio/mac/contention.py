@@ -72,7 +72,7 @@ def saturation_mbps(
         payload_bits: of one frame or A-MPDU.
         ppdu_s, ack_s: time of it and of its answer.
         goes_on_at_once: whoever has succeeded draws a backoff of 0 once in `CW_MIN` + 1 times and then sends again
-            unopposed (ns-3's reference for 802.11a counts this, that for 802.11ax does not; nor does the medium).
+            unopposed (ns-3's reference for 802.11a counts this, that for 802.11ax does not; stations in flight do so).
     """
     among = contention(senders)
     in_a_row = 1.0 / (1.0 - 1.0 / (CW_MIN + 1)) if goes_on_at_once else 1.0

@@ -198,7 +198,7 @@ def bianchi() -> Rows:
             whole = [saturation_mbps(n, 12e3, legacy_ppdu_s(1538, 54.0), ACK_S) for n in SENDERS]
             ppdu_s = 20e-6 + 8 * 1538 / 54e6
             ours = [saturation_mbps(n, 12e3, ppdu_s, ACK_S, goes_on_at_once=True) for n in SENDERS]
-            rows.append(_beside(f"{name}, as the medium counts", whole, reference))
+            rows.append(_beside(f"{name}, as Bianchi counts", whole, reference))
             rows.append(_beside(f"{name}, winner may go on", ours, reference))
         else:
             one = frames_exchanges(1, 1538, 1538, 86.0 if "20" in name else 360.3, 1, ACK_S)

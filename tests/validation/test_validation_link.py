@@ -10,7 +10,7 @@ from sortie.radio.settings import AirSettings
 
 def test_the_analytic_model_is_ns3s_within_one_percent() -> None:
     off = {row["case"]: 100 * row["largest off"] for row in link.bianchi()}
-    assert {case for case, percent in off.items() if percent > 1.0} == {"11a, 54 Mb/s, as the medium counts"}
+    assert {case for case, percent in off.items() if percent > 1.0} == {"11a, 54 Mb/s, as Bianchi counts"}
 
 
 def test_propagation_is_within_its_closed_forms() -> None:
