@@ -95,6 +95,7 @@ def _invariants() -> Lines:
     yield "words about time, judged in flight and over whole courses:"
     for name, (about, example) in TIME_WORDS.items():
         yield f"{_line(name, {}, about)}\n    {escape(example)}"
+    yield f"fresh.FIELD  what the policy decides for the link if every descriptor has age 0\n    {escape('rate_hz <= fresh.rate_hz')}"
     yield f"functions over all links: {', '.join(LINK_FUNCTIONS)}"
     yield f"names of values: {', '.join(CONSTANTS)}"
 

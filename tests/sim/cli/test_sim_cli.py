@@ -443,7 +443,14 @@ def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: P
         ("link", ["no link is built in or installed; name one of your own: path/to/file.py:Name"]),
         (
             "invariants",
-            ["human_in_region", "same_network", "rate_hz  rate, Hz (of each link)", "any_link", "detections"],
+            [
+                "human_in_region",
+                "same_network",
+                "rate_hz  rate, Hz (of each link)",
+                "any_link",
+                "detections",
+                "fresh.FIELD",
+            ],
         ),
     ],
 )
