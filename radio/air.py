@@ -95,13 +95,14 @@ class Air:
             raise ValueError(f"publish_spread is {publish_spread!r}, must be in [0, 1]")
         self._env = env
         self._settings = settings
-        self.channel = Channel(settings, positions_m, seed, replication, frame_s, up)
+        trace = None if settings.trace is None else read_links(settings.trace, np.shape(positions_m)[1])
+        traced = set() if trace is None else {(min(link), max(link)) for link in trace.links}
+        self.channel = Channel(settings, positions_m, seed, replication, frame_s, up, sorted(traced))
         self._n = n_drones = self.channel.n
         self.counters = Counters()
         self._gone: set[int] = set()
         self._overrides: Overrides | None = None
         if Overrides.wanted(settings):
-            trace = None if settings.trace is None else read_links(settings.trace, n_drones)
             self._overrides = Overrides(settings, trace, n_drones, seed=seed, replication=replication, frame_s=frame_s)
         self._broadcasts = Broadcasts(
             settings.group_rate_mbps, n_drones, self.counters, self._gone,
@@ -310,6 +311,9 @@ class Air:
         self._service.prepare(s)
         key = (s.sender, s.origin, s.target, s.kind)
         old = self._latest.get(key)
+        if old is not None and old.number > s.number:  # it came over a longer way
+            self._close(s, _EXPIRED, "replaced")
+            return
         self._latest[key] = s
         if old is None:
             self.medium.submit(s)
@@ -347,6 +351,8 @@ class Air:
     def _others_changed(self) -> None:
         if self.channel.frame >= 0:
             self.medium.sync()
+            for sender in range(self._n):
+                self._drained(sender)  # what has been sent so far went to who was there
             self._retune()
             self.medium.replan()
 
@@ -373,7 +379,7 @@ class Air:
         """The medium is through with a sample's pass, or its deadline has passed."""
         self._measure(s, how is not _DEADLINE_QUEUED, now_s)
         if how is _DEADLINE_QUEUED or how is _DEADLINE_IN_SERVICE:
-            queued = how is _DEADLINE_QUEUED and s.repairs == 0
+            queued = how is _DEADLINE_QUEUED and s.repairs == s.repairs_before
             if queued and s.hops == 1:  # it may have come to the head at this very instant
                 s.t_first_s = nan
             self._close(s, _EXPIRED, "deadline_queued" if queued else "deadline_in_service")
@@ -502,7 +508,7 @@ class Air:
                 self._goodput.measured(s.sender, s.receiver, mbps, now_s)
         else:
             waited = now_s - s.t_queued_s
-            if s.repairs == 0 and waited >= _WINDOW_S:
+            if s.repairs == s.repairs_before and waited >= _WINDOW_S:
                 rate = (self._drained(s.sender) - s.drained_bits) / waited * 1e-6
                 self._goodput.bounded(s.sender, s.receiver, rate)
 

@@ -42,7 +42,7 @@ class Sample(AirJob):
     __slots__ = (
         "arrived", "begun_s", "drained_bits", "fragments", "full_mbps", "hops", "kind", "left", "lost", "mark_bits", "mark_frames",
         "mark_s", "mcs", "on_done", "origin", "pass_wire", "payload_bytes", "piece_bytes", "pieces", "receiver", "reliable",
-        "repairs", "snr_db", "t_first_s", "t_queued_s", "t_sent_s", "target", "unreachable", "wire_bytes",
+        "repairs", "repairs_before", "sent_before", "snr_db", "t_first_s", "t_queued_s", "t_sent_s", "target", "unreachable", "wire_bytes",
     )  # fmt: skip
 
     def __init__(
@@ -66,6 +66,7 @@ class Sample(AirJob):
         self.left = fragments  # fragments of this pass
         self.lost = 0
         self.repairs = 0
+        self.repairs_before = 0  # on earlier hops
         self.piece_bytes = piece_bytes  # 0: it is of use as a whole only
         self.keeps_frames = piece_bytes > 0
         self.pieces: IntArray | None = np.arange(fragments) if piece_bytes else None  # of this pass, in their order
@@ -73,6 +74,7 @@ class Sample(AirJob):
         self.mcs = -1
         self.snr_db = snr_db
         self.unreachable = ""  # '' or the reason
+        self.sent_before = 0  # frames of this pass that were sent before it became so
         self.wire_bytes = 0.0  # of passes that are over
         self.pass_wire = 0.0  # wire bytes of a frame of this pass
         self.full_mbps = 0.0  # payload rate of full A-MPDUs, alone, at the MCS in use
@@ -89,23 +91,28 @@ class Sample(AirJob):
         """Share of this pass that is not at its receiver."""
         return 1.0 - self.arrived_frames / self.frames if self.frames else 1.0
 
+    def _pass_bytes(self) -> float:
+        """What this pass has put on the air; tries on a link that is dead count as airtime alone."""
+        return (self.sent_before if self.unreachable else self.sent_frames) * self.pass_wire
+
     def end_pass(self) -> int:
         """Take in what this pass has brought; returns how many of its fragments are missing at the receiver."""
-        self.wire_bytes += self.sent_frames * self.pass_wire if not self.unreachable else 0.0
+        self.wire_bytes += self._pass_bytes()
         self.lost += len(self.dropped)
         missing = self.left - self.arrived_frames
         if self.pieces is not None:
             self.arrived.append(self.pieces[self.here])
             self.pieces = np.delete(self.pieces, self.here)
-        self.arrived_frames = self.sent_frames = self.mark_frames = 0
+        self.arrived_frames = self.sent_frames = self.sent_before = self.mark_frames = 0
         self.here = NO_FRAMES
-        self.dropped = []
+        self.dropped = set()
         return missing
 
     def forward(self, sender: int, receiver: int, now_s: float, drained_bits: float) -> None:
         """Begin the next hop with what the last one brought."""
         self.sender, self.receiver = sender, receiver
         self.hops += 1
+        self.repairs_before = self.repairs
         self.t_queued_s, self.drained_bits = now_s, drained_bits
         if self.pieces is not None:
             self.pieces = np.sort(np.concatenate(self.arrived))
@@ -130,10 +137,9 @@ class Sample(AirJob):
             if len(here):
                 status, arrived = Status.PARTIAL, self.bytes_of(here)
                 missing = tuple(np.setdiff1d(np.arange(self.fragments), here).tolist())
-        in_pass = self.sent_frames * self.pass_wire if not self.unreachable else 0.0
         return Transmission(
-            self.number, self.origin, self.target, self.kind, self.payload_bytes, round(self.wire_bytes + in_pass),
-            self.t_sent_s, self.deadline_s, self.t_first_s, t_done_s, status, reason, self.fragments, self.lost,
+            self.number, self.origin, self.target, self.kind, self.payload_bytes, round(self.wire_bytes + self._pass_bytes()),
+            self.t_sent_s, self.deadline_s, self.t_first_s, t_done_s, status, reason, self.fragments, self.lost + len(self.dropped),
             self.repairs, self.mcs, self.snr_db, self.granted_s, self.hops, arrived, missing,
         )  # fmt: skip
 
@@ -224,6 +230,8 @@ class Service:
         mcs = -1 if use.unreachable else use.link.mcs
         if fresh or mcs != s.mcs:
             s.mark_s, s.mark_bits = now_s, 0.0
+        if use.unreachable and not s.unreachable:
+            s.sent_before = 0 if fresh else s.sent_frames
         s.snr_db, s.unreachable, s.mcs, s.full_mbps = use.snr_db, use.unreachable, mcs, use.full_mbps
 
     def prepare(self, s: Sample) -> None:

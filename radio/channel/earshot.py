@@ -6,6 +6,7 @@ Values of links are kept as vectors [L].
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,12 +48,15 @@ def all_links(n: int) -> LinkList:
     return LinkList(n, np.repeat(ids, n), np.tile(ids, n), np.arange(n * n), [i * n for i in range(n + 1)], True)
 
 
-def near_pairs(positions_m: FloatArray, range_m: float) -> tuple[IntArray, IntArray, FloatArray]:
+def near_pairs(
+    positions_m: FloatArray, range_m: float, always: Sequence[tuple[int, int]] = ()
+) -> tuple[IntArray, IntArray, FloatArray]:
     """Pairs whose ends come within `range_m` in some frame; the work grows with N × neighbours.
 
     Args:
         positions_m: [frames, N, 3].
         range_m: ≥ 0.
+        always: pairs that are listed however far apart they are, lower id first.
 
     Returns:
         Lower ids [P], higher ids [P], and distances [frames, P], in the type of `positions_m`; pairs by higher, then
@@ -64,10 +68,10 @@ def near_pairs(positions_m: FloatArray, range_m: float) -> tuple[IntArray, IntAr
     middle = positions_m[len(positions_m) // 2]
     astray_m = float(np.sqrt(((positions_m - middle) ** 2).sum(axis=-1).max()))
     pairs = cKDTree(middle).query_pairs(range_m + 2.0 * astray_m, output_type="ndarray")
-    low, high = pairs.min(axis=1), pairs.max(axis=1)
-    order = np.argsort(high * n + low)
-    low, high = low[order], high[order]
-    apart = np.zeros((len(positions_m), len(pairs)), positions_m.dtype)
+    kept = np.array([high * n + low for low, high in always], pairs.dtype)
+    codes = np.union1d(pairs.max(axis=1) * n + pairs.min(axis=1), kept)
+    high, low = np.divmod(codes, n)
+    apart = np.zeros((len(positions_m), len(codes)), positions_m.dtype)
     for axis in range(3):  # mode="clip" spares a copy and a check: ids are in range
         along = np.ascontiguousarray(positions_m[:, :, axis])
         step = np.take(along, low, axis=1, mode="clip")
@@ -76,6 +80,8 @@ def near_pairs(positions_m: FloatArray, range_m: float) -> tuple[IntArray, IntAr
         apart += step
     np.sqrt(apart, out=apart)
     near = (apart <= range_m).any(axis=0)
+    if len(kept):
+        near |= np.isin(codes, kept)
     if near.all():
         return low, high, apart
     return low[near], high[near], apart[:, near]

@@ -6,6 +6,7 @@ numbers that they have in a small fleet, so that one more drone changes none of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,7 +36,7 @@ class BlockStart(NamedTuple):
 
 
 class Crowd:
-    """Blocks of `EPOCH` frames, one after another; arguments as for `Channel`."""
+    """Blocks of `EPOCH` frames, one after another; arguments as for `Channel`; `always` as in `near_pairs`."""
 
     def __init__(
         self,
@@ -46,13 +47,14 @@ class Crowd:
         *,
         n_early: int,
         earshot_m: float,
+        always: Sequence[tuple[int, int]],
         seed: int,
         replication: int,
         frame_s: float,
     ) -> None:
         self._settings, self._n, self._n_early = settings, n, n_early
         self._antennas = Antennas(settings.antennas(n))
-        self._early, self._field, self._earshot_m = early, field, earshot_m
+        self._early, self._field, self._earshot_m, self._always = early, field, earshot_m, always
         self._keys = drone_keys(seed, replication, n)
         self._frame_s = frame_s
         self._keep = keep(frame_s, settings.shadowing_time_s)
@@ -63,7 +65,7 @@ class Crowd:
     def block(self, frame: int, positions_m: Array, up: Array | None) -> BlockStart:
         """The frames from `frame` on, of [frames, N, 3] positions (and vectors along the airframes' z axes)."""
         p = positions_m.astype(np.float32)
-        low, high, distance = near_pairs(p, self._earshot_m)
+        low, high, distance = near_pairs(p, self._earshot_m, self._always)
         loss_db = path_loss_db(self._settings, distance, p[:, low, 2], p[:, high, 2])
         if not self._antennas.lossless:
             loss_db = loss_db + self._antennas_db(p, low, high, distance, up)

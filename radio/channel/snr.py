@@ -107,6 +107,7 @@ class Channel:
         seed, replication: as in `sortie.scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
         up: [T, N, 3], ENU: the unit vector along each airframe's z axis; None is level flight.
+        always: pairs of drones, lower id first, that a large fleet has links between however far apart they are.
 
     Raises:
         ValueError: if a shape is wrong or a number is not finite.
@@ -120,6 +121,7 @@ class Channel:
         replication: int,
         frame_s: float,
         up: ArrayLike | None = None,
+        always: Sequence[tuple[int, int]] = (),
     ) -> None:
         self._positions_m = p = np.asarray(positions_m, dtype=float)
         if p.ndim != 3 or p.shape[1] < 1 or p.shape[2] != 3:
@@ -152,7 +154,7 @@ class Channel:
         if n_drones > SQUARE:
             self._crowd = Crowd(
                 settings, n_drones, self._drawn, self._field,
-                n_early=early, earshot_m=earshot_m(settings), seed=seed, replication=replication, frame_s=frame_s,
+                n_early=early, earshot_m=earshot_m(settings), always=always, seed=seed, replication=replication, frame_s=frame_s,
             )  # fmt: skip
         self._block = EPOCH if self._crowd else max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones)))
         self.links = all_links(0 if self._crowd else n_drones)

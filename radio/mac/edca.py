@@ -573,9 +573,8 @@ def settle(s, t, job, is_answered, counts, S, J, M, T, OUT, told, DROPS, C):
         elif counts and (state & _TRIES) >= C[C_RETRIES]:
             M[s, at] = state | _RESOLVED
             if state & _RECEIVED == 0:
-                DROPS[0, 0] += 1
-                if DROPS[0, 0] < DROPS.shape[0]:
-                    DROPS[DROPS[0, 0], 0], DROPS[DROPS[0, 0], 1] = job, T[s, x]
+                DROPS[0, 0] += 1  # there is room: `run` stops before
+                DROPS[DROPS[0, 0], 0], DROPS[DROPS[0, 0], 1] = job, T[s, x]
                 J[job, DROPPED] += 1
         elif counts:
             M[s, at] = state + 1
@@ -846,18 +845,21 @@ def run(
     F,
     curves,
 ):
-    """Run the stations until something has to be told, or until a time.
+    """Run the stations until something has to be told, until a time, or until the table of drops must be read first.
 
-    Returns: the time reached, and how many rows of OUT are to be told.
+    Returns: the time reached, and how many rows of OUT are to be told; −1 where the drops must be read.
     """
     n = C[C_STATIONS]
     starters = TOUCH[TOUCH.shape[0] // 2 :]
+    most_drops = DROPS.shape[0] - 1 - n * C[C_BLOCK]  # at one instant every station may give up a window of fragments
     while True:
         t = FAR
         for s in range(n):
             t = min(t, S[s, NEXT_AT])
         if t > until:
             return until, 0
+        if DROPS[0, 0] > most_drops:
+            return t - 1, -1
         told = 0
         for s in range(n):  # frames that end
             if S[s, TX_END] == t:
@@ -1121,12 +1123,12 @@ SIZES = 8
 
 @compiled
 def ahead(at, since, until):
-    """Bring the first state up to `since`, and run a copy of it ahead.
+    """Bring the first state up to `since`, and run a copy of it ahead; no copy where its drops must be read first.
 
     Arrays come by address, for numba looks at each array that it is handed, which costs more than most runs:
     `SIZES` sizes, the 12 arrays of the first state, those of its copy, and what they share. An `until` before `since` is no copy.
 
-    Returns: the time that the copy has reached, and how many rows of OUT are to be told.
+    Returns: the time that the copy has reached, or the first state where there is none, and as `run`.
     """
     n, links, jobs, window, flows, mcs, drops, extras = at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7]
     S = carray(pointer(at[8]), (n, STATION_COLUMNS), np.int64)
@@ -1157,7 +1159,7 @@ def ahead(at, since, until):
     C = carray(pointer(at[45]), (17,), np.int64)
     F = carray(pointer(at[46]), (4,), np.float64)
     curves = carray(pointer(at[47]), (14, 5), np.float64)
-    run(
+    reached, told = run(
         since,
         S,
         P,
@@ -1188,8 +1190,8 @@ def ahead(at, since, until):
         F,
         curves,
     )
-    if until < since:
-        return since, 0
+    if until < since or told < 0:
+        return reached, told
     S2 = carray(pointer(at[20]), (n, STATION_COLUMNS), np.int64)
     P2 = carray(pointer(at[21]), (n,), np.float64)
     W2 = carray(pointer(at[22]), (links,), np.float64)

@@ -45,7 +45,7 @@ class AirJob:
         self.row = self.flow = -1
         self.frames = self.full_bytes = self.last_bytes = 0
         self.arrived_frames = self.sent_frames = 0  # of this pass, as the medium told last
-        self.dropped: list[int] = []  # frames of this pass that used up their tries, by index
+        self.dropped: set[int] = set()  # frames of this pass that used up their tries, by index
         self.keeps_frames = False  # whether `here` is kept: which frames of this pass are at the receiver
         self.here = NO_FRAMES
         self.granted_s = self.pass_granted_s = 0.0

@@ -82,7 +82,9 @@ class _State:
 
 
 _S, _P, _W, _WHY, _G, _J, _M, _T, _SEG_AT, _SEG, _LS, _DROPS = range(12)
-_JOBS, _FLOWS, _MOST_DROPS = 64, 32, 8192
+_JOBS, _FLOWS = 64, 32
+_DROPS_KEPT = 8192
+"""Given up fragments that a run keeps before they must be read, at the least."""
 
 
 class Medium(Generic[J, F]):
@@ -161,7 +163,7 @@ class Medium(Generic[J, F]):
                 stations, np.zeros(n), np.zeros(n * n), np.zeros(n * n, np.uint8), np.zeros(5, np.int64),
                 np.zeros((_JOBS, e.JOB_COLUMNS), np.int64), np.zeros((n, window), np.uint8),
                 np.zeros((n, window), np.int32), np.zeros((n, e.OVERLAPS), np.int64), np.zeros((n, e.OVERLAPS)),
-                np.zeros((_FLOWS, mcs + 1, 2), np.int64), np.zeros((_MOST_DROPS, 2), np.int64),
+                np.zeros((_FLOWS, mcs + 1, 2), np.int64), np.zeros((_DROPS_KEPT + n * window, 2), np.int64),
             ),
             _JOBS, self._ns(env.now) - 1,
         )  # fmt: skip
@@ -326,7 +328,7 @@ class Medium(Generic[J, F]):
         """Open a row for a job; returns it as the stations want it."""
         job.live = True
         job.arrived_frames = job.sent_frames = 0
-        job.dropped = []
+        job.dropped = set()
         job.pass_granted_s = 0.0
         job.t_start_s = nan
         self._pushes += 1
@@ -395,16 +397,17 @@ class Medium(Generic[J, F]):
         if job.keeps_frames:
             waiting = np.arange(row[e.LOW], row[e.HIGH])
             here = waiting[(self._settled.arrays[_M][job.sender, waiting % self._window] & 64) > 0]
-            job.here = np.concatenate([np.setdiff1d(np.arange(row[e.LOW]), job.dropped), here])
+            job.here = np.concatenate([np.setdiff1d(np.arange(row[e.LOW]), list(job.dropped)), here])
 
     def _drain(self) -> None:
+        """Give the jobs what the settled state has dropped. The plan may tell the same again: a set takes it once."""
         drops = self._settled.arrays[_DROPS]
         if not drops[0, 0]:
             return
         for row, index in drops[1 : drops[0, 0] + 1].tolist():
             job = self._at_row.get(row)
             if job is not None:
-                job.dropped.append(index)  # type: ignore[union-attr]
+                job.dropped.add(index)  # type: ignore[union-attr]
         drops[0, 0] = 0
 
     def in_service(self, sender: int) -> J | None:
@@ -453,9 +456,10 @@ class Medium(Generic[J, F]):
     def sync(self) -> None:
         """Bring the settled state up to now; what happens at this very instant is still to come."""
         until = self._ns(self._env.now) - 1
-        if self._settled.now_ns < until:
-            self._e.ahead(self._table(self._settled), until, until - 1)
-            self._settled.now_ns = until
+        while self._settled.now_ns < until:
+            self._settled.now_ns, told = self._e.ahead(self._table(self._settled), until, until - 1)
+            if told < 0:
+                self._drain()
 
     def _submit(self, entry: tuple[int, ...]) -> None:
         """A job comes to the stations."""
@@ -489,9 +493,12 @@ class Medium(Generic[J, F]):
         until = since + _AHEAD_NS
         if deadlines:
             until = min(until, max(deadlines[0][0], since))
-        planned.now_ns, told = self._e.ahead(self._table(settled), since, until)
-        settled.now_ns = since
-        if told:
+        reached, told = self._e.ahead(self._table(settled), since, until)
+        while reached < since:
+            self._drain()
+            reached, told = self._e.ahead(self._table(settled), since, until)
+        settled.now_ns, planned.now_ns = since, reached
+        if told > 0:
             self._told = [(kind, row, self._at_row.get(row)) for kind, row in self._out[:told].tolist()]
         self._timer = timer = self._env.timeout(max(0.0, planned.now_ns * _NS - now))
         timer.callbacks.append(self._on_timer)
@@ -500,6 +507,7 @@ class Medium(Generic[J, F]):
         if event is not self._timer:
             return  # something came earlier
         self._settled, self._planned = self._planned, self._settled
+        self._drain()
         now, settled, e = self._env.now, self._settled, self._e
         self._is_telling = True
         for kind, row, job in self._told:
