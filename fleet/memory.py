@@ -61,6 +61,7 @@ class PeerMemory:
         self._doubted: frozenset[int] = frozenset()
         self._arrivals: dict[int, list[Arrival]] = {}
         self._judged_at_s = -math.inf
+        self._stations = frozenset(i for i, its in rules.makes.items() if not its.flies)
         self._loops = loops()
 
     def hear(self, opened: Opened | Dropped, now_s: float) -> DropReason | None:
@@ -188,8 +189,9 @@ class PeerMemory:
                 looking.add(i)
             self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
         self._standings = after = judge(
-            before, self.drone, heard, arrivals, self._rules.form, looking, lambda i: self._rules.equipment(i).cameras
-        )
+            before, self.drone, heard, arrivals, self._rules.form, looking,
+            lambda i: self._rules.equipment(i).cameras, self._stations,
+        )  # fmt: skip
         self._doubted = frozenset([i for i, s in after.items() if s.strikes and s.trust < 1.0])
         moved = [i for i in heard if after[i].strikes != before.get(i, UNJUDGED).strikes]
         return [(peer, after[peer]) for peer in moved if after[peer].trust != before.get(peer, UNJUDGED).trust]

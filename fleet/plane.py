@@ -23,12 +23,15 @@ class Equipment(NamedTuple):
     compute_delay_s: float
     """From sensing to features ready to send."""
     cameras: Cameras = USUAL
+    flies: bool = True
+    """False for a ground station."""
 
 
 def equipment_of(scenario: Scenario) -> dict[int, Equipment]:
     """Each drone's equipment."""
     each = zip(scenario.compute_delays_s, cameras_of(scenario.fleet), strict=True)
-    return {i: Equipment(delay_s, cameras) for i, (delay_s, cameras) in enumerate(each)}
+    stations = {station.drone for station in scenario.fleet.ground}
+    return {i: Equipment(delay_s, cameras, i not in stations) for i, (delay_s, cameras) in enumerate(each)}
 
 
 def codebooks(scenario: Scenario) -> tuple[str, ...]:

@@ -1,9 +1,11 @@
 """Trust in what peers claim: each claim is held against what the listener can check for itself.
 
 Coverage is held against the pose beside it (what its cameras can show from there) and against the payloads of its
-looks (who looks sees something), goodput against the payloads that arrived, and battery against the fleet's: in flight no charge comes back,
-and no drone flies for nothing. Doubts have to last: a judgement is made once a second, and only the second in a row
-that finds something lowers trust. Without a doubt trust is exactly 1.
+looks (who looks sees something), goodput against the payloads that arrived, and battery against the fleet's: no charge
+comes back, and no drone flies for nothing. A ground station may be on mains, so its charge need not fall.
+
+Doubts have to last: a judgement is made once a second, and only the second in a row that finds something lowers trust.
+Without a doubt trust is exactly 1.
 
 All of it is pure: `judge` takes what is known and gives what is thought of a peer next.
 """
@@ -124,6 +126,7 @@ def judge(
     form: Form = FULL,
     looking: Container[int] = (),
     cameras: Callable[[int], Cameras] = lambda _: USUAL,
+    stations: Container[int] = (),
 ) -> dict[int, Standing]:
     """What `ego` thinks of everyone after one more second.
 
@@ -134,13 +137,16 @@ def judge(
         form: how finely descriptors are written; what rounding can do is no doubt.
         looking: who looked shortly before its claim, as payloads of that look show.
         cameras: a drone's cameras, as its make has them.
+        stations: who stands on the ground. Their charge says nothing about the fleet's fall, and may stay as it is.
 
     Returns:
         Standings of all in `known`, and of others a second older: one strike more where a claim cannot be so, one less
         where all can. The ego has nothing to doubt in itself, but its battery is one of the fleet's.
     """
     before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
-    fell_per_s = {i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items()}
+    fell_per_s = {
+        i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items() if i not in stations
+    }
     by_fall = sorted(fell_per_s.values())
     # who was not heard drained on: its fall, once it is heard again, is over this second too
     after = {i: s if i in known else s.unheard_of() for i, s in standings.items()}
@@ -154,7 +160,9 @@ def judge(
         doubt = ""
         if peer != ego:
             came = arrivals.get(peer, ()) if claim.counts(ego) else ()  # who leaves the ego out claims no goodput to it
-            others_fell = _median_without(by_fall, fell_per_s[peer]) * standing.elapsed
+            others_fell = 0.0
+            if peer not in stations:
+                others_fell = _median_without(by_fall, fell_per_s[peer]) * standing.elapsed
             doubt = (
                 (_coverage_doubt(cells[peer], peer in looking) if cells else "")
                 or goodput_doubt(claim.goodput_to(ego), came, goodput_step_mbps)
@@ -174,8 +182,10 @@ def judge(
 
 
 def _median_without(ascending: Sequence[float], value: float) -> float:
-    """The median of the others, where `value` is one of several."""
+    """The median of the others, where `value` is one of several; 0 where it is the only one."""
     at, rest = bisect_left(ascending, value), len(ascending) - 1
+    if not rest:
+        return 0.0
     middle = rest // 2
     high = ascending[middle + (middle >= at)]
     return high if rest % 2 else (ascending[middle - 1 + (middle > at)] + high) / 2
@@ -302,7 +312,7 @@ def battery_doubt(
     Args:
         claimed_soc: the claim.
         least_soc, first_soc: the least that it claimed before, and the first.
-        others_fell: by how much the fleet's charge fell since the first, in the median.
+        others_fell: by how much the charge of the others that fly fell since the first, in the median.
         unseen: how far it may fall before that shows in a claim.
     """
     if claimed_soc > least_soc + RISE:

@@ -14,7 +14,7 @@ Joints, each with a test below:
 10. Staleness and every field of a directive: representation, rate, weight, duty.
 11. Two links that differ in one field: each gets its own payload.
 12. A drone that leaves between its look and its sending, one that is on the ground, and one that comes back.
-13. What a drone believes: doubted peers count for nothing in coverage and views; the fleet's fall leaves out who is judged.
+13. What a drone believes: doubted peers count for nothing in coverage and views; the fleet's fall leaves out who is judged, and ground stations.
 
 Draws that must be independent: gusts, offsets, errors of position and heading, and clocks, of each drone and of each other.
 """
@@ -481,6 +481,19 @@ def test_who_is_judged_is_no_part_of_the_fall_that_it_is_held_against() -> None:
         standings = judge(standings, 0, known, {})
     assert standings[1].trust < 1.0
     assert "battery" in standings[1].reason
+
+
+def test_a_drone_knows_which_members_of_the_scenario_stand_on_the_ground() -> None:
+    """So it does not doubt a station of which the charge stays, and does doubt such a drone."""
+    for ground, doubted in (("[]", [2]), ("[{drone: 2}]", [])):
+        makes = equipment_of(scenario(f"fleet: {{drones: 3, ground: {ground}}}\nperception: {{detector: none}}"))
+        mine = memory(trust=True, makes=makes)
+        for second in range(20):
+            for i in range(3):
+                soc = 0.9 if i == 2 else 0.9 - 0.002 * second
+                mine.hold(descriptor(i, second, battery_soc=soc, coverage_grid=bytes(64)), float(second))
+            mine.judge(second + 0.05)
+        assert [i for i in range(3) if mine.trust_in(i) < 1.0] == doubted
 
 
 def test_doubted_peers_are_left_out_of_what_is_believed_and_read_without_their_claims() -> None:

@@ -275,6 +275,28 @@ def test_who_is_heard_late_has_not_fallen_before() -> None:
         assert all(s.trust == 1.0 for s in standings.values()), second
 
 
+@pytest.mark.parametrize(("drones", "stations"), [(3, {2}), (3, {0}), (5, {1, 2, 3}), (2, {0}), (2, {0, 1})])
+def test_a_ground_station_on_mains_is_not_doubted_and_excuses_nobody(drones: int, stations: set[int]) -> None:
+    """The others in the air lose 0.2 % a second; the last of them claims to lose nothing. Two in the air can be compared."""
+    liar = max({*range(drones)} - stations, default=-1)
+    standings: dict[int, Standing] = {}
+    for second in range(20):
+        known = {
+            i: honest(i, 20.0 * i, soc=0.9 if i in {*stations, liar} else 0.9 - 0.002 * second) for i in range(drones)
+        }
+        standings = judge(standings, 0, known, {}, stations=stations)
+    doubted = {i for i, s in standings.items() if s.trust < 1.0}
+    assert doubted == ({liar} if drones - len(stations) > 1 and liar != 0 else set())
+
+
+def test_a_ground_station_whose_charge_rises_is_doubted() -> None:
+    standings: dict[int, Standing] = {}
+    for second in range(5):
+        known = {i: honest(i, 20.0 * i, soc=0.8 if second < 2 else 0.9) for i in (0, 1)}
+        standings = judge(standings, 0, known, {}, stations={1})
+    assert standings[1].reason == "battery: 90% after 80%"
+
+
 @pytest.mark.parametrize("claim", [None, "much", "little"])
 def test_a_charge_is_watched_on_where_it_is_told_seldom(claim: str | None) -> None:
     """Small packs that lose 0.2 % a second, heard every ten: two percent from one claim to the next are no fault."""
