@@ -17,7 +17,16 @@ from sortie.fleet.messages.auth import Dropped, DropReason, Opened
 from sortie.fleet.peers import PeerTable, loops
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.probes import Probes, window_of
-from sortie.fleet.trust import JUDGED_EVERY_S, UNJUDGED, Arrival, Standing, discounted, judge, split_arrivals
+from sortie.fleet.trust import (
+    JUDGED_EVERY_S,
+    LONG_SILENCE,
+    UNJUDGED,
+    Arrival,
+    Standing,
+    discounted,
+    judge,
+    split_arrivals,
+)
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, FleetView
 from sortie.scenarios.representation import MAPS, Representation
@@ -174,6 +183,8 @@ class PeerMemory:
             Peers for which trust changed, with their new standing.
         """
         before = self._standings
+        if now_s - self._judged_at_s >= LONG_SILENCE * JUDGED_EVERY_S:  # the drone itself was away
+            before = {i: standing._replace(unheard=LONG_SILENCE) for i, standing in before.items()}
         since_s, self._judged_at_s = max(now_s - self._fresh_s, self._judged_at_s), now_s
         looking: set[int] = set()
         # its own claims stand, however long ago another of its nodes published them

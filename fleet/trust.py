@@ -54,6 +54,10 @@ PERCENT = 0.01
 FALL, FALL_SHARE = 0.005, 0.1
 """When the fleet's charge fell by so much in the median, who fell by less than this share of it is doubted: even a
 battery of ten times the others' capacity falls that far."""
+LONG_SILENCE = 30
+"""After so many judgements without a claim of a drone its charge is watched anew: it may have rested on the ground. In a
+shorter silence it is taken to have flown on behind a weak link. Had it rested, four seconds of flight before that would
+still be more than FALL_SHARE of the others'."""
 
 STRIKES_TO_DOUBT, MOST_STRIKES = 2, 6
 UNKNOWN_GRID = bytes(64)
@@ -148,7 +152,7 @@ def judge(
         i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items() if i not in stations
     }
     by_fall = sorted(fell_per_s.values())
-    # who was not heard drained on: its fall, once it is heard again, is over this second too
+    # who was not heard for a while drained on: its fall, once it is heard again, is over this second too
     after = {i: s if i in known else s.unheard_of() for i, s in standings.items()}
     peers = [i for i in known if i != ego] if math.isfinite(form.blur_m) else []
     cells = dict(
@@ -192,11 +196,12 @@ def _median_without(ascending: Sequence[float], value: float) -> float:
 
 
 def _aged(standing: Standing, soc: float) -> Standing:
-    """The standing a second later; who is judged for the first time, or fell at once, begins with its charge."""
+    """The standing a second later. Who is judged for the first time, fell at once, or was silent for long, begins anew with
+    its charge."""
     strikes, reason, seconds, first_soc, least_soc, fine, unheard = standing
     fine = fine or abs(soc / PERCENT - round(soc / PERCENT)) > 1e-4
-    if seconds == 0 or soc < least_soc - min(JUMP * (1 + unheard), MOST_JUMP):
-        return Standing(strikes, reason, 1, soc, soc, fine)
+    if seconds == 0 or unheard >= LONG_SILENCE or soc < least_soc - min(JUMP * (1 + unheard), MOST_JUMP):
+        return Standing(strikes, reason, 1, soc, least_soc, fine)
     return Standing(strikes, reason, seconds + 1, first_soc, least_soc, fine)
 
 

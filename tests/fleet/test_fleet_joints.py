@@ -496,6 +496,18 @@ def test_a_drone_knows_which_members_of_the_scenario_stand_on_the_ground() -> No
         assert [i for i in range(3) if mine.trust_in(i) < 1.0] == doubted
 
 
+def test_a_drone_that_was_away_itself_doubts_nobody_for_that_time() -> None:
+    """Drones 0 and 1 rest; the others lose a percent meanwhile, which is not their fall of the seconds before and after."""
+    mine = memory(trust=True)
+    for second in (*range(4), *range(100, 110)):
+        flown_s = {0: second % 96, 1: second % 96, 2: second, 3: second, 4: second}
+        for i, lasted_s in flown_s.items():
+            soc = 0.9 - 0.0001234 * lasted_s
+            mine.hold(descriptor(i, second, battery_soc=soc, coverage_grid=bytes(64)), float(second))
+        mine.judge(second + 0.05)
+        assert [mine.trust_in(i) for i in flown_s] == [1.0] * 5, second
+
+
 def test_doubted_peers_are_left_out_of_what_is_believed_and_read_without_their_claims() -> None:
     mine = memory()
     for i in range(3):

@@ -14,6 +14,7 @@ from sortie.fleet.coverage import View, pack_grid, placed, unpack_grid
 from sortie.fleet.lies import falsified
 from sortie.fleet.messages.compact import Form, decode_compact, encode_compact
 from sortie.fleet.trust import (
+    LONG_SILENCE,
     Arrival,
     Standing,
     battery_doubt,
@@ -259,6 +260,28 @@ def test_the_return_of_a_silent_majority_brings_nobody_into_doubt() -> None:
         known = {i: d for i, d in fleet(second).items() if i in (0, 2) or not 1 <= second < 27}
         standings = judge(standings, 0, known, {})
         assert all(s.trust == 1.0 for s in standings.values()), second
+
+
+def fallen(drone: int, second: int, away: range) -> float:
+    """A charge that falls by 0.05 % a second, but not while drone 1 is away on the ground."""
+    return 0.9 - 0.0005 * (second - (drone == 1) * min(max(0, second - away.start), len(away)))
+
+
+@pytest.mark.parametrize("rest_s", [LONG_SILENCE, 80])
+def test_who_comes_back_from_a_rest_on_the_ground_is_not_doubted(rest_s: int) -> None:
+    """It flew for two seconds, and its charge stayed while the others flew on."""
+    standings: dict[int, Standing] = {}
+    away = range(2, 2 + rest_s)
+    for second in range(away.stop + 40):
+        known = {i: honest(i, 20.0 * i, soc=fallen(i, second, away)) for i in range(5) if i != 1 or second not in away}
+        standings = judge(standings, 0, known, {})
+        assert all(s.trust == 1.0 for s in standings.values()), second
+
+
+def test_no_charge_comes_back_on_the_ground() -> None:
+    """After a long silence too, a charge of more than before is a doubt."""
+    standings = judge({1: Standing(0, "", 90, 0.9, 0.85, True, 80)}, 0, {0: honest(0), 1: honest(1, soc=0.9)}, {})
+    assert standings[1].reason == "battery: 90% after 85%"
 
 
 def test_who_is_heard_late_has_not_fallen_before() -> None:
