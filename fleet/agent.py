@@ -428,9 +428,11 @@ class Agent:
 
     def _send(self, computed: simpy.Event) -> None:
         """The capture's features are there: hand each link that is due what its directive allows."""
-        if not self.status.airborne:
+        capture = cast(Capture, computed.value)
+        is_old = self.latest is not None and capture.t_s < self.latest.t_s  # it took longer than a later one
+        if is_old or not self.status.airborne:
             return
-        self.latest = capture = cast(Capture, computed.value)
+        self.latest = capture
         self._senses.perceived(capture)
         handshake_bytes = self._handshake_bytes()
         if handshake_bytes:

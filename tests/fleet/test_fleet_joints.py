@@ -669,6 +669,18 @@ def test_lies_of_several_events_are_all_told(order: tuple[int, ...]) -> None:
     assert told.peer_goodput_mbps == (50.0,) * 4
 
 
+def test_a_capture_that_is_ready_after_a_later_one_is_dropped() -> None:
+    """The computer takes half a second longer up to a moment: captures of shortly before it are overtaken."""
+    rig = Rig(lambda view: [FULL], dwell_s=0.0, compute_delay_s=0.04, degraded_after_periods=20)
+    rig.memory.status.slower_s = {3: 0.5}
+    rig.hear(1)
+    rig.env.run(until=0.35)  # after four looks
+    del rig.memory.status.slower_s[3]
+    rig.env.run(until=0.8)
+    assert [round(c.t_s, 9) for _, _, _, c in rig.sent] == [0.4, 0.5, 0.6, 0.7]
+    assert rig.agent.latest == rig.sent[-1][3]
+
+
 def test_what_slows_perception_adds_up() -> None:
     rig = Rig(lambda view: [FULL._replace(destination=p) for p in view.peers], dwell_s=0.0, compute_delay_s=0.04)
     rig.memory.status.slower_s = {3: 0.01, 7: 0.03}
