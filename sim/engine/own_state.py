@@ -28,6 +28,8 @@ class OwnState:
         """Args: `zero_s`: what a perfect clock shows at time 0."""
         self._status, self._oscillator, self._zero_s = status, oscillator, zero_s
         self._clock = oscillator.at_start(gnss)
+        self._follows_gnss = gnss  # wherever there is GNSS
+        self._losses: set[int] = set()  # of GNSS, those that last
         self.read(0.0)
 
     def read(self, now_s: float) -> None:
@@ -42,9 +44,14 @@ class OwnState:
                 self._set(now_s, offset_s=event.skew_s)
                 return Told("clock_skew", f"clock off by {event.skew_s:g} s")
             case ClockDrift():
+                self._follows_gnss = False
                 self._set(now_s, rate_ppm=event.drift_ppm, growth_ppm_per_min=0.0)
                 return Told("clock_drift", f"clock drifts by {event.drift_ppm:g} ppm")
             case GnssLoss():
+                followed = self._follows_gnss and not self._losses
+                self._losses.add(index)
+                if not followed:
+                    return Told("gnss_loss", "no GNSS: the clock runs on as before")
                 self._set(now_s, rate_ppm=own.rate_ppm, growth_ppm_per_min=own.growth_ppm_per_min)
                 return Told("gnss_loss", f"no GNSS: the clock drifts by {own.rate_ppm:.3g} ppm")
             case Lie():
@@ -55,6 +62,11 @@ class OwnState:
         """An event that lasts ends."""
         match event:
             case GnssLoss():
+                self._losses.remove(index)
+                if self._losses:
+                    return Told("gnss_loss", "still no GNSS: another loss lasts")
+                if not self._follows_gnss:
+                    return Told("gnss_back", "GNSS is back: the clock does not follow it")
                 self._set(now_s, offset_s=self._oscillator.offset_s, rate_ppm=0.0, growth_ppm_per_min=0.0)
                 return Told("gnss_back", "the clock follows GNSS again")
             case Lie():

@@ -104,22 +104,46 @@ BEFORE = (
 )
 
 
-@pytest.mark.parametrize("gnss", [True, False])
-@pytest.mark.parametrize("first", BEFORE)
-@pytest.mark.parametrize("second", BEFORE)
-def test_a_clock_that_follows_gnss_again_has_its_constant_error_alone(gnss: bool, first: Any, second: Any) -> None:
-    """Whatever was done to it before: no drift is left, and no growth of one."""
+@pytest.mark.parametrize("first", [BEFORE[0], BEFORE[2]])
+@pytest.mark.parametrize("second", [BEFORE[0], BEFORE[2]])
+def test_a_clock_that_follows_gnss_again_has_its_constant_error_alone(first: Any, second: Any) -> None:
+    """After the last of all losses: no drift is left, and no growth of one."""
     status = DroneStatus()
-    own = OwnState(status, Oscillator(0.03, 20.0, 600.0), gnss=gnss)
+    own = OwnState(status, Oscillator(0.03, 20.0, 600.0), gnss=True)
     own.begin(first, 0, 10.0)
     own.begin(second, 1, 40.0)
     own.begin(BEFORE[0], 2, 70.0)
-    own.read(100.0)
-    assert status.clock_skew_s != pytest.approx(0.03, abs=1e-4)
-    own.end(BEFORE[0], 2, 130.0)
+    losses = [index for index, event in enumerate((first, second, BEFORE[0])) if isinstance(event, GnssLoss)]
+    told = []
+    for index in losses:
+        own.read(100.0 + index)
+        assert status.clock_skew_s != pytest.approx(0.03, abs=1e-4)
+        told.append(own.end(BEFORE[0], index, 100.0 + index).kind)
+    assert told == ["gnss_loss"] * (len(losses) - 1) + ["gnss_back"]
     for t_s in (130.0, 200.0, 4000.0):
         own.read(t_s)
         assert status.clock_skew_s == pytest.approx(0.03, abs=1e-12)
+
+
+@pytest.mark.parametrize(("gnss", "drifts_at_s"), [(False, None), (True, 10.0), (False, 10.0), (True, 70.0)])
+def test_the_end_of_a_loss_leaves_a_clock_alone_that_does_not_follow_gnss(
+    gnss: bool, drifts_at_s: float | None
+) -> None:
+    """Because it never did, or because it was set drifting before the loss or during it."""
+    errors_s = []
+    for ends in (False, True):
+        status = DroneStatus()
+        own = OwnState(status, Oscillator(0.03, 20.0, 600.0), gnss=gnss)
+        for t_s in (10.0, 40.0, 70.0):
+            if t_s == drifts_at_s:
+                own.begin(BEFORE[1], 0, t_s)
+            if t_s == 40.0:
+                own.begin(BEFORE[0], 1, t_s)
+        if ends:
+            assert own.end(BEFORE[0], 1, 100.0) == ("gnss_back", "GNSS is back: the clock does not follow it")
+        own.read(400.0)
+        errors_s.append(status.clock_skew_s)
+    assert errors_s[0] == pytest.approx(errors_s[1])
 
 
 def test_a_clock_without_gnss_drifts_by_a_rate_that_grows() -> None:
