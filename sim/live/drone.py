@@ -89,7 +89,7 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
         if orders.mavlink is not None:
             link = MavlinkLink(orders.mavlink, orders.origin, orders.mavlink_key)
             link.wait_until_found()
-            senses = MavlinkSenses(link, replay, drone, node.note)
+            senses = MavlinkSenses(link, replay, drone, node.note, scenario.policy.hysteresis)
         if go is None:
             while not node.all_found(orders.present):
                 if pipe.poll(POLL_S):

@@ -119,8 +119,17 @@ class MavlinkSenses:
     behind, and the staleness rules degrade and detach the drone at its peers. When peers would detach it, it says nothing.
     """
 
-    def __init__(self, link: MavlinkLink, replay: ReplaySenses, drone: int, note: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        link: MavlinkLink,
+        replay: ReplaySenses,
+        drone: int,
+        note: Callable[[str], None],
+        hysteresis: float = 0.0,
+    ) -> None:
+        """Args: `hysteresis` is the band of the vehicle's charge (`sortie.policies.damping`)."""
         self._link, self._replay, self._drone, self._note = link, replay, drone, note
+        self._hysteresis, self._soc = hysteresis, math.inf
         self._offset_s = 0.0
         self._rules: PlaneRules | None = None
         self._stale = self._doubted = False
@@ -156,9 +165,12 @@ class MavlinkSenses:
         return {"telemetry unsigned or forged": self._link.refused} if self._link.refused else {}
 
     def platform(self) -> Platform:
-        """The vehicle's charge, where it knows it; headrooms are replayed."""
+        """The vehicle's charge, where it knows it, with a hysteresis band; headrooms are replayed."""
         replayed, soc = self._replay.platform(), self._link.state.soc
-        return replayed if soc is None else replayed._replace(soc=soc)
+        if soc is None:
+            return replayed
+        self._soc = min(soc, max(self._soc, soc / (1.0 + self._hysteresis)))
+        return replayed._replace(soc=self._soc)
 
     def task(self) -> Task:
         """The scenario's mission; a vehicle on the ground is landing."""

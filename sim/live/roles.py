@@ -96,7 +96,7 @@ class RoleNode:
         if role == Role.PUBLISHER and orders.mavlink is not None:
             self._link = MavlinkLink(orders.mavlink, orders.origin, orders.mavlink_key)
             self._link.wait_until_found()
-            senses = MavlinkSenses(self._link, replay, drone, node.note)
+            senses = MavlinkSenses(self._link, replay, drone, node.note, scenario.policy.hysteresis)
             senses.begin(-begin_monotonic_s, rules)
             node.is_muted = lambda: isinstance(senses, MavlinkSenses) and senses.muted
         self._senses = senses

@@ -29,7 +29,7 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
         degraded_after_periods=scenario.context.degraded_after_periods,
         detached_after_periods=scenario.context.detached_after_periods,
         dwell_s=scenario.policy.dwell_s,
-        hysteresis=scenario.policy.hysteresis,
+        hysteresis=0.0,  # replayed values went through the band in the simulated flight
         compute_delay_s=scenario.perception.compute_delay_s,
         code_bytes=scenario.perception.code_bytes,
         publish_every=scenario.context.publish_every,

@@ -239,6 +239,7 @@ def test_the_bench_counts_samples_and_bytes_of_each_link_and_from_the_begin_on()
 
 
 def test_the_rules_on_the_bus_are_the_scenario_s_own() -> None:
+    """But for the hysteresis band: what is replayed went through it in the simulated flight."""
     scenario = example(
         "context={rate_hz: 5, degraded_after_periods: 4, detached_after_periods: 17, publish_every: 2, roster: true, trust: false}",
         "policy={name: silence, dwell_s: 0.7, hysteresis: 0.15}", "perception.compute_delay_s=0.06", "perception.code_bytes=3",
@@ -246,7 +247,7 @@ def test_the_rules_on_the_bus_are_the_scenario_s_own() -> None:
     )  # fmt: skip
     rules = rules_of(scenario, 1.0, 4.0)
     assert rules == PlaneRules(
-        period_s=0.2, frames=15, degraded_after_periods=4, detached_after_periods=17, dwell_s=0.7, hysteresis=0.15,
+        period_s=0.2, frames=15, degraded_after_periods=4, detached_after_periods=17, dwell_s=0.7, hysteresis=0.0,
         compute_delay_s=0.06, code_bytes=3, publish_every=2, trust=False, roster=True, makes=rules.makes, people=True, classes=True,
     )  # fmt: skip
     assert [rules.equipment(d).compute_delay_s for d in (0, 1)] == [0.06, 0.5]

@@ -268,6 +268,25 @@ def test_what_a_vehicle_says_is_what_its_drone_senses(monkeypatch: pytest.Monkey
     assert seen["perceived"] == [capture]
 
 
+def test_a_vehicle_s_charge_rises_only_by_more_than_the_band() -> None:
+    """Headrooms are replayed as they were published, and have no second band."""
+    replay = SimpleNamespace(platform=lambda: Platform(0.9, *headrooms))
+    link = SimpleNamespace(state=VehicleState(), refused=0)
+    made = MavlinkSenses(link, replay, 2, str, hysteresis=0.2)  # type: ignore[arg-type]
+    told = []
+    for soc, headrooms in (
+        (None, (0.1, 0.2)),
+        (0.5, (0.8, 0.7)),
+        (0.4, (0.1, 0.2)),
+        (0.44, (0.8, 0.7)),
+        (0.6, (0.8, 0.7)),
+    ):
+        link.state = VehicleState(soc=soc)
+        told.append(made.platform().soc)
+        assert made.platform()[1:] == headrooms
+    assert told == pytest.approx([0.9, 0.5, 0.4, 0.4, 0.5])
+
+
 def test_charge_and_phase_are_the_vehicle_s_where_it_knows_them(monkeypatch: pytest.MonkeyPatch) -> None:
     for soc, wanted in ((None, 0.9), (0.25, 0.25), (0.0, 0.0)):
         assert senses(monkeypatch, soc=soc)[0].platform() == Platform(wanted, 0.8, 0.7)
