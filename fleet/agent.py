@@ -43,7 +43,6 @@ from sortie.policies.contract import (
 )
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
 from sortie.policies.verification.enforced import Cap, Steps
-from sortie.scenarios.plain_sum import plain_sum
 
 _FRESH = LinkHealth.FRESH
 _NOTHING = nothing(0, 1, "")[2:8]
@@ -236,7 +235,7 @@ class Agent:
         self.status.work.looks += self.status.perceiving
         if self.status.perceiving:
             self._look = sensed
-            delay_s = self._compute_delay_s + plain_sum(self.status.slower_s.values())
+            delay_s = self._compute_delay_s + self.status.slowed_s
             self._env.timeout(delay_s, sensed.capture).callbacks.append(self._send)
 
     # --- the context plane ---------------------------------------------------------------------

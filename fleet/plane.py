@@ -14,6 +14,7 @@ from sortie.perception.budget import CODE_BYTES
 from sortie.perception.files import codebook_digest
 from sortie.perception.geometry import USUAL, Cameras
 from sortie.policies.contract import Descriptor
+from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import Scenario
 
 
@@ -119,6 +120,11 @@ class DroneStatus:
     """What the drone's computer did so far."""
     lies: dict[int, Callable[[Descriptor], Descriptor]] = field(default_factory=dict)
     """Falsifications of the drone's descriptors, by the index of the scenario event that causes them."""
+
+    @property
+    def slowed_s(self) -> float:
+        """What `slower_s` adds up to."""
+        return plain_sum(self.slower_s.values())
 
     def leave(self) -> None:
         """The drone leaves the plane."""

@@ -142,7 +142,7 @@ class Scorer:
                 moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))
             elif agent.here is not None and (agent.latest is not None or not agent.status.looks):
                 shares = self._shares(agent, now_s)
-                job = self._job(agent.here, agent.latest, [of_vehicles(s) for s in shares], now_s)
+                job = self._job(agent, agent.here, [of_vehicles(s) for s in shares], now_s)
                 moment[1].append(Ego(agent.here, job, people=self._people.known(agent.here, shares, now_s)))
         self._waiting.append(moment)
         if self._ahead is not None:
@@ -200,15 +200,15 @@ class Scorer:
             shares = [s._replace(tracks=own) if s.representation in DETECTED_NAMES else s for s in shares]
         return shares
 
-    def _job(self, here: Capture, look: Capture | None, shares: list[Share], now_s: float) -> Job | None:
-        """The agent's capture and its recent shares.
+    def _job(self, agent: Agent, here: Capture, shares: list[Share], now_s: float) -> Job | None:
+        """The agent's capture and its recent shares, where `here` is its present pose.
 
         Where its own capture is too old it has its present pose alone, and fuses what its peers sent; None where that is
         nothing.
         """
-        config = self._scenario.perception
+        config, look = self._scenario.perception, agent.latest
         limit_s = config.max_age_s + INSTANT_S
-        delay_s = self._delays_s[here.drone] + config.fusion_delay_s  # of any capture
+        delay_s = self._delays_s[here.drone] + agent.status.slowed_s + config.fusion_delay_s  # of any capture
         if look is None or now_s - look.t_s > limit_s + delay_s:
             if not shares:
                 return None

@@ -17,6 +17,7 @@ from sim_examples import example
 from sortie.fleet.flight.steering import GoTo, Velocity
 from sortie.fleet.memory import Received
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
+from sortie.fleet.plane import DroneStatus
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
@@ -429,7 +430,7 @@ class Nobody:
 def _agent(
     drone: int, here_s: float, latest_s: float | None, mind: Mind, *, airborne: bool = True, looks: bool = True
 ) -> Any:
-    status = SimpleNamespace(airborne=airborne, looks=looks)
+    status = DroneStatus(airborne=airborne, looks=looks)
     latest = None if latest_s is None else capture(drone, latest_s)
     return SimpleNamespace(drone=drone, here=capture(drone, here_s), latest=latest, memory=mind, status=status)
 
@@ -511,6 +512,14 @@ def test_a_look_that_is_too_old_is_left_out_and_the_drone_is_where_it_is(
 def test_a_slow_computer_s_look_may_be_older() -> None:
     slow = "fleet.makes=[{name: a, drones: [2], compute_delay_s: 0.2}]"
     seer, _ = _scored([_agent(d, 1.0, 0.35, Mind()) for d in (0, 2)], slow)
+    assert seer.jobs.keys() == {2}
+
+
+def test_a_look_that_events_slow_may_be_older() -> None:
+    """0.36 s and 0.4 s longer, two events together: the look is as old as it must be, and not too old."""
+    agents = [_agent(d, 1.0, -0.3, Mind()) for d in (0, 1, 2)]
+    agents[1].status.slower_s, agents[2].status.slower_s = {0: 0.36}, {0: 0.36, 1: 0.4}
+    seer, _ = _scored(agents)
     assert seer.jobs.keys() == {2}
 
 
