@@ -29,7 +29,8 @@ class Look(NamedTuple):
     """What a drone's thermal camera found in a frame."""
 
     capture: Capture
-    boxes: Boxes
+    boxes: Boxes | None
+    """None where it was covered, so that its frame says nothing."""
 
 
 class People:
@@ -56,22 +57,25 @@ class People:
             at = enumerate(self._walkers.at(now_s).tolist())
             self._rows["people"].extend((now_s, person, x_m, y_m) for person, (x_m, y_m) in at)
 
-    def look(self, capture: Capture, frame: int) -> None:
-        """A drone's thermal camera looks."""
+    def look(self, capture: Capture, frame: int, *, is_blocked: bool = False) -> None:
+        """A drone's thermal camera looks; one that is blocked sees nothing."""
         camera = self._camera
         if camera is None or capture.drone in self._without_camera:
             return
-        at_m, scene = self._walkers.at(capture.t_s), self._scene
-        trucks = scene.trucks(capture.t_s) if self._has_trucks else None
-        found = look(camera, at_m, scene.height_field, capture, frame, self._frame_s, self._key, trucks)
+        found = [] if is_blocked else self._seen(camera, capture, frame)
         self._rows["sightings"].extend((s.t_s, capture.drone, s.x_m, s.y_m, s.score, s.person) for s in found)
         lately, looks = self._lately[capture.drone], self._looks[capture.drone]
         lately.extend(found)
         while lately and lately[0].t_s < capture.t_s - camera.remembers_s - _INSTANT_S:
             lately.popleft()
-        looks.append(Look(capture, boxes_of(found)))
+        looks.append(Look(capture, None if is_blocked else boxes_of(found)))
         while looks[0].capture.t_s < capture.t_s - KEPT_S:
             looks.popleft()
+
+    def _seen(self, camera: Thermal, capture: Capture, frame: int) -> Sequence[Sighting]:
+        at_m, scene = self._walkers.at(capture.t_s), self._scene
+        trucks = scene.trucks(capture.t_s) if self._has_trucks else None
+        return look(camera, at_m, scene.height_field, capture, frame, self._frame_s, self._key, trucks)
 
     def known_in(self, drone: int, region: Disc | None, now_s: float) -> bool:
         """Whether the drone's own camera found a person in its region lately."""
@@ -87,7 +91,8 @@ class People:
         """What the drone's thermal camera found at the moment of a capture."""
         for its in reversed(self._looks[capture.drone]):
             if its.capture.t_s <= capture.t_s + _INSTANT_S:
-                return its.boxes if its.capture.t_s >= capture.t_s - _INSTANT_S else Boxes.empty()
+                is_same = its.capture.t_s >= capture.t_s - _INSTANT_S
+                return its.boxes if is_same and its.boxes is not None else Boxes.empty()
         return Boxes.empty()
 
     def with_people(
@@ -117,7 +122,7 @@ class People:
             if its.capture.t_s + self._delays_s[here.drone] <= now_s + _INSTANT_S
         )
         sources = []
-        if (last := next(known, None)) is not None:
+        if (last := next(known, None)) is not None and last.boxes is not None:
             own = last.capture
             sources.append(SourceBoxes(last.boxes, 1.0, own.est_pose, looked_at(camera, own), age_s=now_s - own.t_s))
         sources += [_received(s, camera) for s in shares if s.weight > 0.0 and (s.people is not None or _has_tracks(s))]

@@ -380,7 +380,8 @@ class OwnSenses:
 
     def sense(self, frame: int) -> Sensed:
         self._sensed = self._world.sensed(self._drone, frame)
-        self._world.people.look(self._sensed.capture, frame)
+        is_blocked = bool(self._world.drones[self._drone].blocked)
+        self._world.people.look(self._sensed.capture, frame, is_blocked=is_blocked)
         return self._sensed
 
     def platform(self) -> Platform:

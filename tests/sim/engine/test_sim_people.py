@@ -265,6 +265,25 @@ def test_the_own_camera_is_known_after_the_delay_of_perception() -> None:
     assert people.truth(t_s, here).car.tolist() == [0]
 
 
+def test_a_blocked_thermal_camera_finds_nobody_and_votes_nobody_down() -> None:
+    """From the moment at which its covered frame would be known; what it found before stands until then."""
+    people, here = people_of("perception.join=average")
+    share = [received((30.0, 0.0))]
+    people.look(here._replace(t_s=1.1), 11, is_blocked=True)
+    assert people.known(here, share, 1.12).score[0] == pytest.approx(0.45, rel=0.01)
+    assert people.known(here, share, 1.13).score[0] == pytest.approx(0.9, rel=1e-3)
+    assert len(people.found(here._replace(t_s=1.1))) == 0
+
+
+def test_camera_blocked_covers_the_thermal_camera_too() -> None:
+    alarms = "perception.thermal={false_alarms_per_min: 600}"
+    events = "events=[{kind: camera_blocked, at_s: 1, until_s: 2, drone: 1}]"
+    record = run_sortie(example("duration_s=3", "perception.detector=none", alarms, events), "silence")
+    rows = record.tables["sightings"].to_pandas()
+    second = {drone: set((its.t_s + 1e-6).astype(int)) for drone, its in rows.groupby("drone")}
+    assert (second[0], second[1]) == ({0, 1, 2}, {0, 2})
+
+
 def test_people_are_looked_for_where_they_are_at_the_scoring() -> None:
     """One runs 10 m/s, and a fusion comes 0.8 s after its frame. A drone that was lost would have had to find her as well."""
     record = run_sortie(
