@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 from sortie.fleet.flight.descent import descending, level_again
@@ -23,6 +24,8 @@ class Membership:
         self._level = world.motion
         self._homebound: dict[int, float] = {}
         """By drone that went home and did not come back: when it touches down."""
+        self.on_join: Callable[[int], None] = lambda drone: None
+        """Called with each drone that joins."""
         self._replaced: set[int] = set()
         self._reserves = [list(group.reserve) for group in self._mission.groups]
         first: dict[int, object] = {}
@@ -66,6 +69,7 @@ class Membership:
             self._replaced.discard(drone)
             if self._homebound.pop(drone, None) is not None and frame < len(world.motion.time_s):
                 world.reroute(level_again(world.motion, self._level, drone, frame))
+            self.on_join(drone)
 
     def go_home(self, drone: int, text: str = "told to") -> None:
         """A drone that flies goes home; nothing happens to one on the ground or on its way."""

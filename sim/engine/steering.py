@@ -89,6 +89,17 @@ class Steering:
             *(group.reserve for group in scenario.mission.groups)
         )
         self._frame = 0
+        membership.on_join = self._begin_anew
+
+    def _begin_anew(self, drone: int) -> None:
+        """A drone that joins appears in its slot, and rests there until its next command."""
+        frame = self._world.next_frame
+        if drone not in self._planners or frame >= len(self._time_s):
+            return
+        self._ways[drone] = self._resting(drone)
+        self._wishes.pop(drone, None)
+        self._reported.pop(drone, None)
+        self._world.reroute(steered(self._world.motion, self._base, {drone: self._shift(drone, frame)}, frame))
 
     def _resting(self, drone: int) -> SteeredWay:
         x, y, z = self._starts_m[drone].tolist()
@@ -135,6 +146,8 @@ class Steering:
             return
         gone = [i for i, d in enumerate(drones) if not (d.airborne or i in self._comes)]
         others_m = np.array(self._world.motion.position_m[frame:])
+        down = [i for i, d in enumerate(drones) if not d.airborne]
+        others_m[:, down] = self._base.position_m[frame:, down]  # where they appear if they join
         granted, landing = {}, []
         for drone in flying:
             command = wishes[drone]

@@ -217,3 +217,55 @@ def test_drones_that_begin_too_near_each_other_may_part() -> None:
     record = flown(GOES, params(only=0, x_m=-40, y_m=-30), *settings, "duration_s=13")
     assert not [text for text in texts(record, 0) if "refused" in text]
     np.testing.assert_allclose(states(record, "x_m", "y_m")[-1, 0], (-40, -30), atol=0.1)
+
+
+PLANS = """
+from sortie.fleet.flight.steering import GoTo, Land
+
+class Planner:
+    def __init__(self, drone, start_m, rng):
+        self.drone, (self.x_m, self.y_m, self.z_m), self.views = drone, start_m, 0
+
+    def command(self, view):
+        self.views += 1
+        return self.wanted()
+
+class Climbs(Planner):
+    def wanted(self):
+        if self.drone == 0:
+            place = GoTo(self.x_m, self.y_m + 20, self.z_m + 20)
+            return [place, Land(), GoTo(self.x_m, self.y_m, self.z_m + 2)][(self.views > 7) + (self.views > 8)]
+
+class Follows(Planner):
+    def wanted(self):
+        if self.drone == 1:
+            return GoTo(self.x_m, self.y_m + 20, self.z_m)
+        return GoTo(self.x_m, self.y_m + 20, self.z_m) if self.views > 8 else None
+"""
+TWO = ("fleet.drones=2", "fleet.formation={shape: line, altitude_m: 20}")
+
+
+@pytest.mark.parametrize("event", ["drone_lost, at_s: 3.8", "drone_leaves, at_s: 3.2"])
+def test_a_drone_with_a_planner_that_joins_again_begins_anew_in_its_slot(event: str, tmp_path: Path) -> None:
+    """It climbed, landed or was lost elsewhere; then it rises 2 m from its slot, and does not jump to where it was."""
+    (tmp_path / "own.py").write_text(PLANS)
+    events = f"events=[{{kind: {event}, drone: 0}}, {{kind: drone_joins, at_s: 8, drone: 0}}]"
+    record = flown(f"fleet.mobility={tmp_path / 'own.py'}:Climbs", events, *TWO, "mission.descent_mps=10")
+    assert [r["kind"] for r in record.tables["events"].to_pylist()].count("drone_joins") == 1
+    place = states(record, "x_m", "y_m", "z_m")[:, 0]
+    assert np.linalg.norm(place[32] - place[0]) > 3
+    np.testing.assert_allclose(place[80], place[0], atol=1e-9)
+    assert np.linalg.norm(np.diff(place[80:], axis=0), axis=-1).max() < 0.5
+    np.testing.assert_allclose(place[-1], place[0] + (0, 0, 2), atol=0.1)
+
+
+def test_the_slot_of_a_drone_that_may_come_back_is_kept_free_though_it_was_lost_elsewhere(tmp_path: Path) -> None:
+    """Drone 1 is lost 20 m from its slot; drone 0 is then sent to that slot, and keeps its distance from it."""
+    (tmp_path / "own.py").write_text(PLANS)
+    events = "events=[{kind: drone_lost, at_s: 4, drone: 1}, {kind: drone_joins, at_s: 11.5, drone: 1}]"
+    settings = (f"fleet.mobility={tmp_path / 'own.py'}:Follows", events, "fleet.steering.separation_m=8")
+    place = states(flown(*settings, *TWO), "x_m", "y_m", "z_m")
+    slot = place[0, 1]
+    assert np.linalg.norm(place[40, 1] - slot) > 5
+    np.testing.assert_allclose(place[115, 1], slot, atol=1e-9)
+    assert 8.0 - 1e-6 < np.linalg.norm(place[:, 0] - slot, axis=-1).min() < 15.0
