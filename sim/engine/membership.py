@@ -67,6 +67,9 @@ class Membership:
         world.join(drone, text)
         if world.drones[drone].airborne:
             self._replaced.discard(drone)
+            for reserves in self._reserves:
+                if drone in reserves:
+                    reserves.remove(drone)
             if self._homebound.pop(drone, None) is not None and frame < len(world.motion.time_s):
                 world.reroute(level_again(world.motion, self._level, drone, frame))
             self.on_join(drone)

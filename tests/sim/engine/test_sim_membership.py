@@ -107,6 +107,22 @@ def test_a_reserve_takes_over_from_a_lost_drone_once() -> None:
     assert airborne(record, 4) == [(0.0, False)]
 
 
+def test_a_reserve_that_an_event_sent_up_takes_over_from_nobody_and_is_replaced_as_others_are() -> None:
+    """Drone 2 flies already when drone 0 is lost, so 3 takes over; 2 goes home at its charge as any other."""
+    record = flown(
+        "mission.groups=[{drones: [0, 1, 2, 3], reserve: [2, 3], phases: [{phase: search}]}]",
+        "events=[{kind: drone_joins, at_s: 1, drone: 2}, {kind: drone_lost, at_s: 2, drone: 0}]",
+        "fleet.overrides=[{drone: 2, initial_soc: 0.5005}]",
+        "mission.handover_soc=0.5",
+    )
+    joined = rows(record, "events", kind="drone_joins")
+    assert [(r["t_s"], r["drone"], r["text"]) for r in joined] == [
+        (1.0, 2, "takes off"),
+        (2.0, 3, "takes over from drone 0"),
+    ]
+    assert [r["drone"] for r in rows(record, "events", kind="drone_leaves")] == [2]
+
+
 def test_an_empty_drone_stays_down() -> None:
     record = flown("events=[{kind: drone_joins, at_s: 2, drone: 3}]", "fleet.overrides=[{drone: 3, initial_soc: 0.05}]")
     assert airborne(record, 3) == [(0.0, False)]
