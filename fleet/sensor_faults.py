@@ -51,15 +51,16 @@ def sensor_errors(scenario: Scenario, positions_m: Array, seed: int, replication
     """
     frames, drones = positions_m.shape[:2]
     times_s = np.arange(frames, dtype=np.float64) * np.float64(scenario.frame_s)
+    flying = [drone for drone in range(drones) if scenario.fleet.station(drone) is None]  # a station knows its place
     errors: dict[int, Array] = {}
     if scenario.fleet.sensor is not None:
         model = resolve("sensor", scenario.fleet.sensor, scenario.fleet.sensor_params)
-        for drone in range(drones):
+        for drone in flying:
             rng = stream(seed, replication, drone, "own sensor")
             errors[drone] = own_errors(model, times_s, np.array(positions_m[:, drone]), rng)
     for index, event in enumerate(scenario.events):
         if isinstance(event, PositionFault | HeadingFault | GnssLoss):
-            for drone in [event.drone] if event.drone is not None else range(drones):
+            for drone in [event.drone] if event.drone is not None else flying:
                 found = _of_event(event, times_s, stream(seed, replication, (drone, index), "sensor fault"))
                 if found is not None:
                     errors[drone] = errors[drone] + found if drone in errors else found

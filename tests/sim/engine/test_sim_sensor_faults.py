@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,22 @@ def test_dead_reckoning_grows_with_the_root_of_time() -> None:
     for frame in (100, 400):
         variance = np.mean(walked[:, frame - 1] ** 2)
         assert variance == pytest.approx(9.0 * frame / 10, rel=0.5)  # 120 draws: six standard errors are 0.77
+
+
+def test_a_ground_station_knows_its_place_unless_an_event_names_it() -> None:
+    own = f"fleet.sensor={Path(__file__).parent / 'own_models.py'}:drifts"
+    lost = "{kind: gnss_loss, at_s: 0, position_walk_m: 3}"
+    named = "{kind: gnss_loss, at_s: 0, drone: 1, position_walk_m: 3}"
+    station = "fleet.ground=[{drone: 1, position_m: [0, 0, 3]}]"
+
+    def errors(events: str, *settings: str) -> Mapping[int, np.ndarray]:
+        return sensor_errors(example(f"events=[{events}]", own, *settings), np.zeros((60, 5, 3)), 1, 0)
+
+    all_fly, one_stands = errors(lost), errors(lost, station)
+    assert sorted(one_stands) == [0, 2, 3, 4]
+    for drone, error in one_stands.items():
+        assert_allclose(error, all_fly[drone], atol=0.0)
+    assert np.abs(errors(named, station)[1][:, :2]).max() > 0.1
 
 
 def test_without_a_walk_the_loss_of_gnss_touches_clocks_alone() -> None:
