@@ -35,6 +35,15 @@ RECORDED = "recorded"
 """The cause of what a traced drone spent; in the ledger only where a drone is traced."""
 
 
+def overridden(packs: Sequence[Battery], overrides: Sequence[DroneOverride]) -> list[Battery]:
+    """Each drone's pack, with what `fleet.overrides` says of it."""
+    own = list(packs)
+    for override in overrides:
+        changes = override.model_dump(exclude={"drone", "payload_kg"}, exclude_none=True)
+        own[override.drone] = own[override.drone].model_copy(update=changes)
+    return own
+
+
 class FleetBatteries:
     """Every drone's pack and its ledger.
 
@@ -69,10 +78,7 @@ class FleetBatteries:
             traces: drones whose charge is not modelled but read from a trace.
             mains: members of the fleet that draw from the mains; their packs stay full.
         """
-        packs = [config] * n if isinstance(config, Battery) else list(config)
-        for override in overrides:
-            changes = override.model_dump(exclude={"drone", "payload_kg"}, exclude_none=True)
-            packs[override.drone] = packs[override.drone].model_copy(update=changes)
+        packs = overridden([config] * n if isinstance(config, Battery) else config, overrides)
         self._mains = {i for i in range(n) if i in mains}
         for i in self._mains:
             packs[i] = packs[i].model_copy(update={"initial_soc": 1.0})

@@ -14,6 +14,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from sortie.fleet.energy.battery import overridden
 from sortie.fleet.energy.cell import MEAN_CELL_V
 from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.logs.ground_station import answers, parameter_values, status_texts
@@ -34,7 +35,7 @@ DATAGRAM_BYTES = 1400
 
 def parameters_of(scenario: Scenario) -> list[dict[str, float]]:
     """Each drone's parameters, by ArduPilot's names: its system id, and its pack's capacity in mAh."""
-    packs = enumerate(scenario.fleet.batteries)
+    packs = enumerate(overridden(scenario.fleet.batteries, scenario.fleet.overrides))
     return [
         {"SYSID_THISMAV": drone + 1.0, "BATT_CAPACITY": 1000 * pack.capacity_wh / (pack.cells * MEAN_CELL_V)}
         for drone, pack in packs

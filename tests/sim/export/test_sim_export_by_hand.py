@@ -31,6 +31,7 @@ duration_s: 3
 fleet:
   drones: 3
   makes: [{name: big, drones: [1], battery: {capacity_wh: 222, cells: 6}}]
+  overrides: [{drone: 2, capacity_wh: 20}]
 context: {rate_hz: 1, roster: false}
 mission:
   target: {waypoints_m: [[0, 0], [90, 0]], speed_mps: 3}
@@ -309,8 +310,8 @@ def test_each_vehicle_says_its_own_pack_and_its_own_texts() -> None:
     made = parameters_of(exported().scenario)
     assert [p["SYSID_THISMAV"] for p in made] == [1.0, 2.0, 3.0]
     assert made[1]["BATT_CAPACITY"] == pytest.approx(1000 * 222 / (6 * MEAN_CELL_V))
-    assert made[0] == made[2] | {"SYSID_THISMAV": 1.0}
-    assert made[0]["BATT_CAPACITY"] != made[1]["BATT_CAPACITY"]
+    assert made[0]["BATT_CAPACITY"] == pytest.approx(1000 * 130 / (4 * MEAN_CELL_V))
+    assert made[2]["BATT_CAPACITY"] == pytest.approx(1000 * 20 / (4 * MEAN_CELL_V))
     stream = Stream(exported().scenario, Origin(47.0, 8.0, 400.0))
     said: dict[tuple[float, int], list[str]] = {}
     for t_s, drone, m in stream.add(exported().tables):
