@@ -411,6 +411,11 @@ class Fleet(Section):
         return next((station for station in self.ground if station.drone == drone), None)
 
     @property
+    def without_camera(self) -> frozenset[int]:
+        """The ground stations that have no camera."""
+        return frozenset(station.drone for station in self.ground if not station.camera)
+
+    @property
     def in_formation(self) -> tuple[int, ...]:
         """The drones of the fleet's own formation, in the order of its slots."""
         apart = {drone for _, drone in self._apart()}

@@ -166,7 +166,7 @@ class Scenario(Section):
     @property
     def context_only(self) -> tuple[bool, ...]:
         """Whether each drone is of a make without a detector, or a ground station without cameras."""
-        blind = {station.drone for station in self.fleet.ground if not station.camera}
+        blind = self.fleet.without_camera
         makes = enumerate(self.fleet.make_of_each)
         return tuple(i in blind or (make is not None and make.detector == "none") for i, make in makes)
 

@@ -46,7 +46,7 @@ class People:
         self._walkers, self._camera, self._join = scene.walkers, perception.thermal, perception.join
         self._delays_s, self._frame_s = scenario.compute_delays_s, scenario.frame_s
         self._scene, self._rows, self._key = scene, recorder.rows, key
-        self._without_camera = {station.drone for station in scenario.fleet.ground if not station.camera}
+        self._without_camera = scenario.fleet.without_camera
         self._has_trucks = perception.scene.trucks > 0.0
         self._lately: list[deque[Sighting]] = [deque() for _ in range(scenario.fleet.drones)]
         self._looks: list[deque[Look]] = [deque() for _ in range(scenario.fleet.drones)]

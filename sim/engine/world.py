@@ -124,7 +124,7 @@ class World:
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
         self._rotor_w = fleet_power_w(scenario.fleet, motion)
         self._cameras = cameras_of(scenario.fleet)
-        self._without_camera = {station.drone for station in scenario.fleet.ground if not station.camera}
+        self._without_camera = scenario.fleet.without_camera
         self._errors = errors
         self._flight = self._senses(motion)
         recorder.unfold["states"] = self._unfold_states

@@ -1,4 +1,4 @@
-"""A sortie as a ROS 2 bag: context and directives byte for byte as a fleet would send them, and what viewers need beside.
+"""A sortie as a ROS 2 bag: descriptors, directives, and what viewers need beside.
 
 | topic | type | QoS |
 |---|---|---|
@@ -13,7 +13,9 @@
 
 The frame `world` is ENU in metres, `drone_0` its body in FLU. The plane's topics are the live bus's (`sortie.sim.export.topics`). The
 record holds no estimated pose, so a descriptor's is the true one here. All stamps count from the begin of the bag, also those
-that drones put into descriptors by their own clocks, which may be wrong. The bag is compressed (zstd, in chunks).
+that drones put into descriptors by their own clocks, which may be wrong. Descriptors are in the paper's form (CDR), without the
+code of `context.authentication`; where `context.form` is another one, their values are those that peers read from it. The bag is
+compressed (zstd, in chunks).
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sortie.fleet.logs.geodesy import Origin, geodetic
+from sortie.fleet.messages.compact import FULL, Form, decode_compact, encode_compact
 from sortie.fleet.messages.wire import (
     DESCRIPTOR_MSG,
     DESCRIPTOR_NAME,
@@ -37,6 +40,7 @@ from sortie.fleet.messages.wire import (
     encode_descriptor,
     encode_directive,
 )
+from sortie.policies.contract import Descriptor
 from sortie.sim.export.foxglove import LAYOUT, layout
 from sortie.sim.export.messages import descriptors, directives
 from sortie.sim.export.origin import origin_of
@@ -152,11 +156,15 @@ def _streams(record: SortieRecord, make: SimpleNamespace, begin_ns: int, origin:
 
 
 def _plane(record: SortieRecord, begin_ns: int) -> Iterator[Message]:
-    """Descriptors and directives, as they would go over the air of a flight that began then."""
-    said = (
-        Message(t_s, CONTEXT.name, DESCRIPTOR_NAME, encode_descriptor(d._replace(stamp_ns=begin_ns + d.stamp_ns)))
-        for t_s, d in descriptors(record)
-    )
+    """Descriptors, as peers read them, and directives, with the stamps of a flight that began then."""
+    form = Form(**record.scenario.context.form.model_dump())
+
+    def message(t_s: float, d: Descriptor) -> Message:
+        read = d if form == FULL else decode_compact(encode_compact(d, form))
+        data = encode_descriptor(read._replace(stamp_ns=begin_ns + read.stamp_ns))
+        return Message(t_s, CONTEXT.name, DESCRIPTOR_NAME, data)
+
+    said = (message(t_s, d) for t_s, d in descriptors(record))
     ordered = (
         Message(t_s, Topic(TopicKind.DIRECTIVE, d.source, d.destination).name, DIRECTIVE_NAME, encode_directive(d))
         for t_s, d in directives(record)

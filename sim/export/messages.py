@@ -21,7 +21,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
     x, y, z, qx, qy, qz, qw, vx, vy, vz = (states[name].to_numpy() for name in names)
     rate_hz, spaces = record.scenario.context.rate_hz, record.scenario.feature_spaces
     books = codebooks(record.scenario)
-    cameras = cameras_of(record.scenario.fleet)
+    cameras, blind = cameras_of(record.scenario.fleet), record.scenario.fleet.without_camera
     mission, group_of = record.tables["mission"], record.scenario.mission.group_of
     targets = {
         (int(t_s * rate_hz + 1e-6), group): target
@@ -42,7 +42,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             position_m=(float(x[k]), float(y[k]), float(z[k])),
             orientation_xyzw=(float(qx[k]), float(qy[k]), float(qz[k]), float(qw[k])),
             velocity_mps=(float(vx[k]), float(vy[k]), float(vz[k])),
-            footprint_radius_m=footprint_radius_m(float(z[k]), cameras[row["drone"]]),
+            footprint_radius_m=0.0 if row["drone"] in blind else footprint_radius_m(float(z[k]), cameras[row["drone"]]),
             battery_soc=row["soc"],
             cpu_headroom=row["cpu_headroom"],
             gpu_headroom=row["gpu_headroom"],

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 import sortie.fleet.agent
 from sortie.fleet.logs.geodesy import Origin
+from sortie.fleet.messages.compact import Form
 from sortie.fleet.messages.wire import decode_descriptor, decode_directive
 from sortie.policies.contract import Descriptor
 from sortie.sim.cli.app import app
@@ -115,6 +116,32 @@ def test_a_descriptor_is_the_one_that_was_sent_but_for_where_the_drone_thought_i
             assert a == (pytest.approx(b, rel=1e-6) if close else b), name
         assert ours.footprint_radius_m == pytest.approx(theirs.footprint_radius_m, rel=0.05)
     assert any(d.priority_target_ids for d in remade)
+
+
+def test_a_descriptor_in_a_smaller_form_has_what_its_peers_read_and_a_blind_station_no_footprint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[Descriptor] = []
+    encode = sortie.fleet.agent.encode_compact
+
+    def tapped(d: Descriptor, form: Form) -> bytes:
+        data = encode(d, form)
+        sent.append(decode_descriptor(data))
+        return data
+
+    monkeypatch.setattr(sortie.fleet.agent, "encode_compact", tapped)
+    station = "fleet.ground=[{drone: 4, position_m: [0, -20, 3]}]"
+    record = run_sortie(example("duration_s=1", "context.form=small", station))
+    write_bag(record, tmp_path / "bag", BEGIN_NS)
+    found = [m for _, m in read_bag(tmp_path / "bag" / "bag.mcap")["/fleet/context"]]
+    assert len(found) == len(sent) == 50
+    assert [m.agent_id for m in found] == [d.agent_id for d in sent]
+    for m, theirs in zip(found, sent, strict=True):
+        assert m.stamp.sec * 1_000_000_000 + m.stamp.nanosec == BEGIN_NS + theirs.stamp_ns
+        assert list(m.peer_goodput) == [np.float32(v) for v in theirs.peer_goodput_mbps]
+        assert m.battery == np.float32(theirs.battery_soc)
+        assert bytes(m.coverage_grid) == theirs.coverage_grid
+        assert (m.footprint_radius == 0.0) == (theirs.footprint_radius_m == 0.0) == (m.agent_id == 4)
 
 
 def test_fields_come_out_as_the_record_has_them(bag: Bag, record: SortieRecord) -> None:
