@@ -29,10 +29,27 @@ def inconsistent(at: tuple[str | int, ...], value: str, bound: str) -> PydanticC
     return PydanticCustomError("inconsistent", "{path}{value}, must be {bound}", context)
 
 
+_OF_THE_PAST: ContextVar[bool] = ContextVar("_OF_THE_PAST", default=False)
+
+
 class Section(BaseModel):
     """A frozen section of a scenario; unknown keys and non-finite numbers are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _parameters_belong_to_a_model(self) -> Section:
+        """`x_params` are for the model that `x` or `x_model` names."""
+        fields = type(self).model_fields
+        for at in (name for name in fields if name.endswith("_params") and getattr(self, name)):
+            stem = at.removesuffix("_params")
+            field = stem if stem in fields else f"{stem}_model"
+            model = getattr(self, field)
+            without = [name for mark in fields[field].metadata if isinstance(mark, ModelName) for name in mark.without]
+            if (model is None or model in without) and not _OF_THE_PAST.get():
+                where = f"there is no {field}" if model is None else f"{field} is {model}"
+                raise inconsistent((at,), f"{getattr(self, at)}", f"left out where {where}")
+        return self
 
 
 class PresetSection(Section):
@@ -56,9 +73,6 @@ class PresetSection(Section):
         schema["anyOf"] = [{"enum": list(cls.presets)}, {"$ref": schema.pop("$ref")}]
 
 
-_OF_THE_PAST: ContextVar[bool] = ContextVar("_OF_THE_PAST", default=False)
-
-
 @contextmanager
 def models_of_the_past() -> Iterator[None]:
     """Accept every name of a model within the block: what flew once need not be installed to be read."""
@@ -75,6 +89,13 @@ class ModelName:
 
     kind: str
     builtin: tuple[str, ...] = ()
+    take_params: tuple[str, ...] = ()
+    """The built-in ones that take parameters."""
+
+    @property
+    def without(self) -> tuple[str, ...]:
+        """The built-in ones that take no parameters."""
+        return tuple(name for name in self.builtin if name not in self.take_params)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_after_validator_function(self._known, handler(source))

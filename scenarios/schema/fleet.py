@@ -18,7 +18,6 @@ from sortie.scenarios.schema.movement import (
     Route,
     Steering,
     Viewpoints,
-    check_mobility,
 )
 
 
@@ -230,12 +229,6 @@ class Make(Section):
         description="What its feature maps are called; only maps of one name can be fused. Left out, the make's name where its network is another than the fleet's, else the fleet's common one, which has no name.",
     )
 
-    @model_validator(mode="after")
-    def _parameters_of_a_policy(self) -> Make:
-        if self.policy_params and self.policy is None:
-            raise inconsistent(("policy_params",), f"{self.policy_params}", "left out where there is no policy")
-        return self
-
 
 class Network(NamedTuple):
     """What makes a drone's feature maps and boxes."""
@@ -317,7 +310,6 @@ class Fleet(Section):
 
     @model_validator(mode="after")
     def _everyone_moves_in_one_way(self) -> Fleet:
-        check_mobility(self.mobility, self.mobility_params)
         seen: dict[int, str] = {}
         for at, drone in self._apart():
             if drone >= self.drones:

@@ -8,7 +8,8 @@ from pydantic import Field, model_validator
 
 from sortie.scenarios.schema.base import DroneId, ModelName, Params, PointM, Section, inconsistent
 
-Mobility = Annotated[str, ModelName("mobility", ("formation", "random_waypoint", "gauss_markov"))]
+RANDOM_MOBILITY = ("random_waypoint", "gauss_markov")
+Mobility = Annotated[str, ModelName("mobility", ("formation", *RANDOM_MOBILITY), take_params=RANDOM_MOBILITY)]
 """Who decides where drones fly: the formation on its route, a random model, or one of one's own."""
 Height = Annotated[float, Field(ge=2, le=400)]
 
@@ -121,16 +122,6 @@ def check_fence(fence_m: tuple[float, float, float, float] | None) -> None:
         raise inconsistent(("fence_m",), f"{fence_m}", "x_min < x_max and y_min < y_max")
 
 
-def check_mobility(mobility: str, params: Params) -> None:
-    """Parameters belong to a model.
-
-    Raises:
-        ValidationError: the formation has none.
-    """
-    if mobility == "formation" and params:
-        raise inconsistent(("mobility_params",), f"{params}", "left out where mobility is formation")
-
-
 class Leg(Section):
     """One step of a way that is flown step by step."""
 
@@ -186,7 +177,6 @@ class FlightGroup(Section):
                 if getattr(self, name):
                     bound = f"left out where mobility is {self.mobility}"
                     raise inconsistent((name,), f"{len(self.legs)} of them" if name == "legs" else "true", bound)
-        check_mobility(self.mobility, self.mobility_params)
         for k, leg in enumerate(self.legs[:-1]):
             if leg.action == "land":
                 raise inconsistent(("legs", k, "action"), "land", "the last leg")

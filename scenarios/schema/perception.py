@@ -68,7 +68,7 @@ class Perception(Section):
         description="The detector: the network, its fast surrogate, a recording of another model, one of one's own (docs/guide), or none: the traffic alone.",
     )
     detector_params: Params = Field({}, description="Keyword arguments of a detector of one's own.")
-    fusion: Annotated[str, ModelName("fusion", FUSIONS)] = Field(
+    fusion: Annotated[str, ModelName("fusion", FUSIONS, take_params=("disconet",))] = Field(
         "disconet",
         description="How what peers sent is fused, or a fusion of one's own (docs/guide); weights belong to a fusion, none, late and one's own take any; the surrogate takes its calibration's, or none.",
     )

@@ -30,6 +30,7 @@ from sortie.scenarios.plugins.user_calls import Guarded, TookTooLongError, watch
 from sortie.scenarios.plugins.user_code import imported_files
 from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Expectation, Mission, Perception, PolicySection, Scenario, Steering, Viewpoints
+from sortie.scenarios.schema.base import models_of_the_past
 from sortie.scenarios.schema.campaign import Campaign
 from sortie.scenarios.schema.movement import FlightGroup
 from sortie.scenarios.traces import TraceError, check_increasing, located, read_columns
@@ -49,6 +50,48 @@ def campaign(**changes: Any) -> Campaign:
 
 
 # --- sections against each other -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("fleet: {sensor_params: {a: 1}}", "fleet.sensor_params: {'a': 1}, must be left out where there is no sensor"),
+        ("radio: {link_params: {a: 1}}", "radio.link_params: {'a': 1}, must be left out where there is no link"),
+        (
+            "radio: {path_loss: two_ray, path_loss_params: {a: 1}}",
+            "radio.path_loss_params: {'a': 1}, must be left out where path_loss is two_ray",
+        ),
+        (
+            "fleet: {airframe: {power_params: {a: 1}}}",
+            "fleet.airframe.power_params: {'a': 1}, must be left out where power_model is level",
+        ),
+        (
+            "fleet: {makes: [{name: m, drones: [1], battery: {cell_params: {a: 1}}}]}",
+            "fleet.makes.0.battery.cell_params: {'a': 1}, must be left out where cell_model is lipo",
+        ),
+        (
+            "fleet: {groups: [{drones: [1], mobility_params: {a: 1}}]}",
+            "fleet.groups.0.mobility_params: {'a': 1}, must be left out where mobility is formation",
+        ),
+        (
+            "perception: {detector: none, detector_params: {a: 1}}",
+            "perception.detector_params: {'a': 1}, must be left out where detector is none",
+        ),
+        (
+            "perception: {fusion: late, fusion_params: {a: 1}}",
+            "perception.fusion_params: {'a': 1}, must be left out where fusion is late",
+        ),
+    ],
+)
+def test_parameters_that_belong_to_no_model_are_refused(text: str, said: str) -> None:
+    refused(text, said)
+
+
+def test_parameters_of_built_in_models_that_take_some_and_of_what_flew_once_are_accepted() -> None:
+    assert scenario("perception: {fusion_params: {temperature: 2}}").perception.fusion_params == {"temperature": 2}
+    assert scenario("fleet: {mobility: gauss_markov, mobility_params: {alpha: 0.5}}").fleet.mobility_params
+    with models_of_the_past():
+        assert scenario("radio: {link_params: {a: 1}}").radio.link_params == {"a": 1}
 
 
 def test_the_cycles_of_a_drone_are_held_against_the_life_of_its_own_make() -> None:
