@@ -342,9 +342,9 @@ class Fleet(Section):
                     raise inconsistent(at, f"{drone}", f"of one make, it is of {made[drone]!r} already")
                 made[drone] = make.name
             for drone in make.drones:
-                for altitude_m in self._levels_m(drone):
+                for field, altitude_m in self._levels_m(drone).items():
                     if not 10.0 <= altitude_m + make.altitude_offset_m <= 400.0:
-                        bound = f"such that its drones fly at 10 to 400 m, formation.altitude_m is {altitude_m:g}"
+                        bound = f"such that its drones fly at 10 to 400 m, {field} is {altitude_m:g}"
                         raise inconsistent(("makes", i, "altitude_offset_m"), f"{make.altitude_offset_m:g}", bound)
         return self
 
@@ -390,7 +390,8 @@ class Fleet(Section):
         heights = []
         for drone, make in enumerate(self.make_of_each):
             station = self.station(drone)
-            level_m = self._levels_m(drone)[0] if station is None else station.position_m[2]
+            group = self.group_of(drone) or self
+            level_m = group.formation.altitude_m if station is None else station.position_m[2]
             heights.append(level_m if make is None or station else level_m + make.altitude_offset_m)
         return tuple(heights)
 
@@ -413,12 +414,14 @@ class Fleet(Section):
         apart = {drone for _, drone in self._apart()}
         return tuple(drone for drone in range(self.drones) if drone not in apart)
 
-    def _levels_m(self, drone: int) -> tuple[float, ...]:
-        """The heights at which a drone flies, but for what its make adds; none for a ground station."""
+    def _levels_m(self, drone: int) -> dict[str, float]:
+        """The heights at which a drone flies, but for what its make adds, by field; none for a ground station."""
         if self.station(drone) is not None:
-            return ()
+            return {}
         group = self.group_of(drone)
         if group is None:
-            return (self.formation.altitude_m,)
-        legs = (leg.altitude_m for leg in group.legs)
-        return (group.formation.altitude_m, *(altitude_m for altitude_m in legs if altitude_m is not None))
+            return {"formation.altitude_m": self.formation.altitude_m}
+        at = f"groups.{self.groups.index(group)}"
+        climbs = ((k, leg.altitude_m) for k, leg in enumerate(group.legs) if leg.altitude_m is not None)
+        legs = {f"{at}.legs.{k}.altitude_m": altitude_m for k, altitude_m in climbs}
+        return {f"{at}.formation.altitude_m": group.formation.altitude_m, **legs}

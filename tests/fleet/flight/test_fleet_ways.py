@@ -165,10 +165,18 @@ def test_a_staircase_is_the_polyline_smoothed_by_a_quadratic_b_spline(
         ),
         (
             {
-                "groups": [{"drones": [1], "legs": [{"to_m": [1, 1], "altitude_m": 395}]}],
+                "groups": [{"drones": [1], "legs": [{"to_m": [1, 1]}, {"to_m": [2, 2], "altitude_m": 395}]}],
                 "makes": [{"name": "high", "drones": [1], "altitude_offset_m": 10}],
             },
-            "makes.0.altitude_offset_m: 10, must be such that its drones fly at 10 to 400 m, formation.altitude_m is 395",
+            "makes.0.altitude_offset_m: 10, must be such that its drones fly at 10 to 400 m, "
+            "groups.0.legs.1.altitude_m is 395",
+        ),
+        (
+            {
+                "groups": [{"drones": [2]}, {"drones": [1], "formation": {"altitude_m": 399}}],
+                "makes": [{"name": "high", "drones": [1], "altitude_offset_m": 10}],
+            },
+            "fly at 10 to 400 m, groups.1.formation.altitude_m is 399",
         ),
     ],
 )
