@@ -1,6 +1,6 @@
 """A lithium-polymer cell: voltage by charge, what heat, cold and age do to it, and the current that a power asks for.
 
-Pure functions of numbers; `fleet.battery` keeps the state of the packs.
+Pure functions of numbers; `fleet/energy/battery.py` keeps the state of the packs.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ def cell_curve(pack: Battery) -> CellCurve:
 def terminal_voltage_v(time_s: Array, current_a: Array, pack: Battery, soc: float) -> Array:
     """Voltage of a pack under a given current, V [K]: what a log's current says of a pack's data, or the other way.
 
-    The same cell as in `fleet.battery`, driven by current instead of power and counted in charge: open circuit by
+    The built-in cell as in `fleet/energy/battery.py`, driven by current instead of power and counted in charge: open circuit by
     charge, less the resistance's drop, less polarisation's (one RC element, exact for a current that holds from one
     sample to the next). Ages with `pack.cycles`; temperature is left out.
 

@@ -89,10 +89,10 @@ def random_waypoint(
         [T, n, 3], ENU.
     """
     if not (0.0 < slowest_mps <= fastest_mps and min(pause_s, height_range_m) >= 0.0 and turn_time_s > 0):
-        given = f"slowest_mps {slowest_mps:g}, fastest_mps {fastest_mps:g}, pause_s {pause_s:g}, height_range_m {height_range_m:g}"
-        raise PluginError(
-            f"mobility random_waypoint: {given}, must be 0 < slowest_mps ≤ fastest_mps and the others ≥ 0"
-        )
+        speeds = f"slowest_mps {slowest_mps:g}, fastest_mps {fastest_mps:g}"
+        others = f"pause_s {pause_s:g}, height_range_m {height_range_m:g}, turn_time_s {turn_time_s:g}"
+        must = "must be 0 < slowest_mps ≤ fastest_mps, turn_time_s > 0 and the others ≥ 0"
+        raise PluginError(f"mobility random_waypoint: {speeds}, {others}, {must}")
     area = _area(west_m, south_m, east_m, north_m, starts_m, "random_waypoint")
 
     def steps(start_m: Array, draw: np.random.Generator) -> Iterator[Step]:
@@ -152,9 +152,11 @@ def gauss_markov(
     Returns:
         [T, n, 3], ENU.
     """
-    if not (0.0 <= alpha < 1.0 and min(speed_mps, step_s, turn_time_s) > 0.0):
-        given = f"alpha {alpha:g}, speed_mps {speed_mps:g}, step_s {step_s:g}"
-        raise PluginError(f"mobility gauss_markov: {given}, must be 0 ≤ alpha < 1 and the others > 0")
+    if not (0.0 <= alpha < 1.0 and min(speed_mps, step_s, turn_time_s) > 0.0 and speed_sigma_mps >= 0.0):
+        speeds = f"speed_mps {speed_mps:g}, speed_sigma_mps {speed_sigma_mps:g}"
+        given = f"alpha {alpha:g}, {speeds}, step_s {step_s:g}, turn_time_s {turn_time_s:g}"
+        must = "must be 0 ≤ alpha < 1, speed_sigma_mps ≥ 0 and the others > 0"
+        raise PluginError(f"mobility gauss_markov: {given}, {must}")
     area = _area(west_m, south_m, east_m, north_m, starts_m, "gauss_markov")
     longest_m = (speed_mps + 8.0 * speed_sigma_mps) * step_s
     if longest_m > min(area.east_m - area.west_m, area.north_m - area.south_m) / 2:

@@ -218,7 +218,13 @@ def test_what_cannot_be_flown_is_refused(model: Any, said: str) -> None:
         ),
         (random_waypoint, {"west_m": 20}, "a drone begins at (0, 0), must be within (20, -150.0, 150.0, 150.0)"),
         (random_waypoint, {"slowest_mps": 0}, "slowest_mps 0, fastest_mps 10"),
-        (gauss_markov, {"alpha": 1}, "alpha 1, speed_mps 8, step_s 1, must be 0 ≤ alpha < 1 and the others > 0"),
+        (random_waypoint, {"turn_time_s": 0}, "turn_time_s 0, must be 0 < slowest_mps ≤ fastest_mps, turn_time_s > 0"),
+        (
+            gauss_markov,
+            {"alpha": 1},
+            "alpha 1, speed_mps 8, speed_sigma_mps 1.5, step_s 1, turn_time_s 5, must be 0 ≤ alpha < 1",
+        ),
+        (gauss_markov, {"speed_sigma_mps": -5}, "speed_sigma_mps -5, step_s 1, turn_time_s 5, must be 0 ≤ alpha < 1"),
         (gauss_markov, {"step_s": 60}, "steps of 1200 m are too long for (-150.0, -150.0, 150.0, 150.0)"),
     ],
 )
