@@ -215,11 +215,10 @@ def refusal(way: SteeredWay, now_s: float, start_m: Array, fleet: schema.Fleet) 
         start_m: where the drone began.
         fleet: its `steering`, and the jitter, of which the fence keeps clear.
     """
-    lasts_s = way.rests_s - now_s
-    limits, place = (
-        fleet.steering,
-        way.at(np.linspace(now_s, way.rests_s, max(2, math.ceil(lasts_s / INSTANTS_S) + 1)))[0],
-    )
+    limits, bends = fleet.steering, [np.array([now_s, way.rests_s])]
+    for begin_s, width_s, _ in way.changes:  # between them it flies straight, so that no place there is further out
+        bends.append(np.linspace(begin_s, begin_s + width_s, math.ceil(width_s / INSTANTS_S) + 1))
+    place = way.at(np.unique(np.maximum(now_s, np.concatenate(bends))))[0]
     low_m, high_m = (min(limits.altitude_m[0], place[0, 2]), max(limits.altitude_m[1], place[0, 2]))
     if (place[:, 2] < low_m - 1e-6).any() or (place[:, 2] > high_m + 1e-6).any():
         return f"would leave the altitudes of {limits.altitude_m[0]:g} to {limits.altitude_m[1]:g} m"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -31,6 +32,18 @@ commands = st.one_of(
     st.builds(Velocity, st.floats(-12, 12), st.floats(-12, 12), st.floats(-6, 6)),
     st.just(Hold()),
 )
+
+
+def test_a_command_of_a_crawl_is_judged_at_few_instants() -> None:
+    """A way of 100,000 s is straight but for its begin and its end; a million instants of it would take 100 MB."""
+    crawl = steer(STILL, GoTo(100.0, 0.0, 60.0, 1e-3), 0.0, LIMITS)
+    assert crawl.rests_s > 99_000.0
+    tracemalloc.start()
+    try:
+        assert refusal(crawl, 0.0, np.array(STILL.place_m), Fleet()) == ""
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
 
 
 @settings(max_examples=50, deadline=None)
