@@ -254,7 +254,8 @@ def compare(
         most_seeds: the seeds that the torch detector flies at most; None is 200. `precision.reached` says whether that
             was enough.
         kept: a file to which finished seeds are written. After an interruption the same call goes on from there. A later
-            call with a smaller half-width uses them too. True chooses a file in `runs`; False writes nothing.
+            call with a smaller half-width uses them too. True chooses a file in `runs`; False writes nothing. A policy
+            that is a callable must be in a file and hold numbers and texts alone, so that another one is not taken for it.
 
     Raises:
         ScenarioError, PolicyError: the scenario or a policy is wrong; raised before anything flies.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from sortie.policies.registry import resolve
 from sortie.sim.folders import RunError, ensure_files
-from sortie.sim.identity import code_version, name_of, own_files
+from sortie.sim.identity import code_version, own_files, state_of
 from sortie.sim.studies.compare import Compared, Contender, Gain
 from sortie.sim.studies.multifidelity import (
     Batch,
@@ -36,11 +36,20 @@ def identity(contenders: Sequence[Contender], pilot: int) -> str:
     """What is compared, as 16 hex digits: the version, the scenarios, the policies, the files of one's own and the pilot.
 
     The half-width is no part of it. A comparison can go on to a narrower one.
+
+    Raises:
+        RunError: a callable holds something else than plain values, so that it cannot be told from another one.
     """
     parts = [FORMAT, code_version(), pilot]
     for label, scenario, function in contenders:
-        named = None if function is None else name_of(function)
-        parts += [label, named, scenario.model_dump_json(), sorted(own_files(scenario, function).items())]
+        try:
+            state = None if function is None else state_of(function)
+        except ValueError as error:
+            raise RunError(
+                f"policy {label}, in a comparison that is kept: {error}; write a function with parameters into a file and "
+                "name it (mine.py:mine), or leave out kept"
+            ) from None
+        parts += [label, state, scenario.model_dump_json(), sorted(own_files(scenario, function).items())]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
 

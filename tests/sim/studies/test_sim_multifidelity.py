@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -320,6 +322,108 @@ def test_another_version_policy_or_pilot_is_another_comparison(monkeypatch: pyte
     monkeypatch.setattr(kept_comparison, "code_version", lambda: "another")
     known.add(kept_comparison.identity(base, 12))
     assert len(known) == 6
+
+
+class Held:
+    """A policy that is an object."""
+
+    def __init__(self, x: object) -> None:
+        self.x = x
+
+    def __call__(self, view: sortie.FleetView) -> list[sortie.Directive]:
+        return []
+
+    def decide(self, view: sortie.FleetView) -> list[sortie.Directive]:
+        return []
+
+
+class Slotted(Held):
+    __slots__ = ("y",)
+
+    def __init__(self, y: object) -> None:
+        self.y = y
+
+
+def enclosing(x: object) -> Callable[..., list[sortie.Directive]]:
+    def mine(view: sortie.FleetView) -> list[sortie.Directive]:
+        return [] if x else mine(view)
+
+    return mine
+
+
+def defaulting(x: object) -> Callable[..., list[sortie.Directive]]:
+    def mine(view: sortie.FleetView, x: object = x) -> list[sortie.Directive]:
+        return []
+
+    return mine
+
+
+def keyed(x: object) -> Callable[..., list[sortie.Directive]]:
+    def mine(view: sortie.FleetView, *, x: object = x) -> list[sortie.Directive]:
+        return []
+
+    return mine
+
+
+def bound(x: object) -> Callable[..., list[sortie.Directive]]:
+    return functools.partial(keyed(0), x=x)
+
+
+def wrapped(x: object) -> Callable[..., list[sortie.Directive]]:
+    @functools.wraps(enclosing)
+    def mine(view: sortie.FleetView, inner: object = enclosing(x)) -> list[sortie.Directive]:
+        return []
+
+    return mine
+
+
+MAKERS: list[Callable[[Any], Any]] = [
+    Held, Slotted, lambda x: Held(x).decide, enclosing, defaulting, keyed, bound, wrapped
+]  # fmt: skip
+
+
+def identified(policy: Any) -> str:
+    scenario = contenders()[0].scenario
+    return kept_comparison.identity([Contender("mine", scenario), Contender("yours", scenario, policy)], 12)
+
+
+@pytest.mark.parametrize("make", MAKERS)
+def test_policies_that_differ_in_a_value_are_other_comparisons(make: Callable[[Any], Any]) -> None:
+    values = (0.1, 0.5, "0.1", (0.1, 0.5), (0.1, 0.6), {"a": 1}, None)
+    assert len({identified(make(x)) for x in values}) == len(values)
+    assert identified(make((0.1, "a"))) == identified(make((0.1, "a")))
+
+
+def test_functions_without_a_name_differ_by_their_place() -> None:
+    assert identified(lambda view: []) != identified(lambda view: [])
+
+
+def test_a_global_variable_of_a_policy_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    def mine(view: sortie.FleetView) -> list[object]:
+        return [METRIC]
+
+    before = identified(mine)
+    monkeypatch.setitem(globals(), "METRIC", "another")
+    assert identified(mine) != before
+
+
+@pytest.mark.parametrize("make", MAKERS)
+def test_a_policy_that_holds_more_than_values_is_not_kept(make: Callable[[Any], Any]) -> None:
+    with pytest.raises(
+        sortie.SortieError, match=r"policy yours, in a comparison that is kept: .* is of type ndarray, must"
+    ):
+        identified(make(np.zeros(2)))
+
+
+def test_a_policy_without_a_file_is_not_kept() -> None:
+    space: dict[str, Any] = {"__name__": "typed_in"}
+    exec("def decide(view):\n    return []\n", space)  # noqa: S102 - as it is typed into an interpreter
+    with pytest.raises(
+        sortie.SortieError, match=r"it is typed in, must be in a file; write a function .*, or leave out kept"
+    ):
+        identified(space["decide"])
+    with pytest.raises(sortie.SortieError, match="it is of type ufunc"):
+        identified(np.sin)
 
 
 def test_a_changed_file_of_ones_own_is_another_comparison(tmp_path: Path) -> None:
