@@ -7,13 +7,13 @@ import hashlib
 import inspect
 import numbers
 import re
-from collections.abc import Callable, Mapping
-from importlib.metadata import PackageNotFoundError, requires, version
+from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import requires, version
 from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+from sortie.scenarios.code_digest import contents, digest_of, installed
 from sortie.scenarios.plugins.reference import file_of, is_file, package_of
 from sortie.scenarios.plugins.user_code import imported_files
 from sortie.scenarios.reading.files import named_files, named_models
@@ -22,8 +22,8 @@ from sortie.scenarios.traces import located
 
 DISTRIBUTION = "sortie-sim"
 RELEASE = version(DISTRIBUTION)
-_UNREAD = re.compile(r"\..*|__pycache__|.*\.md")
-"""Names of files and folders that no run reads: hidden ones, caches, pages."""
+_WITHOUT_TORCH = {"none", "surrogate"}
+"""Detectors that never compute with torch."""
 
 
 @functools.cache
@@ -32,19 +32,41 @@ def code_version() -> str:
 
     The digest covers every file of the installed package (sources, compiled parts, learned parameters, the library of
     scenarios) and the version of every library that the package requires. Two processes with equal versions run the
-    same code.
+    same code, but for optional libraries: what is kept of flights with torch is kept under `flight_code`.
 
     Example:
         >>> code_version().partition("+")[0] == RELEASE
         True
     """
-    digest = hashlib.sha256()
-    for name, data in sorted(_files(files("sortie"), "")):
-        digest.update(f"{name}\0{len(data)}\0".encode())
-        digest.update(data)
-    for library in sorted(_required()):
-        digest.update(f"{library}={_installed(library)}\0".encode())
-    return f"{RELEASE}+{digest.hexdigest()[:16]}"
+    return f"{RELEASE}+{digest_of(contents(files('sortie')), _required())[:16]}"
+
+
+def codes_here() -> tuple[str, str]:
+    """The code of flights without torch, `code_version`, and of those with it, which also names torch's version."""
+    return code_version(), f"{code_version()} torch {installed('torch')}"
+
+
+def flight_code(sections: object) -> str:
+    """The one of `codes_here` under which flights are kept.
+
+    Args:
+        sections: of scenarios or of a campaign, as JSON. A detector that is no built-in one may compute with torch.
+    """
+    return codes_here()[not set(_detectors(sections)) <= _WITHOUT_TORCH]
+
+
+def _detectors(sections: object) -> Iterator[str]:
+    """All values of `detector` and of fields such as `perception.detector`, with those that are varied."""
+    if isinstance(sections, list | tuple):
+        for section in sections:
+            yield from _detectors(section)
+    elif isinstance(sections, dict):
+        for key, value in sections.items():
+            if key.rpartition(".")[2] != "detector":
+                yield from _detectors(value)
+                continue
+            several = value.get("values", ()) if isinstance(value, dict) else value
+            yield from (v for v in (several if isinstance(several, list | tuple) else [several]) if isinstance(v, str))
 
 
 def _argument(value: object) -> str:
@@ -224,27 +246,7 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _files(folder: Traversable, prefix: str) -> list[tuple[str, bytes]]:
-    """Every file below a folder of the package: its path in the package, and what it holds."""
-    found = []
-    for entry in folder.iterdir():
-        if _UNREAD.fullmatch(entry.name):
-            continue
-        if entry.is_dir():
-            found += _files(entry, f"{prefix}{entry.name}/")
-        else:
-            found.append((f"{prefix}{entry.name}", entry.read_bytes()))
-    return found
-
-
 def _required() -> set[str]:
     """Libraries that the package requires, the optional ones left out."""
     needed = [line for line in requires(DISTRIBUTION) or () if "extra ==" not in line]
     return {match[0].lower() for line in needed if (match := re.match(r"[\w.-]+", line))}
-
-
-def _installed(library: str) -> str:
-    try:
-        return version(library)
-    except PackageNotFoundError:
-        return "none"

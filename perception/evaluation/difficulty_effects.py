@@ -22,6 +22,7 @@ import torch
 from sortie.perception.benchmark.dataset import FORMAT, Frames, start_worker
 from sortie.perception.benchmark.difficulty import Difficulty
 from sortie.perception.benchmark.scenes import draw_captures, draw_scene, model_of, scene_id
+from sortie.perception.code_digest import boxes_digest
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
@@ -108,7 +109,7 @@ def measure(
         ValueError: weights that are missing or do not fit.
     """
     rows = moves()
-    setup = {"format": FORMAT, "seed": SEED, "moves": [asdict(m) for m in rows]}
+    setup = {"code": boxes_digest(), "format": FORMAT, "seed": SEED, "moves": [asdict(m) for m in rows]}
     mark = CarNetInstrument.load(weights).fingerprint + json.dumps(setup, sort_keys=True)
     folder = store / hashlib.blake2b(mark.encode(), digest_size=6).hexdigest()
     paths = [folder / f"scene_{k}.npz" for k in range(scenes)]

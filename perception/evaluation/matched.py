@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from sortie.perception.code_digest import boxes_digest
 from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.files import replacing
 from sortie.perception.joining import NMS_IOU
@@ -159,13 +160,13 @@ def assemble(
 
 
 class MatchedStore:
-    """Finished frames of one instrument under one set of settings, in a folder of Parquet parts.
+    """Finished frames of one instrument under one set of settings, by one version of the code, in a folder of Parquet parts.
 
     A later evaluation takes from it what it needs, whichever conditions and frames the earlier ones were about.
     """
 
     def __init__(self, folder: Path, fingerprint: str, settings: Settings, regions: Sequence[Region]) -> None:
-        what = json.dumps([fingerprint, asdict(settings), sorted(regions)])
+        what = json.dumps([boxes_digest(), fingerprint, asdict(settings), sorted(regions)])
         self._folder = folder / hashlib.blake2b(what.encode(), digest_size=8).hexdigest()
         self._done: dict[str, FrameResult] = {}
         for part in sorted(self._folder.glob("*.parquet")):

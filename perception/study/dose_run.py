@@ -1,6 +1,7 @@
 """Measures the dose–response study frame by frame: each frame is encoded once by each network, whatever the doses.
 
-A frame that is finished under every dose is kept as one file per network, so that a run that was cut off goes on.
+A frame that is finished under every dose is kept as one file per network, so that a run that was cut off goes on. Another
+version of the code (`boxes_digest`) measures all frames anew.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames, load_frames, make_split
+from sortie.perception.code_digest import boxes_digest
 from sortie.perception.evaluation.condition import SINGLE, Sharing
 from sortie.perception.evaluation.evaluate import exchanges, frame_hash, frame_keys, in_order, match_all, truth
 from sortie.perception.evaluation.instrument import CarNetInstrument
@@ -107,7 +109,15 @@ def measure_frames(
 
 
 def _digest(plan: DosePlan) -> str:
-    what = [asdict(SETTINGS), [asdict(d) for d in plan.dose], plan.budgets, plan.starved, plan.many, plan.few]
+    what = [
+        boxes_digest(),
+        asdict(SETTINGS),
+        [asdict(d) for d in plan.dose],
+        plan.budgets,
+        plan.starved,
+        plan.many,
+        plan.few,
+    ]
     return hashlib.blake2b(json.dumps(what).encode(), digest_size=8).hexdigest()
 
 

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sortie.perception.code_digest import boxes_digest
 from sortie.perception.files import replacing
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene.scene_model import SceneModel
@@ -80,10 +81,10 @@ def collect(folder: Path, seed: int, split: Split, scene: int, index: int, weigh
     """Run the detector for moment `index` of a scene and keep the results, unless they are there already.
 
     Args:
-        key: names the weights; other weights and other jobs have other files.
+        key: names the weights; other weights, other jobs and other code have other files.
     """
     jobs = moment(seed, split, scene, index)
-    setup = repr((jobs, draw_scene(seed, split, scene), draw_target(seed, split, scene)))
+    setup = repr((boxes_digest(), jobs, draw_scene(seed, split, scene), draw_target(seed, split, scene)))
     digest = hashlib.blake2b(setup.encode(), digest_size=4).hexdigest()
     path = folder / f"{key}-{split}-{scene_seed(seed, split, scene)}-{index}-{digest}.npz"
     if path.exists():

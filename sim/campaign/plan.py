@@ -40,7 +40,7 @@ from sortie.sim.campaign.work import task_key
 from sortie.sim.engine.pilot import named_policy
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.identity import code_version, file_digest
+from sortie.sim.identity import file_digest, flight_code
 from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results.outcome_fields import check_number, open_keys
 
@@ -214,7 +214,7 @@ def make_plan(study: Study) -> CampaignPlan:
             "columns": columns,
             "policies": [[label, section] for label, section in policies],
             "files": file_digests([file for some in reading for file in named_files(some)]),
-            "code": code_version(),
+            "code": flight_code([sections, columns, spec]),
         }
     )
 

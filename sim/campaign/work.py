@@ -24,7 +24,7 @@ from sortie.sim.campaign.memory import limited
 from sortie.sim.check.expectations import metric
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.identity import code_version, file_digest
+from sortie.sim.identity import codes_here, file_digest
 from sortie.sim.process import own_process
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
@@ -66,8 +66,8 @@ def fly_batch(code: str, tasks: Sequence[Task], memory_b: int | None = None) -> 
         OtherCodeError: results would not be those of the campaign.
     """
     begin_s = time.perf_counter()
-    if code_version() != code:
-        raise OtherCodeError(f"this worker runs Sortie {code_version()}, the campaign is of {code}")
+    if code not in (here := codes_here()):
+        raise OtherCodeError(f"this worker runs Sortie {here[' torch ' in code]}, the campaign is of {code}")
     from threadpoolctl import threadpool_limits
 
     # sums in one order: a matrix product on two threads may round differently than on one

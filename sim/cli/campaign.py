@@ -130,15 +130,17 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     from sortie.sim.campaign.rows import find_row
     from sortie.sim.campaign.work import unpack
     from sortie.sim.folders import RunError
-    from sortie.sim.identity import code_version
+    from sortie.sim.identity import codes_here
 
     if folder is None or run is None:
         raise RunError("--from-campaign DIR and --run ID go together")
     if any(other is not None and other != [] for other in others):
         raise RunError("--from-campaign: the run has its own scenario, policy, seed and settings; name nothing else")
     plan, row = find_row(folder, run)
-    if code_version() != plan.code:
-        err.print(f"[yellow]this is Sortie {code_version()}, the campaign was flown with {plan.code}[/yellow]")
+    if plan.code not in (here := codes_here()):
+        err.print(
+            f"[yellow]this is Sortie {here[' torch ' in plan.code]}, the campaign was flown with {plan.code}[/yellow]"
+        )
     if row is None:
         err.print(f"the campaign has not flown run {run} yet: there is no record to compare with")
     elif row["status"] == "failed":

@@ -19,7 +19,7 @@ from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import file_digests
 from sortie.sim.campaign.work import RunResult, fly_function, task_key
 from sortie.sim.folders import RunError
-from sortie.sim.identity import code_version
+from sortie.sim.identity import flight_code
 from sortie.sim.studies.conditions import scenario_of
 
 METRICS = (
@@ -72,8 +72,8 @@ def fly(
         ScenarioError, PolicyError: a policy or its parameters are wrong; raised before anything flies.
         RunError: the folder cannot be used, or files changed meanwhile.
     """
-    code = code_version()
     asked = [(p, c.name, _task(suite, c, p)) for p in policies for c in suite.conditions]
+    code = flight_code([json.loads(task) for _, _, task in asked])
     kept = _Kept(folder / KEPT)
     found = {
         k: kept.flights[key] for k, (_, _, task) in enumerate(asked) if (key := task_key(task, code)) in kept.flights

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from sortie.policies.registry import resolve
 from sortie.sim.folders import RunError, ensure_files
-from sortie.sim.identity import code_version, own_files, state_of
+from sortie.sim.identity import codes_here, own_files, state_of
 from sortie.sim.studies.compare import Compared, Contender, Gain
 from sortie.sim.studies.multifidelity import (
     Batch,
@@ -40,7 +40,7 @@ def identity(contenders: Sequence[Contender], pilot: int) -> str:
     Raises:
         RunError: a callable holds something else than plain values, so that it cannot be told from another one.
     """
-    parts = [FORMAT, code_version(), pilot]
+    parts = [FORMAT, *codes_here(), pilot]
     for label, scenario, function in contenders:
         try:
             state = None if function is None else state_of(function)

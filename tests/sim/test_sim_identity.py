@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from sortie.perception.surrogate.model import SHIPPED as CALIBRATION
 from sortie.perception.types import Boxes
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.registry import resolve
+from sortie.scenarios import code_digest
 from sortie.scenarios.reading.load import load
 from sortie.sim import identity
 from sortie.sim.engine.sortie import run_sortie
@@ -61,8 +63,46 @@ def test_what_no_run_reads_does_not_count(package: Path, name: str) -> None:
 
 def test_a_librarys_version_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     before = version()
-    monkeypatch.setattr(identity, "version", lambda library: "0" if library == "numpy" else identity.RELEASE)
+    monkeypatch.setattr(code_digest, "version", lambda library: "0" if library == "numpy" else "1")
     assert version() != before
+
+
+def with_torch(monkeypatch: pytest.MonkeyPatch, torch: str | None) -> tuple[str, str]:
+    def installed(library: str) -> str:
+        if torch is None:
+            raise PackageNotFoundError
+        return torch
+
+    monkeypatch.setattr(code_digest, "version", installed)
+    return identity.codes_here()
+
+
+def test_torchs_version_is_part_of_the_code_of_flights_with_torch_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = identity.code_version()
+    for torch in ("2.4.0", "2.13.0", None):
+        assert with_torch(monkeypatch, torch) == (code, f"{code} torch {torch or 'none'}".lower())
+
+
+TORCH_FLIES: list[tuple[object, bool]] = [
+    ({"perception": {"detector": "surrogate"}}, False),
+    ([{"perception": {"detector": "none"}}, {"perception": {"detector": "torch"}}], True),
+    ({"perception": {"detector": "mine.py:Mine"}}, True),
+    ({"fleet": {"makes": [{"detector": None}, {"detector": "torch"}]}, "perception": {"detector": "surrogate"}}, True),
+    ({"vary": {"perception.detector": {"kind": "choice", "values": ["none", "surrogate"]}}}, False),
+    ({"vary": {"perception.detector": {"kind": "choice", "values": ["torch", "surrogate"]}}}, True),
+    ({"vary": {"perception.detector": {"kind": "column", "file": "a", "column": "b"}}}, False),
+    ({"columns": {"perception.detector": ["surrogate", "torch"]}}, True),
+]
+
+
+@pytest.mark.parametrize(("sections", "flies"), TORCH_FLIES)
+def test_a_detector_that_may_compute_with_torch_is_found(sections: object, flies: bool) -> None:
+    assert (identity.flight_code(sections) == identity.codes_here()[True]) is flies
+
+
+def test_a_scenarios_own_detector_is_found() -> None:
+    assert identity.flight_code(example("perception.detector=torch").model_dump(mode="json")) != identity.code_version()
+    assert identity.flight_code(example("perception.detector=none").model_dump(mode="json")) == identity.code_version()
 
 
 def test_the_record_and_the_outcome_name_the_code(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -404,11 +404,11 @@ def _arms() -> Tables:
 def _surrogate_in_flight() -> Tables:
     """As `sortie calibrate --fly conditions_fourth --towns 10`; a run that was cut off goes on after its last condition."""
     from sortie.perception.surrogate.model import SHIPPED
-    from sortie.sim.identity import code_version
+    from sortie.sim.identity import codes_here
     from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means
 
     policies = ["silence", "all-4", "boxes", "adaptive"]
-    kept = WORK / "surrogate_in_flight" / f"{code_version()}.jsonl"
+    kept = WORK / "surrogate_in_flight" / f"{codes_here()[1]}.jsonl"
     kept.parent.mkdir(parents=True, exist_ok=True)
     text = kept.read_text("utf-8") if kept.exists() else ""
     found = [

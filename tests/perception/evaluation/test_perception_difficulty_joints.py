@@ -71,6 +71,10 @@ def test_each_move_is_compared_with_no_move_by_scenes(monkeypatch: pytest.Monkey
     (folder / "scene_0.npz").unlink()
     found = effects.measure(Path("none"), tmp_path, scenes=4)
     assert made == [0, 1, 0, 2, 3]
+    with monkeypatch.context() as other:
+        other.setattr(effects, "boxes_digest", lambda: "another")
+        effects.measure(Path("none"), tmp_path, scenes=1)
+    assert made == [0, 1, 0, 2, 3, 0], "another code evaluates anew"
     label = np.repeat(np.arange(4), 3)
 
     def units(r: int, c: int) -> list[Matched]:

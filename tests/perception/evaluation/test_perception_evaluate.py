@@ -244,10 +244,14 @@ def test_an_evaluation_goes_on_where_it_was_cut_off(frames: MadeFrames, whole: E
     assert again.looked == []
 
 
-@pytest.mark.parametrize("change", ["floor", "seed", "convention", "fingerprint", "pose", "regions"])
-def test_a_store_answers_only_for_what_it_holds(frames: MadeFrames, tmp_path: Path, change: str) -> None:
+@pytest.mark.parametrize("change", ["floor", "seed", "convention", "fingerprint", "pose", "regions", "code"])
+def test_a_store_answers_only_for_what_it_holds(
+    frames: MadeFrames, tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     evaluate(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
     instrument = MadeInstrument("other" if change == "fingerprint" else "made")
+    if change == "code":
+        monkeypatch.setattr("sortie.perception.evaluation.matched.boxes_digest", lambda: "another")
     if change == "pose":
         frames = replace(frames, est_pose=frames.est_pose + 1e-6)
     knobs = {

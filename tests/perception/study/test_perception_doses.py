@@ -151,6 +151,10 @@ def test_a_study_that_was_cut_off_goes_on_where_it_was(tmp_path: Path, monkeypat
     again = replace(plan, dose=(*plan.dose, Dose(3.0)))
     measure_frames(again, tmp_path, data)
     assert measured == [0, -1, 1, 0, 1]
+    # another code measures anew
+    monkeypatch.setattr(dose_run, "boxes_digest", lambda: "another")
+    measure_frames(plan, tmp_path, data)
+    assert measured == [0, -1, 1, 0, 1, 0, 1]
 
 
 class Table:

@@ -150,6 +150,13 @@ def test_answers_to_another_question_are_not_taken_for_these(
     assert FakeProbe.calls > calls
 
 
+def test_answers_of_another_code_are_not_taken_for_this_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collecting, "Probe", FakeProbe)
+    before = collect(tmp_path, 0, "fit", 3, STREET, None, "key")
+    monkeypatch.setattr(collecting, "boxes_digest", lambda: "another")
+    assert collect(tmp_path, 0, "fit", 3, STREET, None, "key") != before
+
+
 def test_runs_of_another_plan_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(collecting, "Probe", FakeProbe)
     path = collect(tmp_path, 0, "held-out", 0, STREET, None, "key")

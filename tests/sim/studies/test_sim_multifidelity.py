@@ -319,7 +319,7 @@ def test_another_version_policy_or_pilot_is_another_comparison(monkeypatch: pyte
     known.add(kept_comparison.identity([base[0], base[1]._replace(function=mine)], 12))
     known.add(kept_comparison.identity(base[::-1], 12))
     known.add(kept_comparison.identity(contenders({**SHORT, "seed": 2}), 12))
-    monkeypatch.setattr(kept_comparison, "code_version", lambda: "another")
+    monkeypatch.setattr(kept_comparison, "codes_here", lambda: ("0.2.0", "0.2.0 torch 2.14"))
     known.add(kept_comparison.identity(base, 12))
     assert len(known) == 6
 
