@@ -218,16 +218,10 @@ def own_files(
 def _digest(path: Path) -> str:
     """16 hex digits of a file, or of a folder's files with their names."""
     if not path.is_dir():
-        return _digest_as_it_stands(path, path.stat().st_size, path.stat().st_mtime_ns)
+        return file_digest(path)[:16]
     inside = sorted(file for file in path.rglob("*") if file.is_file())
     lines = "".join(f"{file.relative_to(path).as_posix()} {_digest(file)}\n" for file in inside)
     return hashlib.sha256(lines.encode()).hexdigest()[:16]
-
-
-@functools.lru_cache(maxsize=4096)
-def _digest_as_it_stands(path: Path, size: int, changed_ns: int) -> str:
-    """A recording may be large and fly often: a file is read again only once it has changed."""
-    return file_digest(path)[:16]
 
 
 def _shown(path: Path) -> str:
@@ -237,11 +231,18 @@ def _shown(path: Path) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file, hex.
+    """SHA-256 of a file as it is now, hex. It is read again only once its size or its time of change differ.
 
     Raises:
         OSError: the file cannot be read.
     """
+    now = path.stat()
+    return _digest_as_it_stands(path, now.st_size, now.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=4096)
+def _digest_as_it_stands(path: Path, size: int, changed_ns: int) -> str:
+    """A recording may be large and fly often."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

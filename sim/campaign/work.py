@@ -6,7 +6,6 @@ a hash over the task and the code, says everything that its row depends on.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import math
@@ -171,7 +170,6 @@ def _in_one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {text}"[:MAX_ERROR]
 
 
-@functools.cache
 def _check_file(path: str, digest: str) -> None:
     try:
         same = file_digest(Path(path)) == digest

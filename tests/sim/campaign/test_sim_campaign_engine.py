@@ -10,7 +10,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import CAMPAIGN, CLUSTER, InProcess, Pretended, plan, table_bytes, write
+from campaign_examples import BASE, CAMPAIGN, CLUSTER, InProcess, Pretended, plan, table_bytes, write
 from typer.testing import CliRunner
 
 from sortie.sim.campaign import cluster
@@ -24,7 +24,7 @@ from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import Task, fly_batch
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
-from sortie.sim.identity import RELEASE
+from sortie.sim.identity import RELEASE, codes_here
 from sortie.sim.user_errors import user_errors
 
 pytest.importorskip("distributed")
@@ -215,6 +215,25 @@ def test_a_worker_that_sees_another_policy_file_flies_nothing(tmp_path: Path) ->
     policy.write_text(FAULTY.format(what="pass # edited"))
     with pytest.raises(RunError, match=r"mine.py: is not the file that the campaign was begun with"):
         fly_batch(p.code, [(0, p.task(0))])
+
+
+def test_a_policy_file_that_is_edited_between_two_runs_is_noticed_by_the_same_worker(tmp_path: Path) -> None:
+    policy = tmp_path / "mine.py"
+    policy.write_text(FAULTY.format(what="pass"))
+    p = plan(tmp_path, CAMPAIGN.replace("worked", f"{policy}:decide"))
+    fly_batch(p.code, [(0, p.task(0))])
+    policy.write_text(FAULTY.format(what="pass # edited"))
+    with pytest.raises(RunError, match=r"mine.py: is not the file that the campaign was begun with"):
+        fly_batch(p.code, [(1, p.task(1))])
+
+
+def test_a_worker_flies_with_its_own_torch_alone(tmp_path: Path) -> None:
+    torch = plan(tmp_path, base=BASE.replace("detector: none", "detector: torch")).code
+    assert torch == codes_here()[1] != plan(tmp_path).code
+    assert fly_batch(torch, [])[0] == fly_batch(plan(tmp_path).code, [])[0] == []
+    other = f"{codes_here()[0]} torch 1.0"
+    with pytest.raises(RunError, match=r"this worker runs Sortie \S+ torch \S+, the campaign is of \S+ torch 1\.0"):
+        fly_batch(other, [])
 
 
 def test_a_failing_run_is_recorded_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
