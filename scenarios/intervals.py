@@ -74,7 +74,7 @@ def mean_interval(values: ArrayLike, within: Range = ANY, level: float = LEVEL) 
         within: what values are possible. The interval is Student's for the logit of the mean between two ends, for its
             logarithm above one end, and for the mean itself where there is none; the standard error is carried over by
             the delta method (Oehlert, *A Note on the Delta Method*, 1992). Far from an end, the three agree. Of a yes or
-            no it is the binomial's exact one (Clopper and Pearson, 1934).
+            no it is the binomial's exact one (Clopper and Pearson, 1934); averages of several have that between two ends.
         level: of the two-sided interval.
 
     Returns:
@@ -101,7 +101,7 @@ def mean_interval(values: ArrayLike, within: Range = ANY, level: float = LEVEL) 
     n, mean = len(kept), math.fsum(kept) / len(kept)
     if n == 1:
         return Estimate(mean, math.nan, math.nan, 1)
-    if within.yes_or_no:
+    if within.yes_or_no and set(kept) <= {0.0, 1.0}:
         return _binomial(round(math.fsum(kept)), n, level)
     error = math.sqrt(math.fsum((v - mean) ** 2 for v in kept) / (n - 1) / n)
     if min(kept) == max(kept):

@@ -44,6 +44,13 @@ def test_every_kind_of_interval_has_the_level_that_is_asked_for(level: float) ->
     assert (flag.low, flag.high) == pytest.approx((exact.low, exact.high))
 
 
+def test_averages_of_a_yes_or_no_have_the_interval_of_a_share() -> None:
+    """A campaign's unit is the mean over its replications, which is neither 0 nor 1 where they differ."""
+    for values in ([0.5, 0.0, 0.0], [0.5] * 10, [1.0, 0.0, 0.25, 1.0]):
+        assert mean_interval(values, FLAG) == mean_interval(values, SHARE)
+    assert mean_interval([0.5, 0.0, 0.0], FLAG).mean == pytest.approx(1 / 6)
+
+
 def test_far_from_its_ends_a_range_changes_nothing() -> None:
     values = np.random.default_rng(1).normal(0.01, 0.005, 8)
     plain = mean_interval(values)
