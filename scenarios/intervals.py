@@ -135,7 +135,7 @@ def _binomial(k: int, n: int, level: float) -> Estimate:
 
 def _to_end(value: float, within: Range) -> float:
     """The end of the range that rounding has left a value just beside."""
-    return next((end for end in within if abs(value - end) < ROUNDING), value)
+    return next((end for end in within[:2] if abs(value - end) < ROUNDING), value)
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,6 +72,9 @@ def test_a_rate_stays_a_rate_and_an_amount_is_never_negative(values: list[float]
 def test_equal_values_are_their_own_interval_and_impossible_ones_are_refused() -> None:
     assert mean_interval([1.0, 1.0, 1.0], SHARE).low == 1.0
     assert mean_interval([0.0, 0.0], AMOUNT).high == 0.0
+    for within in (ANY, AMOUNT, SHARE, FLAG):
+        found = mean_interval([0.0, 0.0], within)
+        assert {type(v) for v in (found.mean, found.low, found.high)} == {float}, "no truth value in place of 0"
     with pytest.raises(ValueError, match=r"1\.5, must be 0 to 1"):
         mean_interval([0.2, 1.5], SHARE)
 
