@@ -25,6 +25,9 @@ from sortie.scenarios.streams import stream
 Floats = NDArray[np.float64]
 LEVEL = 0.95
 DRAWS = 1000
+EQUAL = 30
+"""Values that are all equal count as known from so many units on. If one unit in ten differed, 30 would all be equal in 4 % of
+cases."""
 ROUNDING = 1e-12
 
 
@@ -62,8 +65,12 @@ class Estimate:
 
     @property
     def half_width(self) -> float:
-        """Half the length of the interval; NaN below two values."""
+        """Half the length of the interval; NaN below two values, 0 where all values are equal."""
         return (self.high - self.low) / 2
+
+    def reaches(self, half_width: float) -> bool:
+        """Whether enough was measured for this half-width: values that are all equal have no interval, and count as `EQUAL` says."""
+        return self.half_width <= half_width and (self.low < self.high or self.count >= EQUAL)
 
 
 def mean_interval(values: ArrayLike, within: Range = ANY, level: float = LEVEL) -> Estimate:

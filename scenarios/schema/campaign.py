@@ -151,7 +151,8 @@ class SampledField(Section):
 class StopWhen(Section):
     metric: str = Field(min_length=1, description="One of metrics.")
     half_width: float = Field(
-        gt=0, description="Enough is flown when every policy's interval is no wider than twice this."
+        gt=0,
+        description="Enough is flown when every policy's interval is no wider than twice this. Values that are all equal have no interval, and are enough from 30 units on.",
     )
     confidence: float = Field(0.95, ge=0.5, le=0.9999, description="Of the interval of the mean.")
     difference: bool = Field(False, description="Of the paired difference from the first policy, not of the mean.")

@@ -115,7 +115,8 @@ class Stop:
     """Whether the intervals that `stop_when` names are narrow enough; evaluated part by part, in their order.
 
     Units are what is averaged over (draws, or replications where nothing is drawn), so that replications of one draw
-    do not count as independent. Intervals are Student's. Stopping at a narrow interval favours samples that look
+    do not count as independent. Intervals are Student's; values that are all equal have none, and count as known from
+    30 units on. Stopping at a narrow interval favours samples that look
     less spread than they are: with `at_least` 30 the coverage of a 95 % interval loses about a point.
     """
 
@@ -142,7 +143,7 @@ class Stop:
         if min(map(len, compared)) < rule.at_least:
             return False
         within = possible(rule.metric).of_differences() if rule.difference else possible(rule.metric)
-        return all(mean_interval(m, within, rule.confidence).half_width <= rule.half_width for m in compared)
+        return all(mean_interval(m, within, rule.confidence).reaches(rule.half_width) for m in compared)
 
     def _close(self) -> None:
         means = [float(np.mean(v)) if v else math.nan for v in self._open]

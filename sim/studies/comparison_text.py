@@ -91,8 +91,9 @@ def precision_lines(found: Precision) -> Iterator[str]:
     name = found.detector
     widest = max((c.half_width for c in found.contrasts if c.metric == found.metric), default=math.nan)
     verdict = "reached" if found.reached else "not reached, as the seeds were used up: --most-seeds allows more"
+    width = f"{100 * widest:.2f} AP points" if widest else f"none, as the gains are all equal in {found.paired} seeds"
     yield (
-        f"[bold]half-width[/bold] of {found.metric}: {100 * widest:.2f} AP points, {100 * found.asked:g} asked, {verdict}; "
+        f"[bold]half-width[/bold] of {found.metric}: {width}, {100 * found.asked:g} asked, {verdict}; "
         "intervals are widened for stopping there"
     )
     further = f", and {found.further} further seeds by the surrogate" if found.further else ""

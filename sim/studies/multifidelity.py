@@ -186,7 +186,7 @@ def next_batch(flown: Flown, policies: Sequence[str], settings: Settings) -> Bat
 def _narrow(flown: Flown, policies: Sequence[str], settings: Settings, *, control: bool) -> bool:
     """Whether all intervals are; NaN are not."""
     found = (widened(flown.estimate(p, settings.metric, control=control).estimate) for p in policies)
-    return all(e.half_width <= settings.half_width for e in found)
+    return all(e.reaches(settings.half_width) for e in found)
 
 
 def gains_between(policies: Sequence[str], matched: Sequence[Both]) -> dict[str, dict[str, float | None]]:
@@ -335,7 +335,7 @@ class Contrast:
     policy: str
     metric: str
     half_width: float
-    """Of its 95 % interval, in AP."""
+    """Of its 95 % interval, in AP; 0 where all gains are equal, which have no interval."""
     correlation: float
     """Of the torch detector's gain and the surrogate's over paired seeds; NaN where either does not vary."""
     explained: float
@@ -356,7 +356,7 @@ class Precision:
     asked: float
     """The half-width that was asked for, in AP."""
     reached: bool
-    """False where the seeds were used up first."""
+    """False where the seeds were used up first. Gains that are all equal count from 30 seeds on (`intervals.EQUAL`)."""
     paired: int
     """Seeds flown by the detector that answers; in the pilot, and where `control`, by the surrogate as well."""
     further: int
@@ -387,8 +387,9 @@ def precision_of(flown: Flown, policies: Sequence[str], settings: Settings, dete
         alone = plan_units(found, widest, torch_s, cheap_s, control=False).expensive
         ratio = (len(flown.torch) * torch_s + len(flown.surrogate) * cheap_s) / (alone * torch_s)
     paired = {row.seed for row in flown.torch}
+    reached = _narrow(flown, policies, settings, control=flown.control)
     return Precision(
-        detector, settings.metric, settings.half_width, widest <= settings.half_width, len(paired),
+        detector, settings.metric, settings.half_width, reached, len(paired),
         sum(row.seed not in paired for row in flown.surrogate), flown.control, tuple(contrasts), (torch_s, cheap_s), ratio,
     )  # fmt: skip
 

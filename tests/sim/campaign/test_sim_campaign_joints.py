@@ -97,9 +97,18 @@ def test_differences_are_of_one_unit_and_may_be_below_zero() -> None:
 
 
 def test_of_three_policies_every_difference_is_narrow_enough() -> None:
-    three: Values = [[[0.4], [0.6], [0.8]], [[0.5], [0.7], [0.9]], [[0.1], [0.6], [0.9]]]
+    three: Values = [[[0.4], [0.6], [0.8]], [[0.5], [0.7], [0.91]], [[0.1], [0.6], [0.9]]]
     assert not stop(9, 3, half_width=0.1, difference=True).enough(table(three))
     assert stop(6, 2, half_width=0.1, difference=True).enough(table(three[:2]))
+
+
+@pytest.mark.parametrize("difference", [False, True])
+def test_values_that_are_all_equal_end_a_campaign_from_thirty_units_on(difference: bool) -> None:
+    def enough(units: int) -> bool:
+        equal: Values = [[[0.5]] * units] * 2
+        return stop(2 * units, half_width=0.1, at_least=2, difference=difference).enough(table(equal))
+
+    assert [enough(units) for units in (2, 29, 30)] == [False, False, True]
 
 
 def test_speed_and_time_left_are_of_what_this_driver_flew() -> None:

@@ -132,6 +132,34 @@ def test_a_comparison_stops_when_its_seeds_are_used_up() -> None:
     assert "not reached, as the seeds were used up: --most-seeds" in "\n".join(precision_lines(found))
 
 
+def equal(seeds: int, plans: Sequence[Batch]) -> Flown:
+    flown = Flown(plans=list(plans))
+    for seed in range(seeds):
+        flown.add(row("torch", seed, 0.0, 15.0))
+        if seed < 12:
+            flown.add(row("surrogate", seed, 0.0))
+    return flown
+
+
+def test_gains_that_are_all_equal_count_as_known_from_thirty_seeds_on() -> None:
+    plans: list[Batch] = []
+    while batch := next_batch(equal(plans[-1].paired, plans) if plans else Flown(), ["silence"], Settings(0.01)):
+        plans.append(batch)
+    assert plans[0].paired == 12
+    assert 30 <= plans[-1].paired < 36, "policies that decide alike do not fly to the end"
+    found = precision_of(equal(plans[-1].paired, plans), ["silence"], Settings(0.01), "torch")
+    assert found.reached
+    told = next(iter(precision_lines(found)))
+    assert f": none, as the gains are all equal in {plans[-1].paired} seeds, 1 asked, reached; " in told
+
+
+def test_gains_that_are_all_equal_in_a_few_seeds_reach_no_half_width() -> None:
+    settings = Settings(0.01, most=20)
+    found = precision_of(equal(20, [Batch(20, 0, control=False)]), ["silence"], settings, "torch")
+    assert not found.reached
+    assert "all equal in 20 seeds, 1 asked, not reached" in next(iter(precision_lines(found)))
+
+
 def test_seeds_without_a_gain_count_nowhere() -> None:
     flown = Flown(plans=[Batch(12, 0, True), Batch(12, 3, True)])
     for seed in range(6):
