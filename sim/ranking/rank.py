@@ -11,7 +11,7 @@ import numpy as np
 
 from sortie.policies.contract import Policy, PolicyError
 from sortie.policies.registry import POLICIES, resolve
-from sortie.scenarios.reading.load import load_conditions
+from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version
@@ -95,7 +95,7 @@ def load_suite(name: str, *, by_torch: bool = False) -> ConditionSet:
 
     Raises:
         ScenarioError: no such file, or an error in it.
-        RunError: a file of another kind, or conditions without seeds of their own.
+        RunError: a file of another kind, or conditions without a seed and a town of their own.
     """
     suite = load_conditions(name)
     if suite is None:
@@ -105,6 +105,16 @@ def load_suite(name: str, *, by_torch: bool = False) -> ConditionSet:
             f"--suite {name}: seeds is {list(suite.seeds)}, must be [], with a `seed=` in the `set` of each condition: "
             "places are compared over conditions that are drawn independently"
         )
+    flown: dict[tuple[str, int], str] = {}
+    for condition in suite.conditions:
+        scenario = load(suite.base, [*suite.set, *condition.set])
+        for field, value in (("seed", scenario.seed), ("perception.scene.seed", scenario.perception.scene.seed)):
+            other = flown.setdefault((field, value), condition.name)
+            if other != condition.name:
+                raise RunError(
+                    f"--suite {name}: {field} is {value} in {other} and in {condition.name}, must differ from condition to "
+                    f"condition: write `{field}=` into the `set` of each; places are compared over independent draws"
+                )
     return suite.model_copy(update={"set": (*suite.set, *BY_TORCH)}) if by_torch else suite
 
 

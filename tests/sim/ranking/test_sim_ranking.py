@@ -120,6 +120,10 @@ def test_a_set_with_seeds_of_its_own_is_no_suite(here: object) -> None:
     Path("seeds.yaml").write_text(SMALL.replace("seeds: []", "seeds: [1, 2]"))
     with pytest.raises(RunError, match=r"seeds is \[1, 2\], must be \[\]"):
         rank.load_suite("seeds.yaml")
+    for field, own in (("seed", "seed=2, "), ("perception.scene.seed", ", perception.scene.seed=8")):
+        Path("seeds.yaml").write_text(SMALL.replace(own, ""))
+        with pytest.raises(RunError, match=rf"{field} is \d in poor and in rich, must differ .* write `{field}=` into"):
+            rank.load_suite("seeds.yaml")
     with pytest.raises(RunError, match="holds no conditions"):
         rank.load_suite("track_target")
 
