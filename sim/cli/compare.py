@@ -134,8 +134,9 @@ def compare(
         out.print(f"kept in [bold]{report}[/bold]", soft_wrap=True)
     if readme is not None:
         command = compare_command(
-            scenario, policies, seed, seeds, set_ or [], own_fusion=own_fusion, half_width=half_width, metric=metric
-        )
+            scenario, policies, seed, seeds, set_ or [], own_fusion=own_fusion, half_width=half_width, metric=metric, pilot=pilot,
+            most_seeds=most_seeds,
+        )  # fmt: skip
         section = comparison_markdown(Flown(compared.sorties, compared.gains), command, compared.precision)
         put_between(readme, section, BEGIN, END)
         out.print(f"the comparison in [bold]{readme}[/bold] written")

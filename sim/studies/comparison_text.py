@@ -53,6 +53,8 @@ def compare_command(
     own_fusion: bool,
     half_width: float | None = None,
     metric: str | None = None,
+    pilot: int | None = None,
+    most_seeds: int | None = None,
 ) -> str:
     """The command that gives the same comparison again."""
     said = ["sortie", "compare", scenario, "--policies", policies]
@@ -61,6 +63,8 @@ def compare_command(
     said += [x for override in overrides for x in ("--set", override)]
     said += [] if half_width is None else ["--half-width", f"{half_width:g}"]
     said += [] if metric is None else ["--metric", metric]
+    said += [] if pilot is None else ["--pilot", str(pilot)]
+    said += [] if most_seeds is None else ["--most-seeds", str(most_seeds)]
     return shlex.join(said + ["--own-fusion"] * own_fusion)
 
 

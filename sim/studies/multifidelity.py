@@ -293,7 +293,7 @@ def run(
     cheap = [with_detector(c, "surrogate") for c in contenders]
     policies = [c.label for c in contenders[1:]]
     while True:
-        batch = flown.plans[-1] if flown.plans else None
+        batch = _planned(flown, settings)
         if batch is None or _complete(flown, batch):
             batch = next_batch(flown, policies, settings)
             if batch is None:
@@ -315,6 +315,14 @@ def run(
                 _add(flown, keep, fly_surrogate(cheap, seed))
         if batch.further:
             report(f"{stage}further seeds by the surrogate", batch.further, batch.further)
+
+
+def _planned(flown: Flown, settings: Settings) -> Batch | None:
+    """The last plan. One that an earlier call made with more seeds at most ends at this call's, or where that call was."""
+    if not flown.plans:
+        return None
+    last = flown.plans[-1]
+    return last._replace(paired=min(last.paired, max(settings.most, len(flown.torch))))
 
 
 def _complete(flown: Flown, batch: Batch) -> bool:

@@ -19,7 +19,7 @@ from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.accuracy import both_matched
 from sortie.sim.studies import kept_comparison, multifidelity
 from sortie.sim.studies.compare import BY_BOTH, Contender, compare
-from sortie.sim.studies.comparison_text import precision_lines
+from sortie.sim.studies.comparison_text import compare_command, precision_lines
 from sortie.sim.studies.kept_comparison import compare_to, keep, kept
 from sortie.sim.studies.multifidelity import (
     FURTHER,
@@ -308,6 +308,36 @@ def test_a_narrower_half_width_goes_on_and_a_wider_one_flies_nothing(
     count = len(flights)
     assert compare_to(contenders(), Settings(0.02), tmp_path / "c.sqlite").precision.reached
     assert len(flights) == count
+
+
+def test_a_comparison_that_goes_on_flies_no_more_than_the_seeds_asked_now(
+    flights: list[tuple[str, int]], tmp_path: Path
+) -> None:
+    path, narrow = tmp_path / "c.sqlite", Settings(0.004)
+
+    def torch() -> int:
+        return sum(by == "torch" for by, _ in flights)
+
+    def kill(stage: str, done: int, of: float) -> None:
+        if torch() == 14:
+            raise Killed
+
+    with pytest.raises(Killed):
+        compare_to(contenders(), narrow, path, kill)
+    found = compare_to(contenders(), Settings(0.004, most=16), path).precision
+    assert (found.paired, found.reached, torch()) == (16, False, 16), "24 were planned"
+    assert compare_to(contenders(), Settings(0.004, most=12), path).precision.paired == torch() == 16
+    assert compare_to(contenders(), Settings(0.004, most=24), path).precision.paired == 24
+    assert len(set(flights)) == len(flights), "nothing is flown twice"
+
+
+def test_the_command_that_gives_the_comparison_again_has_its_pilot_and_its_most_seeds() -> None:
+    told = compare_command(
+        "track_target", "worked,silence", 4, None, [], own_fusion=False, half_width=0.02, pilot=8, most_seeds=90
+    )
+    assert told == (
+        "sortie compare track_target --policies worked,silence --seed 4 --half-width 0.02 --pilot 8 --most-seeds 90"
+    )
 
 
 def test_files_of_others_are_refused(flights: list[tuple[str, int]], tmp_path: Path) -> None:
