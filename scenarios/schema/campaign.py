@@ -141,6 +141,12 @@ class SampledField(Section):
         description="Draws; for morris trajectories of fields + 1 draws, for saltelli blocks of fields + 2.",
     )
 
+    @property
+    def independent(self) -> bool:
+        """Whether the draws are one sample, over which a mean has an interval. Draws of a Morris trajectory or a Saltelli block
+        share values with one another."""
+        return self.method not in ("morris", "saltelli")
+
     @model_validator(mode="after")
     def _power(self) -> SampledField:
         if self.method in ("sobol", "saltelli") and self.count & (self.count - 1):
@@ -193,13 +199,12 @@ class Campaign(Section):
             raise inconsistent(
                 ("sample", "count"), f"{self.sample.count}", "1 where no field is drawn, see replications"
             )
-        if self.sample.method in ("morris", "saltelli") and (not drawn or len(drawn) < len(self.vary)):
+        if not self.sample.independent and (not drawn or len(drawn) < len(self.vary)):
             bound = "another, or every field of vary drawn, none a grid"
             raise inconsistent(("sample", "method"), self.sample.method, bound)
-        if self.sample.method == "morris" and self.stop_when is not None:  # its levels are no sample
-            raise inconsistent(
-                ("stop_when",), "morris", "left out, or another sample.method: its means have no intervals"
-            )
+        if not self.sample.independent and self.stop_when is not None:
+            bound = "left out, or another sample.method: its means have no intervals"
+            raise inconsistent(("stop_when",), self.sample.method, bound)
         for name in ("policies", "metrics"):
             entries = getattr(self, name)
             for i, entry in enumerate(entries):

@@ -24,6 +24,12 @@ from sortie.sim.results.outcome_fields import possible
 
 REPORT, VARIED, PARETO = "report.md", "varied.png", "pareto.png"
 MAX_FAILED = 20
+NO_INTERVALS = {
+    "morris": "The draws are Morris' levels, for the elementary effects below: means over them are not of the distributions, "
+    "and have no intervals.",
+    "saltelli": "The draws are Saltelli's blocks, for the Sobol' indices below: draws of a block share values and are not "
+    "independent, so means over them have no intervals.",
+}
 
 
 def write_report(folder: Path, notice: Callable[[str], None] = lambda line: None) -> Path:
@@ -44,7 +50,7 @@ def write_report(folder: Path, notice: Callable[[str], None] = lambda line: None
         store.export()
     try:
         pictures = {VARIED: False, PARETO: False}
-        if _sampled(rows):
+        if _independent(rows):
             pictures = {VARIED: draw_varied(rows, folder / VARIED), PARETO: draw_pareto(rows, folder / PARETO)}
     except OSError as error:
         raise RunError(f"{folder}: cannot be written: {error.strerror}") from error
@@ -75,11 +81,11 @@ def _lines(rows: CampaignRows, folder: Path, pictures: dict[str, bool]) -> Itera
     if plan.campaign.sample.method in ("latin_hypercube", "sobol") and len(plan.points) > 1:
         yield "Draws of this design are spread more evenly than independent ones, so the intervals are on the wide side."
     yield from _by_policy(rows)
-    if _sampled(rows):
+    if _independent(rows):
         yield from _varied(rows, pictures[VARIED])
         yield from _pareto(rows, pictures[PARETO])
     yield from _sensitivity(rows)
-    if _sampled(rows):
+    if _independent(rows):
         yield from _winners(rows)
     yield from _failed(rows, folder)
     yield "\n## The rows\n"
@@ -114,7 +120,7 @@ def _by_policy(rows: CampaignRows) -> Iterator[str]:
     valued = with_values(rows)
     if missing := [m for m in rows.plan.campaign.metrics if m not in valued]:
         yield f"\nNo run has a value of {', '.join(missing)}: left out of what follows."
-    if len(labels) > 1 and _sampled(rows):
+    if len(labels) > 1 and _independent(rows):
         yield f"\nDifferences from **{labels[0]}**, paired; × says how many times as many runs it would have taken unpaired.\n"
         others = range(1, len(labels))
         yield from table(
@@ -235,19 +241,15 @@ def _failures(rows: CampaignRows) -> list[dict[str, Any]]:
     return failed
 
 
-def _sampled(rows: CampaignRows) -> bool:
-    """Whether draws are of the fields' distributions; Morris' are a few levels, walked along in trajectories."""
-    return rows.plan.campaign.sample.method != "morris" or rows.plan.unit == "replication"
+def _independent(rows: CampaignRows) -> bool:
+    return rows.plan.campaign.sample.independent
 
 
 def _intervals(rows: CampaignRows) -> str:
     """What the intervals are, or why there are none."""
     unit = rows.plan.unit
-    if not _sampled(rows):
-        return (
-            "The draws are Morris' levels, for the elementary effects below: means over them are not of the distributions, "
-            "and have no intervals."
-        )
+    if not _independent(rows):
+        return NO_INTERVALS[rows.plan.campaign.sample.method]
     if rows.plan.units == 1:
         return (
             f"One {unit} gives no interval: ask for more, by `{'sample.count' if unit == 'draw' else 'replications'}`."
@@ -269,7 +271,7 @@ def _stopped(rows: CampaignRows) -> bool:
 
 def _mean(rows: CampaignRows, metric: str, values: Floats) -> str:
     result = mean_interval(values, possible(metric))
-    return _interval(result) if _sampled(rows) else prefixed(result.mean)[0]
+    return _interval(result) if _independent(rows) else prefixed(result.mean)[0]
 
 
 def _difference(compared: Paired) -> str:

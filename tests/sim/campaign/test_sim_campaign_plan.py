@@ -388,15 +388,16 @@ def test_another_policy_than_the_bases_own_flies_to_the_end(tmp_path: Path) -> N
     assert (other["name"], other["changes"]) == ("best-2", [])
 
 
-def test_levels_of_morris_stop_at_no_interval(tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["morris", "saltelli"])
+def test_draws_that_share_values_stop_at_no_interval(method: str, tmp_path: Path) -> None:
     text = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n", "")
-    text = text.replace("{count: 6}", "{count: 6, method: morris}")
-    assert load_campaign(write(tmp_path, text)).campaign.sample.method == "morris"
+    text = text.replace("{count: 6}", f"{{count: 8, method: {method}}}")
+    assert load_campaign(write(tmp_path, text)).campaign.sample.method == method
     path = write(tmp_path, text + "stop_when: {metric: bytes.data_sent, half_width: 1}\n")
     with pytest.raises(ScenarioError) as error:
         load_campaign(path)
     must = "must be left out, or another sample.method: its means have no intervals"
-    assert str(error.value) == f"{path}:11: stop_when: morris, {must}"
+    assert str(error.value) == f"{path}:11: stop_when: {method}, {must}"
 
 
 def test_a_shorter_campaign_leaves_out_what_its_base_does_later(
