@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sortie.scenarios.intervals import Floats
 from sortie.sim.campaign.rows import CampaignRows
@@ -45,7 +44,7 @@ def sensitivity(rows: CampaignRows, metric: str, policy: int) -> Sensitivity | N
     """None where no numeric field is drawn, or too little is finished.
 
     Raises:
-        RunError: the rows are not in the order of the design, so that indices would be of something else.
+        RunError: rows have other values of the fields than the design, so that indices would be of something else.
     """
     plan = rows.plan
     design = plan.campaign.sample.method
@@ -62,14 +61,12 @@ def sensitivity(rows: CampaignRows, metric: str, policy: int) -> Sensitivity | N
             return None
         figures = np.array([[_spearman(column, y)] for column in x])
         return Sensitivity(label, metric, method, fields, figures, len(y))
-    y, order = _in_order(rows, metric, policy)
     block = len(fields) + (1 if method == "morris" else 2)
-    whole = len(y) // block
-    y, points = y[: whole * block].reshape(whole, block), plan.points[order[: whole * block]]
-    kept = ~np.isnan(y).any(axis=1)  # a failed run takes its trajectory with it
+    y = _by_draw(rows, metric, policy).reshape(-1, block)
+    kept = ~np.isnan(y).any(axis=1)  # a run that failed, or is not flown yet, takes its trajectory or block with it
     if kept.sum() < 2:
         return None
-    points = points.reshape(whole, block, len(fields))[kept].reshape(-1, len(fields))
+    points = plan.points.reshape(-1, block, len(fields))[kept].reshape(-1, len(fields))
     figures = _morris(points, y[kept].ravel()) if method == "morris" else _saltelli(len(fields), y[kept].ravel())
     return Sensitivity(label, metric, method, fields, figures, int(kept.sum()) * block)
 
@@ -78,24 +75,27 @@ def _numeric(rows: CampaignRows) -> tuple[str, ...]:
     return tuple(f for f in rows.plan.campaign.vary if rows.table[f].to_numpy(zero_copy_only=False).dtype != object)
 
 
-def _in_order(rows: CampaignRows, metric: str, policy: int) -> tuple[Floats, NDArray[np.int64]]:
-    """A policy's values by draw, 0, 1, 2, …, replications averaged; each row's fields are compared with the design's."""
+def _by_draw(rows: CampaignRows, metric: str, policy: int) -> Floats:
+    """A policy's values [draws of the design], replications averaged; NaN where one is missing.
+
+    The fields of three draws are compared with the design's.
+    """
     plan = rows.plan
     mine = np.flatnonzero(rows.policy == policy)
     unit = rows.unit[mine]
     distinct, first = np.unique(unit, return_index=True)
-    if (np.diff(unit) < 0).any() or not np.array_equal(distinct, np.arange(len(distinct))):
-        raise RunError("sensitivity: the rows are not in the order of the design")
-    table = rows.table
     for field in drawn_fields(plan.campaign):
-        column = table[field].to_pylist()
-        for number in (0, len(distinct) // 2, len(distinct) - 1):
-            if plan.varied(int(distinct[number]))[field] != column[int(mine[first[number]])]:
-                raise RunError(f"sensitivity: {field} of draw {number} is not the design's")
+        column = rows.table[field].to_pylist()
+        for k in (0, len(distinct) // 2, len(distinct) - 1):
+            if plan.varied(int(distinct[k]))[field] != column[int(mine[first[k]])]:
+                raise RunError(f"sensitivity: {field} of draw {distinct[k]} is not the design's")
     values = rows.values(metric)[mine]
-    total, count = np.bincount(unit, np.nan_to_num(values)), np.bincount(unit, ~np.isnan(values))
+    known = ~np.isnan(values)
+    total, flown, count = (
+        np.bincount(unit, weights, minlength=plan.units) for weights in (np.nan_to_num(values), None, known)
+    )
     with np.errstate(invalid="ignore"):
-        return np.where(count == np.bincount(unit), total / count, math.nan), distinct
+        return np.where(count == flown, total / count, math.nan)
 
 
 def _morris(points: Floats, y: Floats) -> Floats:
