@@ -20,8 +20,8 @@ COST = ("bytes.data_sent", "data_rate_mbps", "energy_j.total")
 
 
 def with_values(rows: CampaignRows) -> list[str]:
-    """The campaign's metrics that some run has a value of; of the others nothing can be drawn or said."""
-    return [m for m in rows.plan.campaign.metrics if not np.isnan(rows.values(m)).all()]
+    """The campaign's metrics that some scene counts for; of the others nothing can be drawn or said."""
+    return [m for m in rows.plan.campaign.metrics if rows.counted(m)[0].any()]
 
 
 def costs(metrics: Sequence[str]) -> list[str]:

@@ -8,7 +8,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from sortie.scenarios.intervals import Estimate, Floats, Paired, mean_interval, paired
 from sortie.scenarios.report_text import ALL_EQUAL, NONE, number, prefixed, table
@@ -111,23 +113,30 @@ def _lost(rows: CampaignRows) -> Iterator[str]:
 
 
 def _by_policy(rows: CampaignRows) -> Iterator[str]:
-    labels = rows.plan.policies
+    labels, metrics = rows.plan.policies, rows.plan.campaign.metrics
+    some = {metric: _some(rows, metric) for metric in metrics}
     yield "\n## Metrics by policy\n"
     yield from table(
         ("metric", *labels),
-        ((metric, *(_mean(rows, metric, m) for m in rows.by_unit(metric).T)) for metric in rows.plan.campaign.metrics),
+        ((metric + some[metric], *(_mean(rows, metric, m) for m in rows.by_unit(metric).T)) for metric in metrics),
     )
+    if any(some.values()):
+        yield (
+            f"\nA scene is one replication of a {rows.plan.unit} at a grid point. It counts for a metric where every policy "
+            "that ever has a value of the metric has one, so that policies are compared on the same scenes."
+        )
     valued = with_values(rows)
-    if missing := [m for m in rows.plan.campaign.metrics if m not in valued]:
-        yield f"\nNo run has a value of {', '.join(missing)}: left out of what follows."
+    if missing := [m for m in metrics if m not in valued]:
+        yield f"\nNo scene can be compared by {', '.join(missing)}: left out of what follows."
     if len(labels) > 1 and _independent(rows):
         yield f"\nDifferences from **{labels[0]}**, paired; × says how many times as many runs it would have taken unpaired.\n"
         others = range(1, len(labels))
         yield from table(
             ("metric", *labels[1:]),
             (
-                (metric, *(_difference(paired(*rows.pair(metric, 0, p), possible(metric))) for p in others))
+                (metric, *(_difference(paired(means[:, 0], means[:, p], possible(metric))) for p in others))
                 for metric in valued
+                for means in [rows.by_unit(metric)]
             ),
         )
 
@@ -148,7 +157,11 @@ def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:
         yield from table(
             (metric, "part", *rows.plan.policies),
             (
-                (field, label, *(_interval(mean_interval(m, possible(metric))) for m in rows.by_unit(metric, mask).T))
+                (
+                    field,
+                    label + _some(rows, metric, mask),
+                    *(_interval(mean_interval(m, possible(metric))) for m in rows.by_unit(metric, mask).T),
+                )
                 for field in rows.plan.campaign.vary
                 for label, _, mask in rows.bins(field)
             ),
@@ -209,7 +222,7 @@ def _winners(rows: CampaignRows) -> Iterator[str]:
         best, other = winner(rows, metric), other_winners(rows, metric)
         yield f"\n**{metric}**: {best} has the best mean over everything."
         if not other:
-            yield "It has it in every part of every varied field, too."
+            yield "No other policy has a better mean in any part of a varied field."
         for c in other:
             sure = "surely" if c.sure else "not surely"
             yield f"- {c.field} {c.part}: {c.winner}, {sure}: {_interval(c.gain, signed=True)} over {best}"
@@ -267,6 +280,13 @@ def _stopped(rows: CampaignRows) -> bool:
     for begin in range(0, count, size):
         enough = stop.enough(rows.all.slice(begin, size))
     return enough and count < rows.plan.runs
+
+
+def _some(rows: CampaignRows, metric: str, mask: NDArray[np.bool_] | None = None) -> str:
+    """How many of the scenes count for a metric, where not all do."""
+    runs, scenes = rows.counted(metric, mask)
+    count = int(runs.reshape(-1, len(rows.plan.policies)).any(axis=1).sum())
+    return f" ({count} of {scenes} scenes)" if 0 < count < scenes else ""
 
 
 def _mean(rows: CampaignRows, metric: str, values: Floats) -> str:

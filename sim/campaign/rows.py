@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from contextlib import closing
@@ -62,18 +61,28 @@ class CampaignRows:
         flew = np.bincount(self.policy, self.done, minlength=failed.shape[2]) > 0
         return np.asarray(failed.any(axis=1) & flew)
 
+    def counted(self, metric: str, mask: NDArray[np.bool_] | None = None) -> tuple[NDArray[np.bool_], int]:
+        """Which runs [runs] count for a metric, and of how many scenes they are some.
+
+        A scene is one replication of a unit at a grid point, with a run of each policy. It counts where every policy that
+        ever has a value of the metric has one: means over other scenes would be no comparison. Units that a policy has
+        `lost` are left out.
+        """
+        mask = np.ones(len(self.unit), bool) if mask is None else mask
+        mask = mask & ~np.isin(self.unit, np.flatnonzero(self.lost(mask).any(axis=1)))
+        policies = len(self.plan.policies)  # a scene's policies stand together
+        known = ~np.isnan(self.values(metric)).reshape(-1, policies)
+        whole = (known == known.any(axis=0)).all(axis=1, keepdims=True)
+        return (known & whole).ravel() & mask, int(mask.sum()) // policies
+
     def by_unit(self, metric: str, mask: NDArray[np.bool_] | None = None) -> Floats:
-        """Means [units, policies] over the grid points of a unit, each the mean of its replications; NaN where there is no
-        value. Left out are units without any, and those that a policy has `lost`: the others' means would be over other
-        draws than its own."""
-        values = self.values(metric)
-        mask = np.ones(len(values), bool) if mask is None else mask
-        use = mask & ~np.isnan(values)
+        """Means [units, policies] over the grid points of a unit, each the mean of its replications, over the scenes that
+        count (`counted`) and the units that have one; NaN for a policy that never has a value."""
+        use, _ = self.counted(metric, mask)
         counts = self._count(use)
         with np.errstate(invalid="ignore"):
-            of_points = self._count(use, values) / counts
+            of_points = self._count(use, self.values(metric)) / counts
             means = np.nansum(of_points, axis=1) / (counts > 0).sum(axis=1)
-        means[self.lost(mask).any(axis=1)] = math.nan
         return np.asarray(means[~np.isnan(means).all(axis=1)])
 
     def _count(self, which: NDArray[np.bool_], weights: Floats | None = None) -> Floats:
@@ -84,17 +93,6 @@ class CampaignRows:
         some = None if weights is None else weights[which]
         count = np.bincount(at[which], some, minlength=units * points * policies)
         return count.reshape(units, points, policies).astype(float)
-
-    def pair(self, metric: str, a: int, b: int) -> tuple[Floats, Floats]:
-        """Means by unit of two policies, over the scenes of the units of `by_unit` in which both have a value."""
-        policies = len(self.plan.policies)
-        values = self.values(metric).reshape(-1, policies)[:, [a, b]]  # a scene's policies stand together
-        unit = self.unit[::policies]
-        kept = np.flatnonzero(~self.lost().any(axis=1))
-        both = ~np.isnan(values).any(axis=1) & np.isin(unit, kept)
-        at = np.unique(unit[both], return_inverse=True)[1]
-        count = np.bincount(at)
-        return np.bincount(at, values[both, 0]) / count, np.bincount(at, values[both, 1]) / count
 
     def bins(self, field: str) -> list[tuple[str, float, NDArray[np.bool_]]]:
         """A varied field's range in parts: a label, a place on its axis, and the runs; few values stand as they are."""

@@ -65,9 +65,8 @@ def other_winners(rows: CampaignRows, metric: str) -> list[OtherWinner]:
 
 
 def _first(means: Floats) -> int:
-    """Which column has the highest mean; one without any value has none."""
-    sums, counts = np.nansum(means, axis=0), (~np.isnan(means)).sum(axis=0)
-    return int(np.argmax(np.where(counts > 0, sums / np.maximum(counts, 1), -math.inf)))
+    """Which column has the highest mean; one that never has a value has none."""
+    return int(np.argmax(np.nan_to_num(means.mean(axis=0), nan=-math.inf)))
 
 
 def rule(rows: CampaignRows, metric: str) -> Rule | None:
@@ -75,11 +74,11 @@ def rule(rows: CampaignRows, metric: str) -> Rule | None:
 
     Returns:
         The rule found on all units, with the gain that rules found on one half had on the other; None where no field
-        has enough distinct numbers, there is one policy, or there are fewer than four units.
+        has enough distinct numbers, one policy has values, or there are fewer than four units.
     """
-    unit, x, y = _cells(rows, metric)
+    labels, unit, x, y = _cells(rows, metric)
     number = np.unique(unit, return_inverse=True)[1] if len(unit) else unit
-    if len(rows.plan.policies) < 2 or not x or len(unit) < 8 or number.max() < 3:
+    if len(labels) < 2 or not x or len(unit) < 8 or number.max() < 3:
         return None
     even = number % 2 == 0
     gains: list[float] = []
@@ -98,28 +97,25 @@ def rule(rows: CampaignRows, metric: str) -> Rule | None:
     field, threshold, below, above = whole
     if below == above:
         return None
-    labels = rows.plan.policies
     return Rule(field, threshold, labels[below], labels[above], mean_interval(gains, possible(metric).of_differences()))
 
 
-def _cells(rows: CampaignRows, metric: str) -> tuple[NDArray[np.int64], dict[str, Floats], Floats]:
-    """Cells of units in which every policy has a value: their units, their numeric fields, and what each policy got."""
-    cell, values = rows.table["cell"].to_numpy(), sign(metric) * rows.values(metric)
-    numbers, at = np.unique(rows.unit * rows.plan.cells + cell, return_inverse=True)
-    policies = len(rows.plan.policies)
-    use = ~np.isnan(values)
-    slot = at[use] * policies + rows.policy[use]
-    count = np.bincount(slot, minlength=len(numbers) * policies)
-    with np.errstate(invalid="ignore"):
-        y = (np.bincount(slot, values[use], minlength=len(count)) / count).reshape(len(numbers), policies)
-    whole = ~np.isnan(y).any(axis=1)
-    first = np.unique(at, return_index=True)[1]
+def _cells(rows: CampaignRows, metric: str) -> tuple[list[str], NDArray[np.int64], dict[str, Floats], Floats]:
+    """The policies that have values, and the cells of units with scenes that count: their units, their numeric fields, and
+    what each of these policies got."""
+    use = np.flatnonzero(rows.counted(metric)[0])
+    valued, policy = np.unique(rows.policy[use], return_inverse=True)
+    cell = rows.unit[use] * rows.plan.cells + rows.table["cell"].to_numpy()[use]
+    _, first, at = np.unique(cell, return_index=True, return_inverse=True)
+    slot = at * len(valued) + policy
+    y = np.bincount(slot, sign(metric) * rows.values(metric)[use]) / np.bincount(slot)
     x = {}
     for field in rows.plan.campaign.vary:
         column = rows.table[field].to_numpy(zero_copy_only=False)
         if column.dtype != object:
-            x[field] = column.astype(float)[first][whole]
-    return rows.unit[first][whole], x, y[whole]
+            x[field] = column[use[first]].astype(float)
+    labels = [rows.plan.policies[i] for i in valued]
+    return labels, rows.unit[use[first]], x, y.reshape(len(first), len(valued))
 
 
 def _best(x: dict[str, Floats], y: Floats) -> tuple[str, float, int, int] | None:

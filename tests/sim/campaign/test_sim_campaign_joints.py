@@ -222,12 +222,14 @@ def rows(
 
 
 def test_a_mean_is_over_grid_points_and_each_of_them_over_its_replications() -> None:
-    """Policy a: 2 and 5. Policy b: nothing at the first point, and 8 at the second."""
+    """Policy a: 2 and 5. Policy b: 6 and 9, as a replication without a value of policy a counts for neither."""
     made = rows([
-        (0, 0, 0, 0, 1.0, "done"), (0, 0, 0, 1, None, "done"), (0, 0, 1, 0, 3.0, "done"), (0, 0, 1, 1, None, "done"),
+        (0, 0, 0, 0, 1.0, "done"), (0, 0, 0, 1, 4.0, "done"), (0, 0, 1, 0, 3.0, "done"), (0, 0, 1, 1, 8.0, "done"),
         (0, 1, 0, 0, None, "done"), (0, 1, 0, 1, 7.0, "done"), (0, 1, 1, 0, 5.0, "done"), (0, 1, 1, 1, 9.0, "done"),
     ], points=2)  # fmt: skip
-    assert made.by_unit(AP).tolist() == [[3.5, 8.0]]
+    assert made.by_unit(AP).tolist() == [[3.5, 7.5]]
+    counted, scenes = made.counted(AP)
+    assert (counted.tolist(), scenes) == ([True] * 4 + [False] * 2 + [True] * 2, 4)
 
 
 def test_a_unit_is_left_out_where_a_policy_is_lost_in_the_part_that_is_looked_at() -> None:
@@ -249,14 +251,13 @@ def test_a_unit_is_left_out_where_a_policy_is_lost_in_the_part_that_is_looked_at
     assert made.by_unit(AP).tolist() == [[0.5, pytest.approx(0.6)]]
     first = made.table["cell"].to_numpy() % 2 == 0
     assert made.by_unit(AP, first).tolist() == [[0.0, 0.1], [10.0, 10.1]]
-    assert [part.tolist() for part in made.pair(AP, 0, 1)] == [[0.5], [pytest.approx(0.6)]]
 
 
-def test_a_failed_replication_takes_nothing_where_another_finished() -> None:
+def test_a_failed_replication_counts_for_no_policy_and_its_unit_stays_where_another_finished() -> None:
     made = rows([
         (0, 0, 0, 0, 1.0, "done"), (0, 0, 0, 1, None, "failed"), (0, 0, 1, 0, 3.0, "done"), (0, 0, 1, 1, 5.0, "done"),
     ])  # fmt: skip
-    assert made.by_unit(AP).tolist() == [[2.0, 5.0]]
+    assert made.by_unit(AP).tolist() == [[3.0, 5.0]]
     assert not made.lost().any()
 
 
@@ -298,8 +299,8 @@ def test_a_threshold_leaves_an_eighth_on_either_side() -> None:
     assert _best(x, high) == ("x", 27.5, 0, 1)
 
 
-def test_the_first_is_by_the_mean_of_those_that_have_a_value() -> None:
-    assert _first(np.array([[1.0, 2.5, NAN], [1.0, NAN, NAN], [1.0, NAN, NAN]])) == 1
+def test_the_first_is_by_the_mean_and_a_policy_without_values_is_never_first() -> None:
+    assert _first(np.array([[1.0, 2.5, NAN], [1.0, 0.0, NAN]])) == 1
     assert _first(np.array([[-1.0, NAN], [-2.0, NAN]])) == 0
 
 

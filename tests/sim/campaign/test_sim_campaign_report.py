@@ -225,7 +225,7 @@ def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: P
     told = list(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
     assert [line for line in told if "ap50.mission" in line] == [
         "| ap50.mission | – | – |",
-        "\nNo run has a value of ap50.mission: left out of what follows.",
+        "\nNo scene can be compared by ap50.mission: left out of what follows.",
     ]
     assert "- ap50.full_scene against bytes.data_sent: no policy is better in both than worked" in told
     pytest.importorskip("matplotlib")

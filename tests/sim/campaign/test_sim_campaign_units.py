@@ -12,7 +12,7 @@ from campaign_examples import CAMPAIGN, Pretended, plan, rows_of
 
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.rows import CampaignRows, read_rows
-from sortie.sim.campaign.winners import winner
+from sortie.sim.campaign.winners import other_winners, rule, winner
 from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError
 
@@ -60,7 +60,6 @@ def test_a_failed_grid_point_takes_its_unit_with_it(tmp_path: Path) -> None:
     table = table.set_column(table.schema.get_field_index("bytes.data_sent"), "bytes.data_sent", pa.array(values))
     left = CampaignRows(rows.plan, table, rows.unit, rows.policy)
     assert left.by_unit("bytes.data_sent").tolist() == [[30, 31]] * 5, "the other policy's mean of draw 1, too"
-    assert [len(side) for side in left.pair("bytes.data_sent", 0, 1)] == [5, 5]
     assert left.lost().sum(axis=0).tolist() == [1, 0]
 
 
@@ -89,6 +88,69 @@ def test_a_policy_that_fails_where_it_is_hard_gains_nothing_by_it(tmp_path: Path
     assert winner(rows, "bytes.data_sent") == "worked"
     said = "2 of the draws are left out of all means, where a policy's runs failed (best-2(received_budget=0.1) 2): policies are"
     assert said in write_report(folder).read_text()
+
+
+MISSES = CAMPAIGN.replace("metrics: [bytes.data_sent, energy_j.total]", "metrics: [deadline_miss_rate]").replace(
+    "policies: [", "policies: [silence, "
+)
+
+
+def test_a_policy_that_sends_nothing_where_it_is_easy_loses_nothing_by_it(tmp_path: Path) -> None:
+    """It misses 0.02 less wherever it sends; `silence` never sends, and takes nothing from the others."""
+    from sortie.sim.campaign.report import _lines
+
+    def misses(fields: dict[str, float], policy: int) -> float | None:
+        easy = fields["fleet.battery.initial_soc"] < 0.6
+        if policy == 0 or (policy == 1 and easy):
+            return None
+        return (0.06 if easy else 0.47) + 0.02 * policy
+
+    text = MISSES.replace("{count: 6}", "{count: 40}").replace("replications: 2", "replications: 1")
+    rows = rows_of(tmp_path, text, misses, "deadline_miss_rate")
+    assert rows.by_unit("deadline_miss_rate")[:, 1:] == pytest.approx(np.array([[0.49, 0.51]] * 20))
+    assert winner(rows, "deadline_miss_rate") == "worked"
+    assert other_winners(rows, "deadline_miss_rate") == []
+    assert rule(rows, "deadline_miss_rate") is None, "no threshold gains, and none is hidden by the silent policy"
+    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    assert "| deadline_miss_rate (40 of 80 scenes) | – | 0.49 (all equal) | 0.51 (all equal) |" in told
+    assert "A scene is one replication of a draw at a grid point." in told
+    assert "| deadline_miss_rate | – | – |\n" in told, "differences from a silent policy"
+
+
+def test_a_grid_point_without_a_value_of_one_policy_is_left_out_for_all(tmp_path: Path) -> None:
+    """At 20 m `worked` sends nothing in half of the draws; there the others' means are of 40 m alone, too."""
+
+    def misses(fields: dict[str, float], policy: int) -> float | None:
+        hidden = fields["fleet.battery.initial_soc"] < 0.6 and fields["fleet.formation.spacing_m"] == 20
+        return (
+            None if policy == 0 or (policy == 1 and hidden) else fields["fleet.formation.spacing_m"] / 100 + policy / 10
+        )
+
+    rows = rows_of(tmp_path, MISSES, misses, "deadline_miss_rate")
+    means = rows.by_unit("deadline_miss_rate")
+    assert sorted(means[:, 1].tolist()) == pytest.approx([0.4] * 3 + [0.5] * 3)
+    assert means[:, 2] == pytest.approx(means[:, 1] + 0.1)
+
+
+def test_a_rule_is_between_the_policies_that_have_values(tmp_path: Path) -> None:
+    def misses(fields: dict[str, float], policy: int) -> float | None:
+        return None if policy == 0 else 0.2 + 0.1 * ((fields["fleet.battery.initial_soc"] > 0.6) == (policy == 1))
+
+    found = rule(rows_of(tmp_path, MISSES, misses, "deadline_miss_rate"), "deadline_miss_rate")
+    assert found is not None
+    assert (found.below, found.above) == ("worked", "best-2(received_budget=0.1)")
+
+
+def test_policies_that_never_have_a_value_in_the_same_scene_are_not_compared(tmp_path: Path) -> None:
+    from sortie.sim.campaign.report import _lines
+
+    def misses(fields: dict[str, float], policy: int) -> float | None:
+        return 0.5 if (fields["fleet.battery.initial_soc"] < 0.6) == (policy == 1) else None
+
+    rows = rows_of(tmp_path, MISSES, misses, "deadline_miss_rate")
+    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    assert "No scene can be compared by deadline_miss_rate: left out of what follows." in told
+    assert "## Where the winner changes" not in told
 
 
 def test_a_policy_that_never_finishes_takes_no_other_with_it(tmp_path: Path) -> None:
