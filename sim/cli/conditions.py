@@ -67,7 +67,8 @@ def compare_conditions(
         gain = "–" if r.policy == fixed else points(r.gain, "+.1f")
         table.add_row(
             r.policy, f"{r.ap:.3f}", gain,
-            "–" if r.of_oracle is None else f"{r.of_oracle:.0%}", size(r.data_bytes), f"{r.energy_j / 1e3:.1f}", f"{r.miss_rate:.1%}",
+            "–" if r.of_oracle is None else f"{r.of_oracle:.0%}", size(r.data_bytes), f"{r.energy_j / 1e3:.1f}",
+            "–" if r.miss_rate is None else f"{r.miss_rate:.1%}",
         )  # fmt: skip
     out.print(table)
     flown = ", ".join(p for p in policies if p in FIXED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +36,8 @@ class Cell:
     data_bytes: float
     """Sent a sortie, handshakes included."""
     energy_j: float
-    miss_rate: float
+    miss_rate: float | None
+    """Share of payloads past their deadline, mean over the seeds that have one; None where no payload had a deadline."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,8 @@ class Summary:
     """Mean AP relative to the best fixed policy of each condition; None where those have an AP of zero."""
     data_bytes: float
     energy_j: float
-    miss_rate: float
+    miss_rate: float | None
+    """Mean over the conditions that have one; None for a policy that never sent a payload."""
 
 
 def fly_all(
@@ -110,7 +112,7 @@ def _fly(
         float(ap),
         float(np.mean([r["bytes"]["data_sent"] for r in results])),
         float(np.mean([r["energy_j"]["total"] for r in results])),
-        float(np.mean([r["deadline_miss_rate"] or 0.0 for r in results])),
+        _mean(r["deadline_miss_rate"] for r in results),
     )
 
 
@@ -143,10 +145,16 @@ def summarise(cells: Sequence[Cell]) -> list[Summary]:
             Summary(
                 p, mean, (gain.mean, gain.low, gain.high), mean / oracle if oracle else None,
                 float(np.mean([c.data_bytes for c in mine])), float(np.mean([c.energy_j for c in mine])),
-                float(np.mean([c.miss_rate for c in mine])),
+                _mean(c.miss_rate for c in mine),
             )
         )  # fmt: skip
     return rows
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    """Of those that are known."""
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None
 
 
 def best_fixed(rows: Sequence[Summary]) -> str:

@@ -79,7 +79,7 @@ def test_every_policy_flies_every_condition_on_each_seed_within_its_budget(monke
     ]
     for c in cells:
         assert (c.data_bytes, c.energy_j) == (pytest.approx(99_000.0), pytest.approx(52_200.0))
-        assert c.miss_rate == pytest.approx(0.0 if c.policy == "silence" else 0.35)
+        assert c.miss_rate == (None if c.policy == "silence" else pytest.approx(0.35))
     # all-4: hit and miss at 0.9, two hits at 0.8: of four cars three. silence: hit and miss at 0.9, two misses
     # in the whole scene there are twice as many cars
     assert cells[0].ap > cells[2].ap > 0.0
@@ -87,10 +87,18 @@ def test_every_policy_flies_every_condition_on_each_seed_within_its_budget(monke
         assert cells[in_disc].ap == pytest.approx(2 * cells[in_scene].ap)
 
 
+def test_a_miss_rate_is_the_mean_over_the_seeds_that_sent_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    flown(monkeypatch)
+    monkeypatch.setattr(
+        conditions, "outcome", lambda made: told_outcome() | {"deadline_miss_rate": 0.25 if made.seed == 3 else None}
+    )
+    assert [c.miss_rate for c in conditions.fly_all(suite(), ["worked"])] == [0.25, 0.25]
+
+
 CELLS = [
     Cell("all-4", "poor", 0.4, 2e6, 3000.0, 0.1), Cell("all-4", "rich", 0.6, 4e6, 5000.0, 0.3),
     Cell("worked", "poor", 0.5, 1e6, 2000.0, 0.05), Cell("worked", "rich", 0.8, 3e6, 4000.0, 0.15),
-    Cell("silence", "poor", 0.45, 0.0, 1000.0, 0.0), Cell("silence", "rich", 0.3, 0.0, 1200.0, 0.0),
+    Cell("silence", "poor", 0.45, 0.0, 1000.0, None), Cell("silence", "rich", 0.3, 0.0, 1200.0, None),
 ]  # fmt: skip
 
 
@@ -126,12 +134,14 @@ def test_the_command_prints_and_keeps_each_policy_s_own_figures(
     rows = cells_of(second)
     assert [row[:2] + row[3:] for row in rows] == [
         ["all-4", "0.500", "95%", "3.0 MB", "4.0", "20.0%"], ["worked", "0.650", "124%", "2.0 MB", "3.0", "10.0%"],
-        ["silence", "0.375", "71%", "0 B", "1.1", "0.0%"],
+        ["silence", "0.375", "71%", "0 B", "1.1", "–"],
     ]  # fmt: skip
     assert rows[0][2] == "–"
     assert rows[1][2].startswith("+15.0 [")
     assert rows[2][2].startswith("-12.5 [")
     kept = json.loads((tmp_path / "c.json").read_text())
+    assert [c["miss_rate"] for c in kept["cells"]] == [0.1, 0.3, 0.05, 0.15, None, None]
+    assert [r["miss_rate"] for r in kept["summary"]] == [pytest.approx(0.2), pytest.approx(0.1), None]
     assert kept["cells"][3] == {
         "policy": "worked", "condition": "rich", "ap": 0.8, "data_bytes": 3e6, "energy_j": 4000.0, "miss_rate": 0.15,
     }  # fmt: skip
@@ -142,6 +152,7 @@ def test_the_command_prints_and_keeps_each_policy_s_own_figures(
 
 
 def test_a_condition_without_a_car_is_named_and_kept_as_null(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """And a miss rate is the mean over the conditions that have one."""
     blind = [c if c.condition == "rich" else Cell(c.policy, "poor", math.nan, 1.0, 2.0, 0.3) for c in CELLS]
     shown: list[Any] = []
     monkeypatch.setattr(command, "fly_all", lambda *a, **k: blind)
@@ -151,7 +162,7 @@ def test_a_condition_without_a_car_is_named_and_kept_as_null(monkeypatch: pytest
     kept = json.loads((tmp_path / "c.json").read_text())
     assert [c["ap"] for c in kept["cells"]] == [None, 0.6, None, 0.8, None, 0.3]
     assert [r["ap"] for r in kept["summary"]] == [0.6, 0.8, 0.3]
-    assert [r["miss_rate"] for r in kept["summary"]] == pytest.approx([0.3, 0.225, 0.15])
+    assert [r["miss_rate"] for r in kept["summary"]] == pytest.approx([0.3, 0.225, 0.3])
 
 
 # --- decisions made again -------------------------------------------------------------------------------------------
