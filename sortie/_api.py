@@ -243,7 +243,7 @@ def compare(
         seeds: a list of seeds, or the number of seeds, beginning with the scenario's own. None flies eight with the
             surrogate, which is fast, and one with any other detector. With several seeds, each has its own town and
             random draws, the same for all policies; intervals then cover sorties. With one seed, the flight is over
-            the scenario's own town, and intervals cover the instants of that flight alone.
+            the scenario's own town, and intervals cover that flight alone: they resample its blocks of 5 s.
         own_fusion: fly published methods with the fusion that they were published with, not `perception.fusion`.
         progress: called with the policy's label, the seed and the simulated time (s). With `half_width`: called with the
             stage, the number of seeds flown in it, and the number of all its seeds.

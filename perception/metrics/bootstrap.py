@@ -6,6 +6,7 @@ paired, and any arithmetic of APs has its interval by doing it to every draw.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -85,7 +86,10 @@ def rank(units: Sequence[Matched], groups: ArrayLike | None = None, bins: int = 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """AP of b minus AP of a, with its paired 95 % interval; `ap_a` and `ap_b` are on all frames."""
+    """AP of b minus AP of a, with its paired 95 % interval; `ap_a` and `ap_b` are on all frames.
+
+    A single frame or group has no interval: `low`, `high` and `p` are NaN.
+    """
 
     ap_a: float
     ap_b: float
@@ -112,7 +116,9 @@ def compare(
     if len(a) != len(b):
         raise ValueError(f"a has {len(a)} frames and b has {len(b)}, must be the same")
     ranked = [rank(units, groups) for units in (a, b)]
+    ap_a, ap_b = average_precision(a), average_precision(b)
+    if len(ranked[0].truths) < 2:
+        return Difference(ap_a, ap_b, ap_b - ap_a, math.nan, math.nan)
     weights = resamples(len(ranked[0].truths), draws, seed)
     gain = ranked[1].ap(weights) - ranked[0].ap(weights)
-    ap_a, ap_b = average_precision(a), average_precision(b)
     return Difference(ap_a, ap_b, ap_b - ap_a, *percentile_interval(gain), p_value(gain))

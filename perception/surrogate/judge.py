@@ -62,7 +62,7 @@ class OrderKept:
 
     @property
     def significant(self) -> bool:
-        return not self.low <= 0.0 <= self.high
+        return self.low > 0.0 or self.high < 0.0  # without an interval, of a single scene, it is not
 
     @property
     def kept(self) -> bool:

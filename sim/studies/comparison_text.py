@@ -12,7 +12,7 @@ from rich.table import Table
 
 from sortie.scenarios.report_text import number, percent, points, size, table
 from sortie.sim.results.summary import PLURAL
-from sortie.sim.studies.compare import BY_BOTH, Compared, Flown, Gain
+from sortie.sim.studies.compare import BLOCK_S, BY_BOTH, Compared, Flown, Gain
 from sortie.sim.studies.multifidelity import Precision
 
 BEGIN, END = "<!-- compare:begin -->", "<!-- compare:end -->"
@@ -140,7 +140,7 @@ def _what_gains_are(flown: Flown) -> str:
     covers = {
         "sorties": "the mean over sorties of each sortie's difference in AP, over the fusions that both policies made, with Student's 95 % interval over sorties",
         BY_BOTH: "the mean over sorties of each sortie's difference in AP, over the fusions that both policies made, corrected by the surrogate's sorties as control variates, with a 95 % interval over sorties",
-        "instants of one sortie": "with a 95 % interval over the instants of this one flight, which says nothing of others",
+        "blocks of one sortie": f"with a descriptive 95 % interval over blocks of {BLOCK_S:g} s of this one flight in this one town, which says nothing of others",
     }[flown.gains[0].over]
     return f"Gains are in AP points over {flown.sorties[0].policy}, paired: {covers}."
 

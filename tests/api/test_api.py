@@ -190,7 +190,7 @@ def test_a_comparison_has_a_row_a_sortie_and_says_what_its_intervals_cover() -> 
     one = sortie.compare("track_target", ["worked", quiet], SURROGATE, seeds=[1])
     assert isinstance(one.table, pa.Table)
     assert one.table["policy"].to_pylist() == ["worked", "quiet"]
-    assert [(gain.over, gain.count) for gain in one.gains] == [("instants of one sortie", 4)]
+    assert [(gain.over, gain.count) for gain in one.gains] == [("blocks of one sortie", 1)]
     assert "seed 1, in this town, this flight" in _line(one)
     three = sortie.compare("track_target", ["worked", quiet], SURROGATE, seeds=range(3))
     assert three.table.select(["policy", "seed", "town_seed"]).to_pylist() == [

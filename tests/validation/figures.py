@@ -61,10 +61,12 @@ def _liars() -> Tables:
 def _context_forms() -> Tables:
     import minimal_context
 
+    from sortie.sim.studies.compare import BLOCK_S
+
     rows = list(minimal_context.measure(range(1, 3), 40.0))
     return {
         "context_forms": minimal_context.table(
-            rows, "Two sorties of 40 s for each row; intervals over scored instants."
+            rows, f"Two sorties of 40 s for each row; intervals over blocks of {BLOCK_S:g} s of the sorties."
         )
     }
 

@@ -17,7 +17,7 @@ from sortie.scenarios.reading.load import library, load
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.studies.compare import pair_up
+from sortie.sim.studies.compare import BLOCK_S, pair_up
 
 SCENARIO, LIAR, SINCE_S = "track_target", 2, 5.0
 BUDGET = 0.1
@@ -28,7 +28,7 @@ LIES = (("coverage", "much"), ("coverage", "little"), ("goodput", "little"), ("b
 
 @dataclass(frozen=True, slots=True)
 class LiarRow:
-    """One policy and one lie; differences are in AP@0.5 of the honest drones, paired, by whole instants."""
+    """One policy and one lie; differences are in AP@0.5 of the honest drones, paired, by blocks of `BLOCK_S` of a sortie."""
 
     policy: str
     lie: str
@@ -114,7 +114,7 @@ def tables(seeds: Sequence[int], duration_s: float) -> dict[str, Table]:
                 for r in rows
             ],
             f"{len(seeds)} sorties of {duration_s:g} s for each row; change of AP against the honest fleet, in points, with "
-            "intervals over scored instants.",
+            f"intervals over blocks of {BLOCK_S:g} s of the sorties.",
         ),
         "false_alarms": Table(
             [Column("false alarms where nobody lies", ".0f"), Column("minutes of one drone judging another", ",.0f")],

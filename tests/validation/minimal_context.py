@@ -47,7 +47,7 @@ class ContextRow:
     """Descriptors of the whole fleet."""
     data_bytes_per_s: float
     difference: Difference
-    """AP@0.5 under the paper's form (a) and this one (b), paired, by whole instants."""
+    """AP@0.5 under the paper's form (a) and this one (b), paired, by blocks of `BLOCK_S` of a sortie."""
 
 
 def measure(

@@ -72,6 +72,13 @@ def test_nothing_differs_from_itself_and_groups_widen() -> None:
     assert by_group.high - by_group.low > by_frame.high - by_frame.low
 
 
+def test_a_single_frame_or_group_has_no_interval() -> None:
+    a, b = units(5, 4), units(6, 4)
+    for found in (compare(a[:1], b[:1]), compare(a, b, groups=[7] * 4)):
+        assert math.isfinite(found.delta)
+        assert all(math.isnan(v) for v in (found.low, found.high, found.p))
+
+
 def test_compare_refuses_unequal_frames() -> None:
     with pytest.raises(ValueError, match=r"a has 0 frames and b has 1, must be the same"):
         compare([], [Matched(np.zeros(0), np.zeros(0, bool), 1)])

@@ -5,6 +5,7 @@ The other detector is played by the surrogate itself under one replication, so t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 
@@ -121,6 +122,7 @@ def test_an_order_is_of_the_second_over_the_first_by_both(judged: tuple[Calibrat
         (-0.05, -0.09, -0.01, -0.001, True, True),
         (0.05, -0.01, 0.09, -0.02, False, True),
         (0.05, 0.0, 0.09, -0.02, False, True),
+        (0.05, math.nan, math.nan, -0.02, False, True),
     ],
 )
 def test_an_order_is_lost_where_it_is_significant_and_the_surrogate_s_sign_is_another(

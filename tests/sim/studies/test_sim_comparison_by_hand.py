@@ -91,7 +91,10 @@ def test_a_comparison_is_headed_by_its_sorties_and_by_what_its_intervals_cover()
     for over, words in (
         ("sorties", "with Student's 95 % interval over sorties"),
         (BY_BOTH, "corrected by the surrogate's sorties as control variates"),
-        ("instants of one sortie", "with a 95 % interval over the instants of this one flight"),
+        (
+            "blocks of one sortie",
+            "with a descriptive 95 % interval over blocks of 5 s of this one flight in this one town",
+        ),
     ):
         told = Flown(flown().sorties, (Gain("b", "ap50.full_scene", 0.1, 0.0, 0.2, over, 2),))
         caption = str(comparison_table(told).caption)
@@ -243,13 +246,29 @@ def test_each_seed_has_its_town_its_first_policy_and_its_own_gains(monkeypatch: 
         assert (blind.gain, blind.count) == (pytest.approx(0.005), 2)
 
 
-def test_one_seed_flies_in_the_scenario_s_own_town_and_its_interval_is_over_instants(monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+def test_one_seed_flies_in_the_scenario_s_own_town_and_its_interval_is_over_blocks(monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     calls = fake(monkeypatch, FRAMES)
     found = compare.compare(contenders(), [5])
     assert calls == [("worked", None, 5, 11), ("silence", None, 5, 11)]
     assert [(g.metric, g.gain, g.over, g.count) for g in found.gains] == [
-        ("ap50.full_scene", -1.0, "instants of one sortie", 1), ("ap50.mission", 1.0, "instants of one sortie", 1),
+        ("ap50.full_scene", -1.0, "blocks of one sortie", 1), ("ap50.mission", 1.0, "blocks of one sortie", 1),
     ]  # fmt: skip
+    assert all(np.isnan([g.low, g.high]).all() for g in found.gains), "one block has no interval"
+
+
+def test_instants_that_follow_each_other_do_not_narrow_the_interval_of_one_sortie(monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """The gain changes from block to block and is the same at all ten instants of each: ten times as many say no more."""
+    intervals = []
+    for per_block in (1, 10):
+        times = [5.0 * block + k / 2 for block in range(12) for k in range(per_block)]
+        frames = {(t_s, 0): scored(True, t_s // 5 % 3 > 0) for t_s in times}
+        arms = {("worked", 5): {key: scored(True, False) for key in frames}, ("silence", 5): frames}
+        fake(monkeypatch, {(*who, mission): made for who, made in arms.items() for mission in (False, True)})
+        gain = compare.compare(contenders(), [5]).gains[0]
+        assert gain.count == 12
+        intervals.append((gain.low, gain.gain, gain.high))
+    assert intervals[0] == pytest.approx(intervals[1])
+    assert intervals[0][0] < intervals[0][1] < intervals[0][2]
 
 
 def test_every_policy_is_compared_with_the_first_and_not_with_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
