@@ -76,7 +76,11 @@ def _lines(rows: CampaignRows, folder: Path, pictures: dict[str, bool]) -> Itera
         f"seed {plan.campaign.seed}, Sortie {plan.code}. {_intervals(rows)}"
     )
     if (stop := plan.campaign.stop_when) is not None and _stopped(rows):
-        yield f"`stop_when` ended it: the interval of {stop.metric} is narrow enough."
+        yield (
+            f"`stop_when` ended it: the interval of {stop.metric} is narrow enough. It is a little too narrow, because stopping "
+            "there favours samples that look less spread than they are, the more so the smaller `at_least` is (here "
+            f"{stop.at_least})."
+        )
     if left := rows.all.num_rows - rows.table.num_rows:
         yield f"{left} of the runs are left out of all that follows: their {plan.unit} is not finished at every grid point."
     yield from _lost(rows)
@@ -279,7 +283,7 @@ def _stopped(rows: CampaignRows) -> bool:
     enough = False
     for begin in range(0, count, size):
         enough = stop.enough(rows.all.slice(begin, size))
-    return enough and count < rows.plan.runs
+    return enough and rows.all["run"][-1].as_py() + 1 == count < rows.plan.runs
 
 
 def _some(rows: CampaignRows, metric: str, mask: NDArray[np.bool_] | None = None) -> str:

@@ -249,7 +249,30 @@ def test_a_campaign_that_knew_enough_says_so(tmp_path: Path) -> None:
     enough = "stop_when: {metric: bytes.data_sent, half_width: 1000000, at_least: 3}\n"
     folder = tmp_path / "a"
     run_campaign(plan(tmp_path, CAMPAIGN.replace("{count: 6}", "{count: 40}") + enough), folder, Pretended())
-    assert "`stop_when` ended it: the interval of bytes.data_sent is narrow enough." in write_report(folder).read_text()
+    told = write_report(folder).read_text()
+    assert (
+        "`stop_when` ended it: the interval of bytes.data_sent is narrow enough. It is a little too narrow, because"
+        in told
+    )
+    assert "the more so the smaller `at_least` is (here 3)." in told
+
+
+def test_a_campaign_with_a_gap_was_not_ended_by_stop_when(tmp_path: Path) -> None:
+    """Its driver looks at parts in their order, and has not come to those behind the gap."""
+    from sortie.sim.campaign.report import _stopped
+
+    text = CAMPAIGN.replace("{count: 6}", "{count: 40}")
+    text += "stop_when: {metric: bytes.data_sent, half_width: 1000000, at_least: 3}\n"
+    rows = rows_of(tmp_path, text, lambda fields, policy: 10.0 * fields["fleet.battery.initial_soc"] + policy)
+    size = rows.plan.shard
+    assert rows.table.num_rows > 3 * size
+
+    def of_parts(*parts: int) -> CampaignRows:
+        table = pa.concat_tables([rows.table.slice(k * size, size) for k in parts])
+        return CampaignRows(rows.plan, table, table["unit"].to_numpy(), np.zeros(table.num_rows, np.int64))
+
+    assert _stopped(of_parts(0, 1))
+    assert not _stopped(of_parts(0, 2))
 
 
 def test_a_rule_over_a_grid_is_judged_on_other_draws(tmp_path: Path) -> None:
