@@ -1,7 +1,7 @@
 """Trust in what peers claim: each claim is held against what the listener can check for itself.
 
 Coverage is held against the pose beside it (what its cameras can show from there) and against the payloads of its
-looks (who looks sees something), goodput against the payloads that arrived, and battery against the fleet's: no charge
+looks (who looks from above the roofs sees something), goodput against the payloads that arrived, and battery against the fleet's: no charge
 comes back, and no drone flies for nothing. A ground station may be on mains, so its charge need not fall.
 
 Doubts have to last: a judgement is made once a second, and only the second in a row that finds something lowers trust.
@@ -32,6 +32,8 @@ JUDGED_EVERY_S = 1.0
 # --- coverage
 FALSE_CELLS = 4
 """So many cells that cannot be so are a doubt, and so few cells of a drone that looks."""
+ROOFS_M = 20.0
+"""Lower than this a drone may see next to nothing: houses hide the ground from it."""
 
 # --- goodput
 LARGE_BYTES = 10_000
@@ -219,7 +221,7 @@ def discounted(d: Descriptor) -> Descriptor:
 def coverage_doubt(d: Descriptor, blur_m: float = 0.0, looks: bool = False, cameras: Cameras = USUAL) -> str:
     """What a coverage grid says that its pose or its payloads forbid; empty where it may be so.
 
-    How much is hidden from a drone, others cannot know. A drone that looks sees some of the ground.
+    How much is hidden from a drone, others cannot know. A drone that looks from above the roofs sees some of the ground.
 
     Args:
         d: the claim.
@@ -233,7 +235,7 @@ def coverage_doubt(d: Descriptor, blur_m: float = 0.0, looks: bool = False, came
 def _coverage_doubt(cells: _Cells, looks: bool) -> str:
     if cells.impossible >= FALSE_CELLS:
         return f"coverage: {cells.impossible} cells seen well that its cameras cannot show so"
-    if looks and cells.seen < FALSE_CELLS:
+    if looks and cells.is_high and cells.seen < FALSE_CELLS:
         return f"coverage: {cells.seen} cells seen by a drone that looks"
     return ""
 
@@ -244,6 +246,8 @@ class _Cells(NamedTuple):
     impossible: int
     """Seen well, where the drone's cameras cannot show it so from its pose."""
     seen: int
+    is_high: bool
+    """Whether the drone is above the roofs."""
 
 
 _COUNTED: dict[tuple[object, ...], _Cells] = {}
@@ -288,7 +292,7 @@ def _count(claims: Sequence[Descriptor], blur_m: float, cameras: Cameras) -> lis
             reach = 1 + math.ceil(flown_m / COVERAGE_CELL_M)  # a cell more: it may have turned since it looked
             near = binary_dilation(possible, np.ones((3, 3)), iterations=reach)
             impossible = int(np.count_nonzero(claimed & ~near))
-        found.append(_Cells(impossible, int(seen)))
+        found.append(_Cells(impossible, int(seen), d.position_m[2] >= ROOFS_M))
     return found
 
 

@@ -121,6 +121,11 @@ def test_a_drone_that_does_not_look_may_see_nothing() -> None:
     blind = honest(1)._replace(coverage_grid=bytes(64))
     assert coverage_doubt(blind) == ""
     assert coverage_doubt(blind, looks=True) == "coverage: 0 cells seen by a drone that looks"
+    x_m, y_m, _ = blind.position_m
+    low, high = (blind._replace(position_m=(x_m, y_m, z_m)) for z_m in (19.9, 20.0))
+    assert (coverage_doubt(low, looks=True), bool(coverage_doubt(high, looks=True))) == ("", True), (
+        "houses hide the ground"
+    )
 
 
 def test_a_footprint_does_not_excuse_a_grid() -> None:
