@@ -101,7 +101,7 @@ def source_of(share: Share, alone: Boxes | None, errors: BoxErrors | None = None
         alone = share.boxes
     if alone is None:
         assert tracks is not None  # noqa: S101 (what `is_detected` says)
-        cut = len(tracks) >= budget.MAX_TRACKS
+        cut = share.cut or len(tracks) >= budget.MAX_TRACKS
         return SourceBoxes(boxes_of(tracks), *where, cut, age_s, *motion_of(tracks, age_s))
     boxes, truncated = alone.inside(share.roi), False
     if share.representation == "tracks":

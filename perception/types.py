@@ -77,6 +77,8 @@ class Share(NamedTuple):
     """How uncertain the places of `boxes` are, where they are sent with covariances."""
     first: Disc | None = None
     """Cells in this disc are sent before all others (`perception.serve`); None: all by their rank."""
+    cut: bool = False
+    """Of a payload of tracks: it was full before the people in it were set aside, so weaker tracks may have been left out."""
 
     @property
     def is_map(self) -> bool:

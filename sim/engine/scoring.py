@@ -12,6 +12,7 @@ import simpy
 
 from sortie.fleet.agent import Agent
 from sortie.fleet.memory import Received
+from sortie.perception.budget import MAX_TRACKS
 from sortie.perception.classes import PERSON, vehicle_classes
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.motion import Tracks
@@ -44,7 +45,7 @@ def of_vehicles(share: Share) -> Share:
     tracks = share.tracks
     if tracks is None or not np.any(person := tracks.kind == PERSON):
         return share
-    return share._replace(tracks=tracks.take(~person))
+    return share._replace(tracks=tracks.take(~person), cut=len(tracks) >= MAX_TRACKS)
 
 
 Job = tuple[Capture, list[Share]]

@@ -16,6 +16,7 @@ from perception_examples import capture
 from recording_examples import small
 
 from sortie.perception import budget
+from sortie.perception.classes import CAR, PERSON
 from sortie.perception.joining import source_of
 from sortie.perception.motion import Tracks
 from sortie.perception.recordings.detector import RecordedDetector
@@ -26,6 +27,7 @@ from sortie.perception.tracking.following import motion_of_boxes
 from sortie.perception.types import Boxes, Share
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception, Scene, Target, Thermal
+from sortie.sim.engine.scoring import of_vehicles
 
 BARE = SceneModel(Scene(building_density=0.0, tree_density=0.0), None, (0.0, 0.0, 80.0, 80.0))
 
@@ -51,6 +53,15 @@ def test_as_many_tracks_as_a_payload_holds_may_have_been_more(n: int) -> None:
     share = Share(capture(), "tracks", 0.0, None, 0.5, tracks=tracks(n))
     source = source_of(share, None)
     assert len(source.boxes) == n
+    assert source.truncated == (n == budget.MAX_TRACKS)
+
+
+@pytest.mark.parametrize("n", [11, 12])
+def test_people_in_a_full_payload_of_tracks_do_not_hide_that_it_was_cut(n: int) -> None:
+    """A detector gets the cars alone; that a car is missing among them means nothing where the payload was full."""
+    kind = np.where(np.arange(n) < 3, PERSON, CAR).astype(np.int8)
+    source = source_of(of_vehicles(Share(capture(), "tracks", 0.0, None, 0.5, tracks=tracks(n, kind=kind))), None)
+    assert len(source.boxes) == n - 3
     assert source.truncated == (n == budget.MAX_TRACKS)
 
 
