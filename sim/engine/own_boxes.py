@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.types import Boxes, Capture
@@ -15,9 +16,14 @@ class OwnBoxes:
     it in flight at little more than what it costs at the end of a sortie.
     """
 
-    def __init__(self, detector: Detector, coming: Callable[[float], Iterable[Capture]]) -> None:
-        """Args: `coming` gives captures after a time that will probably be asked for; in flight they may turn out others."""
-        self._detector, self._coming = detector, coming
+    def __init__(
+        self, detector: Detector, coming: Callable[[float], Iterable[Capture]], *, one_by_one: bool = False
+    ) -> None:
+        """Args:
+        coming: gives captures after a time that will probably be asked for; in flight they may turn out others.
+        one_by_one: each capture is a call of its own, for a detector to which the drones of one call are peers.
+        """
+        self._detector, self._coming, self._one_by_one = detector, coming, one_by_one
         self._many = detector if isinstance(detector, DetectsMany) else None
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
         self._known: dict[Capture, Boxes] = {}
@@ -26,8 +32,10 @@ class OwnBoxes:
     def __call__(self, captures: Sequence[Capture]) -> list[Boxes]:
         """The boxes of each capture, ENU, best first."""
         if self._many is None:
+            begin = partial(partial, self._detector.detect) if self._ahead is None else self._ahead.begin
             jobs = [(capture, ()) for capture in captures]
-            return self._detector.detect(jobs) if self._ahead is None else self._ahead.begin(jobs)()
+            begun = [begin([job]) for job in jobs] if self._one_by_one else [begin(jobs)]
+            return [boxes for wait in begun for boxes in wait()]
         missing = [c for c in captures if c not in self._known]
         if missing:
             now_s = max(c.t_s for c in captures)

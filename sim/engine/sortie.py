@@ -237,7 +237,8 @@ def build(
 
     ahead = captures_ahead(scenario, capture_of)
     looking = detector.looks if isinstance(detector, LooksByAnother) else detector
-    own_boxes: OwnBoxesOf = TargetSeen(scene) if looking is None else OwnBoxes(looking, ahead)
+    zeros = scenario.perception.absent_peers == "zeros"  # all drones of one call are peers
+    own_boxes: OwnBoxesOf = TargetSeen(scene) if looking is None else OwnBoxes(looking, ahead, one_by_one=zeros)
     tracking = FleetTracking(scenario, people.with_people(own_boxes))
     agents = [
         Agent(
