@@ -298,7 +298,7 @@ class TorchDetector:
     def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
         maps = [s for s in shares if self._is_fused(s) and s.weight > 0.0]
-        silent = self._silent(ego, maps, now)
+        silent = self._silent(ego, maps, now) if maps or ego.looked else []
         out = self._fuse(ego, maps, silent, now, known) if maps or silent else None
         if out is not None:
             own = self._place(out, ego.est_pose)
@@ -309,7 +309,7 @@ class TorchDetector:
         else:
             own = self._place(self._head(known[ego].maps.result()[None]), ego.est_pose)
         late = [self._source(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
-        sources = EgoSources.of(ego, shares, own, out is not None, late)
+        sources = EgoSources.of(ego, shares, own, bool(maps) and out is not None, late)
         if any(s.covariance_m2 is not None for s in late):
             sources = sources._replace(errors=self.box_errors)
         return joined_many([sources], self._config.join, self._config.common_share)[0]

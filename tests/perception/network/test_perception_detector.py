@@ -145,6 +145,27 @@ def test_peers_of_whom_nothing_came_dilute_where_they_count_as_zeros(scene: Scen
     assert same(masked.detect(jobs)[0], TorchDetector(scene, Perception(), 1).detect(jobs)[0])
 
 
+@pytest.mark.parametrize(("looked", "score"), [(True, 0.4), (False, 0.8)])
+def test_boxes_beside_silent_peers_alone_are_not_fused_ones(looked: bool, score: float) -> None:
+    """No map came: a drone that looked and saw nothing votes with a weight of 1, one without a look does not vote."""
+    nothing, car = Boxes.empty(), Boxes.placed(np.array([(20.0, 0.0, 4.5, 1.9, 0.0, 0.8)]), (0.0, 0.0, 0.0))
+
+    class Silence(TorchDetector):
+        def __init__(self) -> None:
+            self._config, self._shares = Perception(unsent_cells="zero", absent_peers="zeros"), "features"
+
+        def _fuse(self, *_: object) -> torch.Tensor:
+            return torch.zeros(0)
+
+        def _place(self, *_: object) -> Boxes:
+            return nothing
+
+    ego, peer = cross(0.0, 0.0, 0.0)[:2]
+    ego, detections = ego._replace(looked=looked), Share(peer, "detections", 0.0, None, 1.0, boxes=car)
+    found = Silence()._detect_ego(ego, [detections], {0: ego, 1: peer}, {})
+    assert found.score.tolist() == pytest.approx([score])
+
+
 def test_cells_of_the_region_that_is_served_first_are_all_that_a_small_budget_sends(
     scene: SceneModel, fleet: list[Capture]
 ) -> None:
