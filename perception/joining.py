@@ -133,7 +133,7 @@ class EgoSources(NamedTuple):
     """Whether peers' maps were fused into those."""
     others: Sequence[SourceBoxes]
     age_s: float = 0.0
-    """From its own capture to the fusion."""
+    """From its own capture to the fusion; of a drone without a look, the age of the freshest map that was fused for it."""
     looked: bool = True
     """False: a drone without a look of its own. Its silence means nothing."""
     errors: BoxErrors | None = None
@@ -144,7 +144,9 @@ class EgoSources(NamedTuple):
         cls, ego: Capture, shares: Sequence[Share], own: Boxes, fused: bool, others: Sequence[SourceBoxes]
     ) -> EgoSources:
         """For a detector's job; `others` are the boxes of the shares that are not fused as maps."""
-        return cls(ego.est_pose, own, fused, others, own_age_s(ego, shares), ego.looked or fused)
+        maps_s = [s.age_s for s in shares if s.is_map and s.weight > 0.0]
+        age_s = own_age_s(ego, shares) if ego.looked else min(maps_s, default=0.0)
+        return cls(ego.est_pose, own, fused, others, age_s, ego.looked or fused)
 
     def sources(self) -> list[SourceBoxes]:
         """Its own boxes, if it has any, and those of the peers that count."""

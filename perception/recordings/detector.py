@@ -103,6 +103,8 @@ class RecordedDetector:
         own = suppress(own, NMS_IOU)
         late = [self._source(s) for s in weighted if not s.is_map]
         sources = EgoSources.of(ego, shares, own, bool(maps), late)._replace(pose=pose)
+        if not ego.looked:  # what it received has lost by its age
+            sources = sources._replace(age_s=0.0)
         return joined_many([sources], config.join)[0]
 
     def _sent(self, share: Share, now: Mapping[int, Capture]) -> Sent:

@@ -56,6 +56,21 @@ def test_an_ego_without_a_look_counts_where_maps_were_fused_for_it(looked: bool,
     assert len(found.sources()) == counts
 
 
+@pytest.mark.parametrize(
+    ("maps", "age_s"),
+    [([(1.0, 0.8), (0.5, 0.6)], 0.6), ([(1.0, 0.8), (0.0, 0.6)], 0.8), ([(0.0, 0.6)], 0.0), ([], 0.0)],
+)
+def test_fused_boxes_of_an_ego_without_a_look_are_as_old_as_the_freshest_map(
+    maps: list[tuple[float, float]], age_s: float
+) -> None:
+    """The weight and the age of each map; detections that are fresher still do not count."""
+    blind = capture()._replace(looked=False)
+    shares = [Share(capture(drone=1, t_s=5.0 - age), "features", 1.0, None, weight, age_s=age) for weight, age in maps]
+    shares.append(Share(capture(drone=2, t_s=4.9), "detections", 0.0, None, 1.0, age_s=0.1))
+    assert EgoSources.of(blind, shares, boxes_at((5.0, 5.0, 0.9)), True, []).age_s == age_s
+    assert EgoSources.of(blind._replace(looked=True), shares, Boxes.empty(), True, []).age_s == 0.0
+
+
 @pytest.mark.parametrize("rule", ["nms", "average"])
 def test_boxes_lose_by_their_whole_age_where_the_ego_has_no_look(rule: str) -> None:
     """There is no look of its own that they could be compared with, however late all of them are."""
