@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -121,9 +122,11 @@ class RecordedDetector:
         return Sent(frame, capture.drone, cells, self._pose(lies), share.weight, share.age_s)
 
     def _source(self, share: Share) -> SourceBoxes:
-        if not share.is_detected:
+        if share.boxes is not None or share.capture.drone >= self._recording.drones:  # of another network
             return source_of(share, None)
-        return source_of(share, self._sendable(self._alone(share.capture, self._pose(share.capture))))
+        pose = self._pose(share.capture)
+        alone = self._sendable(self._alone(share.capture, pose)) if share.is_detected else None
+        return replace(source_of(share, alone), pose=pose)
 
     def _sendable(self, boxes: Boxes) -> Boxes:
         """Those of a drone's boxes that it sends: in late fusion only confident ones."""

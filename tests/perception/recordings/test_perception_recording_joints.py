@@ -12,11 +12,12 @@ from recording_examples import score_map, small
 
 from sortie.perception.evaluation.contract import Exchange
 from sortie.perception.lateness import map_weight, reach_m, still_right
+from sortie.perception.motion import Tracks
 from sortie.perception.recordings.detector import RecordedDetector
 from sortie.perception.recordings.exchange import Sent, fusion_hash, received_boxes
 from sortie.perception.recordings.instrument import RecordedInstrument, content_hash, evaluate_recording, frames_of
 from sortie.perception.recordings.recording import RecordingError, open_recording
-from sortie.perception.types import Capture, Share
+from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 
@@ -81,6 +82,27 @@ def test_received_boxes_are_dropped_beyond_the_recorded_square(tmp_path: Path) -
     detector = flown(recorded(tmp_path / "r.npz", [[box(8.0), np.concatenate([box(84.0), box(86.0, 9.0)]), NONE]] * 3))
     found = detector.detect([(at(0), [Share(at(1), "detections", 0.0, None, 1.0)])])[0]
     assert sorted(found.xy_m[:, 0].tolist()) == pytest.approx([11.0, 104.0])
+
+
+@pytest.mark.parametrize(
+    ("of_peer", "score"),
+    [
+        ({"representation": "detections"}, 0.8),
+        ({"representation": "tracks", "tracks": Tracks.empty()}, 0.8),
+        (
+            {"representation": "detections", "boxes": Boxes.empty()},
+            0.4,
+        ),  # of another network, which flies as the sortie does
+    ],
+)
+def test_a_peer_that_sees_nothing_votes_in_the_square_about_its_recorded_pose(
+    of_peer: dict[str, Any], score: float, tmp_path: Path
+) -> None:
+    """The car lies a metre beyond the peer's recorded square, and a metre within the one about where the sortie has it."""
+    path = recorded(tmp_path / "r.npz", [[box(8.0, -101.4), NONE, NONE]] * 3)
+    share = Share(at(1), "detections", 0.0, None, 1.0)._replace(**of_peer)
+    found = flown(path, join="average").detect([(at(0), [share])])[0]
+    assert found.score.tolist() == pytest.approx([score])
 
 
 def test_only_boxes_above_the_threshold_and_one_of_each_car_are_found_or_sent(tmp_path: Path) -> None:
