@@ -88,7 +88,7 @@ class RecordedDetector:
     def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture]) -> Boxes:
         config, pose = self._config, self._pose(ego)
         at = (self._frame(ego), ego.drone)
-        if self._fuse is not None:
+        if self._fuse is not None and ego.looked:
             shares = weighed(ego, shares)
         weighted = [s for s in shares if s.weight > 0.0]
         for s in weighted:

@@ -142,6 +142,24 @@ def test_without_a_look_of_its_own_a_drone_has_what_its_peers_sent(tmp_path: Pat
         assert len(flown(path, **settings).detect([(blind, [])])[0]) == 0
 
 
+@pytest.mark.parametrize("own_fusion", [False, True])
+def test_without_a_look_of_its_own_what_a_late_map_brings_loses_by_its_age_once(
+    own_fusion: bool, tmp_path: Path
+) -> None:
+    """A fusion of one's own has no part in it, as there is no own map."""
+    (tmp_path / "f.py").write_text(TELLS)
+    maps = [np.stack([score_map(NONE)] * 3)] * 3
+    path = recorded(tmp_path / "r.npz", [[NONE, box(5.0), box(9.0)]] * 3, features=maps)
+    shares = [
+        Share(at(1, 0.2), "features", 1.0, None, 1.0, age_s=0.0),
+        Share(at(2, 0.0), "features", 1.0, None, 0.5, age_s=0.2),
+    ]
+    settings = {"recorded_fusion": f"{tmp_path / 'f.py'}:tell"} if own_fusion else {}
+    found = flown(path, **settings).detect([(at(0, 0.2, looked=False), shares)])[0]
+    left = float(still_right(reach_m(np.array([[4.5, 1.9]])), 0.2)[0])
+    assert found.score.tolist() == pytest.approx([0.8, 0.8 * 0.5 * left])
+
+
 def test_a_late_map_weighs_less_in_a_fusion_of_one_s_own_beside_the_own_look(tmp_path: Path) -> None:
     """Weights arrive in order, the ego's first; what was not sent takes part as zeros or not, as asked."""
     (tmp_path / "f.py").write_text(TELLS)
