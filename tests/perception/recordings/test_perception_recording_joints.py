@@ -158,6 +158,11 @@ def test_without_a_look_of_its_own_what_a_late_map_brings_loses_by_its_age_once(
     found = flown(path, **settings).detect([(at(0, 0.2, looked=False), shares)])[0]
     left = float(still_right(reach_m(np.array([[4.5, 1.9]])), 0.2)[0])
     assert found.score.tolist() == pytest.approx([0.8, 0.8 * 0.5 * left])
+    shares.append(Share(at(1, 0.2), "detections", 0.0, None, 1.0))
+    beside = flown(path, **settings).detect(
+        [(at(0, 0.2, looked=False), [s for s in shares if s.weight < 1.0 or not s.is_map])]
+    )[0]
+    assert beside.score.tolist() == pytest.approx([0.8, 0.8 * 0.5 * left]), "nor once more beside fresh boxes"
 
 
 def test_a_late_map_weighs_less_in_a_fusion_of_one_s_own_beside_the_own_look(tmp_path: Path) -> None:
