@@ -334,10 +334,10 @@ class _Members(NamedTuple):
         fresh_m2, late_m2 = moving_m2(freshest_s, of), moving_m2(age_s, of)
         precise = still + (1.0 - still) * np.minimum(fresh_m2 / late_m2, 1.0)
         left = still + (1.0 - still) * np.minimum(within(reach, late_m2) / within(reach, fresh_m2), 1.0)
-        alone = off_m == 0.0
+        is_anchor = anchor == np.arange(len(anchor))
         given = ~np.isnan(self.known_m2)
         precise = np.where(given, np.minimum(variance_m2(freshest_s, of) / self.known_m2, 1.0), precise)
-        return precise, np.where(given | alone, self.left, left)
+        return precise, np.where(given | is_anchor, self.left, left)
 
 
 def _averaged(boxes: Boxes, of: _Members, sources: Sequence[SourceBoxes], freshest_s: float) -> Boxes:

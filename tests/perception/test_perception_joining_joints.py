@@ -81,6 +81,18 @@ def test_boxes_lose_by_their_whole_age_where_the_ego_has_no_look(rule: str) -> N
     assert found.score == pytest.approx(0.8 * still_right(reach_m(lone.size_m), 0.7), rel=1e-5)
 
 
+def test_a_late_box_exactly_on_the_fresh_one_counts_as_one_beside_it() -> None:
+    """That it lies there tells that the car stands, a tenth of a millimetre off as well."""
+    own = boxes_at((20.0, 0.0, 0.6))
+    exact, close = (
+        joined_many(
+            [EgoSources(HERE, own, False, [SourceBoxes(boxes_at((x, 0.0, 0.9)), 1.0, HERE, age_s=1.0)])], "average"
+        )[0].score[0]
+        for x in (20.0, 20.0001)
+    )
+    assert exact == pytest.approx(close, rel=1e-5)
+
+
 def test_a_known_variance_stays_with_its_box_however_boxes_are_sorted() -> None:
     """A place counts by score and inverse variance beside the fresh one; the best box is not the first that came."""
     own = boxes_at((20.0, 0.0, 0.6), (-20.0, 0.0, 0.5))
