@@ -1,7 +1,8 @@
 """HOTA, higher order tracking accuracy: how well cars are detected (DetA) and keep their identity (AssA). Free of torch.
 
 J. Luiten et al., *HOTA: A Higher Order Metric for Evaluating Multi-Object Tracking*, IJCV 129, 2021, as their program
-TrackEval works it out. The similarity of a track's box and a car is their rotated IoU on the ground, as for AP.
+TrackEval works it out. The similarity of a track's box and a car is their rotated IoU on the ground, as for AP. Only boxes
+of one class match.
 """
 
 from __future__ import annotations
@@ -42,11 +43,13 @@ class Followed(NamedTuple):
     """[n] the frame of each, ≥ 0; a frame is one sequence's at one moment."""
     identity: Ints
     """[n] whose box it is, ≥ 0; no two sequences share one, and no two boxes of a frame."""
+    kind: NDArray[np.int8]
+    """[n] its class, as `TargetClass`."""
 
     def by_frame(self) -> Followed:
         """The same, frame by frame."""
         order = np.argsort(self.frame, kind="stable")
-        return Followed(self.boxes[order], self.frame[order], self.identity[order])
+        return Followed(*(column[order] for column in self))
 
 
 def hota(cars: Followed, tracks: Followed) -> Hota | None:
@@ -57,7 +60,7 @@ def hota(cars: Followed, tracks: Followed) -> Hota | None:
 _PAIR = np.dtype(
     [("i", "i8"), ("j", "i8"), ("frame", "i8"), ("car", "i8"), ("track", "i8"), ("iou", "f8"), ("share", "f8")]
 )
-"""A car and a track box of one frame that overlap."""
+"""A car and a track box of one frame and one class that overlap."""
 
 
 def hota_of(blocks: Iterable[tuple[Followed, Followed]]) -> Hota | None:
@@ -104,7 +107,7 @@ def _pairs(cars: Followed, tracks: Followed) -> NDArray[np.void]:
     """Those of a block, and the share of each in what overlaps with its two boxes."""
     first = min(cars.frame.min(initial=np.iinfo(np.int64).max), tracks.frame.min(initial=np.iinfo(np.int64).max))
     i, j, iou = overlapping(cars.boxes, tracks.boxes, cars.frame - first, tracks.frame - first)
-    some = iou > 0.0
+    some = (iou > 0.0) & (cars.kind[i] == tracks.kind[j])
     i, j, iou = i[some], j[some], iou[some]
     total = np.bincount(i, iou, len(cars.frame))[i] + np.bincount(j, iou, len(tracks.frame))[j] - iou
     pairs = np.empty(len(i), _PAIR)

@@ -54,7 +54,8 @@ def _followed(tables: Mapping[str, pa.Table], drones: int, end_s: float) -> Iter
         keys = list(zip(t_s[here].tolist(), drone[here].tolist(), strict=True))
         frames = (first + instant) * drones + drone[here]  # of each fusion
         there, frame = _vehicles(columns_of(truths.before(until_s)), keys, frames)
-        cars = Followed(_as_rows(there), frame, there["car"].astype(np.int64) * drones + frame % drones)
+        identity = there["car"].astype(np.int64) * drones + frame % drones
+        cars = Followed(_as_rows(there), frame, identity, kinds_of(there))
         found, frame = _vehicles(columns_of(detections.before(until_s)), keys, frames)
         told = []
         for k, now_s in enumerate(instants.tolist(), first):
@@ -96,4 +97,4 @@ def _step(
     tracks, next_id, _ = step(tracks, boxes, frame[here] % drones, looks_s, next_id)
     seen = tracks.take(tracks.confirmed & (tracks.seen_s == np.nanmax(looks_s)))
     rows = np.column_stack([seen.xy_m, seen.size_m, seen.yaw_rad])
-    return tracks, next_id, Followed(rows, k * drones + seen.owner, seen.id * drones + seen.owner)
+    return tracks, next_id, Followed(rows, k * drones + seen.owner, seen.id * drones + seen.owner, seen.kind)

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from sortie.perception.classes import CAR, TRUCK
 from sortie.perception.metrics.hota import Followed, hota
 from sortie.perception.metrics.overlap import iou_pairs
 
@@ -26,9 +27,9 @@ def flat(sequences: list[Sequence], which: int) -> Followed:
         for identity, box in frame[which].items()
     ]
     if not rows:
-        return Followed(np.zeros((0, 5)), np.zeros(0, np.int64), np.zeros(0, np.int64))
+        return Followed(np.zeros((0, 5)), *np.zeros((2, 0), np.int64), np.zeros(0, np.int8))
     boxes, frame_of, who = zip(*rows, strict=True)
-    return Followed(np.array(boxes), np.array(frame_of), np.array(who))
+    return Followed(np.array(boxes), np.array(frame_of), np.array(who), np.full(len(who), CAR, np.int8))
 
 
 def judged(*sequences: Sequence) -> tuple[float, float, float]:
@@ -63,6 +64,18 @@ def test_the_pair_that_fits_over_the_whole_sequence_is_matched_though_another_ov
     frames = [*frames, ({0: car(0)}, {5: car(0.2), 6: car(0.0)})]
     # IoU 3.8 / 4.2 = 0.905, right at 18 limits: ten of eleven boxes, and all ten of one track
     assert judged(frames)[1:] == pytest.approx((18 / 19 * 10 / 11, 18 / 19))
+
+
+def test_a_track_of_another_class_on_a_car_is_a_miss_and_a_false_positive() -> None:
+    """Two vehicles are followed in full, the second as what it is not: one hit of three."""
+    frames: Sequence = [({0: car(0), 1: car(50)}, {5: car(0), 6: car(50)})] * 4
+    there, told = flat([frames], 0), flat([frames], 1)
+    trucks = told._replace(kind=np.where(told.identity == 6, TRUCK, CAR).astype(np.int8))
+    value = hota(there, trucks)
+    assert value is not None
+    assert (value.det_a, value.ass_a) == pytest.approx((1 / 3, 1.0))
+    right = hota(there._replace(kind=np.where(there.identity == 1, TRUCK, CAR).astype(np.int8)), trucks)
+    assert right == pytest.approx((1.0, 1.0, 1.0))
 
 
 def test_no_car_has_no_hota() -> None:

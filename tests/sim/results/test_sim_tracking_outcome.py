@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from sortie.perception.classes import CAR, TRUCK
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Capture
@@ -58,6 +59,23 @@ def test_cars_that_change_places_cost_association_and_no_detection() -> None:
     before, after = tracking_outcome(record), tracking_outcome(other)
     assert after["ass_a"] < 0.8 * before["ass_a"]
     assert after["det_a"] == pytest.approx(before["det_a"], rel=0.1)
+
+
+def test_a_vehicle_that_is_taken_for_one_of_another_class_is_not_followed() -> None:
+    record = flown()
+    truths = record.tables["truths"]
+    found, classes = as_seen(truths), [np.full(truths.num_rows, kind, np.int8) for kind in (CAR, TRUCK)]
+
+    def judged(there: np.ndarray, told: np.ndarray) -> dict[str, float | None]:
+        tables = {
+            "truths": truths.append_column("kind", pa.array(there)),
+            "detections": found.append_column("kind", pa.array(told)),
+        }
+        return tracking_outcome(dataclasses.replace(record, tables={**record.tables, **tables}))
+
+    cars, trucks = classes
+    assert judged(cars, cars) == judged(trucks, trucks) == tracking_outcome(with_table(record, "detections", found))
+    assert judged(trucks, cars) == judged(cars, trucks) == {"hota": 0.0, "det_a": 0.0, "ass_a": 0.0}
 
 
 def test_without_identities_or_a_detector_there_is_none() -> None:
