@@ -311,7 +311,7 @@ class TorchDetector:
         late = [self._source(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
         sources = EgoSources.of(ego, shares, own, bool(maps) and out is not None, late)
         if any(s.covariance_m2 is not None for s in late):
-            sources = sources._replace(errors=self.box_errors)
+            sources = sources._replace(errors=self._own_errors)
         return joined_many([sources], self._config.join, self._config.common_share)[0]
 
     def _silent(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture]) -> list[Capture]:
@@ -385,6 +385,11 @@ class TorchDetector:
         """
         return load_errors(beside(self._weights, ERRORS), self._weights.name)
 
+    @cached_property
+    def _own_errors(self) -> BoxErrors | None:
+        """How uncertain an ego's own boxes are; None where nobody fitted it: they count with the usual one of their class."""
+        return self.box_errors if beside(self._weights, ERRORS).is_file() else None
+
     def _map_pose(self, share: Share, now: Mapping[int, Capture]) -> Pose:
         """The pose that places a share's map in the world."""
         capture = share.capture if self._config.motion_compensation else now.get(share.capture.drone, share.capture)
@@ -398,7 +403,7 @@ class TorchDetector:
             cut = share.representation != "raw" and _is_ranked(share)
             boxes = self._sendable(self._place(out, lies))
             return SourceBoxes(boxes, share.weight, lies, part[1], cut, share.age_s)
-        errors = self.box_errors if share.representation == "uncertain_boxes" else None
+        errors = self.box_errors if share.representation == "uncertain_boxes" and share.errors is None else None
         if not share.is_detected:
             return source_of(share, None, errors)
         alone = known[share.capture].boxes

@@ -137,6 +137,11 @@ class SurrogateDetector:
         """
         return load_errors(beside(self._path, ERRORS), self._path.name)
 
+    @cached_property
+    def _own_errors(self) -> BoxErrors | None:
+        """How uncertain an ego's own boxes are; None where nobody fitted it: they count with the usual one of their class."""
+        return self.box_errors if beside(self._path, ERRORS).is_file() else None
+
     def detect(self, jobs: Sequence[Job]) -> list[Boxes]:
         """Each ego's boxes from its own look and the shares it received, ENU, best first."""
         return list(self.detect_many([jobs]))
@@ -240,14 +245,14 @@ class SurrogateDetector:
                 source_of(
                     s,
                     alone.get(s.capture) if s.is_detected else None,
-                    self.box_errors if s.representation == "uncertain_boxes" else None,
+                    self.box_errors if s.representation == "uncertain_boxes" and s.errors is None else None,
                 )
                 for s in shares
                 if not s.is_map and s.weight > 0.0
             ]
             of = EgoSources.of(ego, shares, own, f or m in leads, others)
             exact = any(s.covariance_m2 is not None for s in others)
-            sources.append(of._replace(errors=self.box_errors) if exact else of)
+            sources.append(of._replace(errors=self._own_errors) if exact else of)
         out = joined_many(sources, self._config.join, self._config.common_share)
         return BoxColumns(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
 

@@ -15,9 +15,12 @@ from sortie.perception.files import ERRORS, beside
 from sortie.perception.intersection import intersect, inverse
 from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
 from sortie.perception.lateness import MOVING, SPEED_MPS
+from sortie.perception.scene.scene_model import SceneModel
+from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.training.box_errors import Errors, calibration, common, errors_of, fit
 from sortie.perception.types import Boxes, Share
 from sortie.perception.uncertainty import BoxErrors, errors_text, load_errors, terms
+from sortie.scenarios.schema import Perception, Scene
 
 HERE = (0.0, 0.0, 0.0)
 FLAT = BoxErrors((np.log(0.6), 0, 0, 0, 0), (np.log(0.3), 0, 0, 0, 0), common=0.2)
@@ -165,6 +168,21 @@ def test_a_share_brings_the_covariances_of_its_senders_boxes() -> None:
     assert source_of(share._replace(representation="detections"), alone, FLAT).covariance_m2 is None
     with pytest.raises(InputError, match="does not tell how uncertain its boxes are: let policies send detections"):
         source_of(share, alone)
+
+
+def test_a_receiver_without_fitted_errors_joins_uncertain_boxes_of_another_network(tmp_path: Path) -> None:
+    """Its own boxes have the usual covariance of their class; boxes of its own network cannot be sent with one."""
+    seen = SceneModel(Scene(), None, (-50.0, -50.0, 50.0, 50.0))
+    detector = SurrogateDetector(seen, Perception(detector="surrogate"), 1)
+    detector._path = tmp_path / "net.safetensors"
+    own, peer = cross(0.0, 0.0, 0.0)[:2]
+    alone = detector.detect([(own, [])])[0]
+    theirs = boxes(*((*alone.xy_m[0] + 0.3, 0.5), (30, 40, 0.5)))
+    share = Share(peer, "uncertain_boxes", 0.0, None, 1.0, boxes=theirs, errors=FITTED)
+    sources = EgoSources(own.est_pose, alone, False, [source_of(share, None)])
+    assert detector.detect([(own, [share])])[0].xy_m.tolist() == joined_many([sources], "average")[0].xy_m.tolist()
+    with pytest.raises(InputError, match=r"nobody fitted how uncertain the boxes of net\.safetensors are"):
+        detector.detect([(own, [share._replace(boxes=None, errors=None)])])
 
 
 def test_a_box_with_its_covariance_has_36_bytes() -> None:

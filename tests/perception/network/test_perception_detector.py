@@ -2,7 +2,10 @@
 
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,12 +17,13 @@ from sortie.perception.budget import cells_sent
 from sortie.perception.detectors import make_detector
 from sortie.perception.errors import InputError
 from sortie.perception.ground_truth import ground_truth
-from sortie.perception.joining import source_of
+from sortie.perception.joining import EgoSources, joined_many, source_of
 from sortie.perception.metrics.ap import match
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene import render
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.perception.uncertainty import BoxErrors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception, Scene, Target
 
@@ -164,6 +168,30 @@ def test_boxes_beside_silent_peers_alone_are_not_fused_ones(looked: bool, score:
     ego, detections = ego._replace(looked=looked), Share(peer, "detections", 0.0, None, 1.0, boxes=car)
     found = Silence()._detect_ego(ego, [detections], {0: ego, 1: peer}, {})
     assert found.score.tolist() == pytest.approx([score])
+
+
+def test_weights_without_fitted_errors_join_uncertain_boxes_of_another_network(tmp_path: Path) -> None:
+    """The ego's own box has the usual covariance of its class."""
+    car = Boxes.placed(np.array([(20.0, 0.0, 4.5, 1.9, 0.0, 0.8)]), (0.0, 0.0, 0.0))
+    theirs, errors = replace(car, xy_m=car.xy_m + np.float32(0.3)), BoxErrors((-0.7, 0, 0, 0, 0), (-1.5, 0, 0, 0, 0))
+
+    class Alone(TorchDetector):
+        def __init__(self) -> None:
+            self._config, self._shares, self._weights = Perception(), "features", tmp_path / "net.safetensors"
+
+        def _head(self, *_: object) -> torch.Tensor:
+            return torch.zeros(0)
+
+        def _place(self, *_: object) -> Boxes:
+            return car
+
+    ego, peer = cross(0.0, 0.0, 0.0)[:2]
+    share = Share(peer, "uncertain_boxes", 0.0, None, 1.0, boxes=theirs, errors=errors)
+    maps: Future[torch.Tensor] = Future()
+    maps.set_result(torch.zeros(0))
+    found = Alone()._detect_ego(ego, [share], {0: ego, 1: peer}, {ego: SimpleNamespace(boxes=None, maps=maps)})  # type: ignore[dict-item]
+    wanted = joined_many([EgoSources(ego.est_pose, car, False, [source_of(share, None)])], "average")[0]
+    assert same(found, wanted)
 
 
 def test_cells_of_the_region_that_is_served_first_are_all_that_a_small_budget_sends(
