@@ -207,11 +207,11 @@ class SurrogateDetector:
         queries: list[Job] = [(ego, shares) for ego, shares, _ in jobs]
         for m, lead in leads.items():
             rest = [s for s in queries[m][1] if s is not lead]
-            queries[m] = lead.capture, [s._replace(weight=s.weight / lead.weight) for s in rest]
+            laid = lead.capture if self._config.motion_compensation else _believed_now(lead.capture, jobs[m][2])
+            queries[m] = laid, [s._replace(weight=s.weight / lead.weight) for s in rest]
         queries += [(c, ()) for c in late]
-        captures = list(
-            dict.fromkeys(c for ego, shares in queries for c in (ego, *(s.capture for s in shares if s.is_map)))
-        )
+        seen = [c for ego, shares in queries for c in (ego, *(s.capture for s in shares if s.is_map))]
+        captures = list(dict.fromkeys([*seen, *(s.capture for s in leads.values())]))
         column = {c: i for i, c in enumerate(captures)}
         fleet = CaptureColumns.of(captures)
         looks = self._eyes.look(fleet)
@@ -360,6 +360,12 @@ class _Alarms:
 
     job: NDArray[np.intp]
     drawn: Floats
+
+
+def _believed_now(capture: Capture, now: dict[int, Capture]) -> Capture:
+    """A capture placed where its drone is now, if it is among these."""
+    x, y, yaw = now.get(capture.drone, capture).est_pose
+    return capture._replace(est_position_m=(x, y, capture.est_position_m[2]), est_yaw_rad=yaw)
 
 
 def _joined(parts: Sequence[BoxColumns]) -> BoxColumns:

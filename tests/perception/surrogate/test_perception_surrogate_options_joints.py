@@ -71,6 +71,20 @@ def test_without_compensation_a_late_map_lies_where_its_sender_believes_to_be_no
     assert equal(keeps.detect([(ego, [share])])[0], corrects.detect([(ego, [share])])[0])
 
 
+def test_without_compensation_the_map_that_leads_for_a_drone_without_a_look_lies_where_its_sender_is_now() -> None:
+    """As if it had believed so when it looked; the map that follows lies where it lay."""
+    blind, now = FLEET[0]._replace(looked=False), moved(FLEET[1], est_position_m=(31.5, 22.0, 60.0), est_yaw_rad=0.35)
+    late = moved(FLEET[1], t_s=4.6, position_m=(27.0, 19.0, 60.0), est_position_m=(27.5, 19.5, 60.0))
+    lead, follows = Share(late, "features", 0.3, None, 1.0), Share(FLEET[2], "features", 0.5, None, 0.4)
+    there = lead._replace(capture=moved(late, est_position_m=now.est_position_m, est_yaw_rad=now.est_yaw_rad))
+    keeps, corrects = detector(motion_compensation=False), detector()
+    for others in ([], [follows]):
+        found = keeps.detect([(blind, [lead, *others]), (now, [])])[0]
+        assert len(found) > 3
+        assert equal(found, corrects.detect([(blind, [there, *others])])[0])
+        assert not equal(found, corrects.detect([(blind, [lead, *others]), (now, [])])[0])
+
+
 def test_of_many_draws_of_everything_each_has_cars_of_its_own_that_are_hard_and_false_positives_of_its_own() -> None:
     """Where every car has one draw for all, which of them are found is the town's draw; one draw is the same twice."""
     none_shared = np.array([0.0, 1.0, 0.0, 0.0], np.float32)
