@@ -335,7 +335,14 @@ class TorchDetector:
     ) -> Tensor | None:
         """The head's output after fusion; None where no peer takes part in any cell."""
         peers = [
-            Peer(self._map_pose(s, now), s.weight, self._map(s, known).result(), self._sent(s, known)) for s in maps
+            Peer(
+                self._map_pose(s, now),
+                s.weight,
+                self._map(s, known).result(),
+                self._sent(s, known),
+                known[s.capture].maps.result(),
+            )
+            for s in maps
         ]
         peers += [Peer(capture.est_pose, 1.0) for capture in silent]
         own = known[ego].maps.result() if ego.looked else None

@@ -27,6 +27,8 @@ class Peer(NamedTuple):
     """[channels, n, n] on its own grid, as it is fused; None of a peer that sent none: zeros."""
     sent: Tensor | None = None
     """[64, 64] bool: the cells that came; None with a `map` of None."""
+    whole: Tensor | None = None
+    """Its own map, by which it answers a handshake, where `map` is what was read from the codes of some cells."""
 
 
 def fused_map(net: CarNet, pose: Pose, own: Tensor | None, peers: Sequence[Peer], unsent: UnsentCells) -> Tensor | None:
@@ -60,7 +62,8 @@ def fused_map(net: CarNet, pose: Pose, own: Tensor | None, peers: Sequence[Peer]
 
     if own is None:
         return _without_own(net, said, part[0, 1:], arrived, weight[0])
-    weight = net.fusion.weigh(own[None], torch.stack(theirs)[None], weight)
+    whole = [each if p.whole is None else p.whole for p, each in zip(peers, theirs, strict=True)]
+    weight = net.fusion.weigh(own[None], torch.stack(whole)[None], weight)
     return net.fusion.fuse(own, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
 
 
