@@ -49,7 +49,7 @@ class Followed(NamedTuple):
     def by_frame(self) -> Followed:
         """The same, frame by frame."""
         order = np.argsort(self.frame, kind="stable")
-        return Followed(*(column[order] for column in self))
+        return Followed(self.boxes[order], self.frame[order], self.identity[order], self.kind[order])
 
 
 def hota(cars: Followed, tracks: Followed) -> Hota | None:

@@ -32,9 +32,8 @@ class OwnBoxes:
     def __call__(self, captures: Sequence[Capture]) -> list[Boxes]:
         """The boxes of each capture, ENU, best first."""
         if self._many is None:
-            begin = partial(partial, self._detector.detect) if self._ahead is None else self._ahead.begin
-            jobs = [(capture, ()) for capture in captures]
-            begun = [begin([job]) for job in jobs] if self._one_by_one else [begin(jobs)]
+            calls = [[c] for c in captures] if self._one_by_one else [captures]
+            begun = [self._begin(call) for call in calls]
             return [boxes for wait in begun for boxes in wait()]
         missing = [c for c in captures if c not in self._known]
         if missing:
@@ -46,3 +45,7 @@ class OwnBoxes:
                 missing = list(dict.fromkeys([*missing, *next_ones]))
             self._known.update(zip(missing, self._many.detect_many([[(c, ())] for c in missing]), strict=True))
         return [self._known.pop(c) for c in captures]
+
+    def _begin(self, captures: Sequence[Capture]) -> Callable[[], list[Boxes]]:
+        jobs = [(capture, ()) for capture in captures]
+        return partial(self._detector.detect, jobs) if self._ahead is None else self._ahead.begin(jobs)
