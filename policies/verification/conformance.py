@@ -189,7 +189,10 @@ def _is_deterministic(policy: Policy, view: FleetView) -> str | None:
 def _reads_only_its_view(policy: Policy, view: FleetView) -> str | None:
     usual = _as_tuples(_decide(policy, view))
     try:
-        alone = _as_tuples(_decide(_alone(policy), view))  # type: ignore[arg-type]
+        try:
+            alone = _as_tuples(_decide(_alone(policy), view))  # type: ignore[arg-type]
+        except Refused:  # here it goes where no search can follow
+            alone = _as_tuples(_decide(confined(policy), view))
     except Reached as error:
         return str(error)
     return None if alone == usual else "decides differently if it can only use its view"

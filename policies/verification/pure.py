@@ -180,7 +180,7 @@ def _is_foreign(value: Any) -> bool:
 
 def is_trusted(home: str) -> bool:
     """Whether a module is one of Sortie's that policies are made of."""
-    return home == "sortie" or home.startswith(_TRUSTED)
+    return home in ("sortie", "sortie.policies") or home.startswith(_TRUSTED)
 
 
 def is_seeded(path: str) -> bool:
@@ -234,7 +234,7 @@ def cannot_call(function: Any) -> str | None:
     if isinstance(function, functools.partial):
         return cannot_call(function.func)
     if hasattr(function, "cache_info"):
-        return "keeps results (functools.cache)"
+        return None if is_trusted(str(function.__module__)) else "keeps results (functools.cache)"
     home = home_of(kind)
     if is_users(home) or kind is operator.itemgetter or isinstance(function, Enum):
         return None
