@@ -34,6 +34,7 @@ WRITTEN = frozenset(
     | {
         PAGE,
         "sortie.tlog",
+        "sortie.pcap",
         "bag/metadata.yaml",
         "bag/bag.mcap",
         "bag/foxglove_layout.json",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import subprocess
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 from sortie.perception.surrogate.model import SHIPPED as CALIBRATION
 from sortie.sim.check.expectations import check
 from sortie.sim.cli.app import app
+from sortie.sim.cli.export import export
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
@@ -126,11 +128,20 @@ def test_what_was_made_of_a_run_goes_with_it(tmp_path: Path) -> None:
     path = tmp_path / "run"
     run_folder.save(run_sortie(example("duration_s=1")), path, lambda folder: (folder / "sortie.rrd").write_text(""))
     alone = {p.name for p in path.iterdir()}
-    for made in (["report"], ["export", "--mcap"], ["export", "--tlog"]):
+    formats = [
+        f"--{p.name}"
+        for p in inspect.signature(export).parameters.values()
+        if p.annotation.startswith("Annotated[bool")
+    ]
+    assert "--pcap" in formats
+    for made in (["report"], *(["export", each] for each in formats)):
+        before = set(path.rglob("*"))
         done = CliRunner().invoke(app, [made[0], str(path), *made[1:]])
         assert done.exit_code == 0, done.output
+        new = {p.relative_to(path).as_posix() for p in set(path.rglob("*")) - before if p.is_file()}
+        assert new, made
+        assert new <= run_folder.WRITTEN, made
     (path / ".DS_Store").write_text("")
-    assert {p.name for p in path.iterdir()} - alone == {"report.html", "bag", "sortie.tlog", ".DS_Store"}
     page = (path / "report.html").read_text()
     run_folder.save(run_sortie(example("duration_s=0.5")), path, replace=True)
     assert {p.name for p in path.iterdir()} == alone - {"sortie.rrd"}
