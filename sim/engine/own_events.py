@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any, Protocol
 
 import numpy as np
@@ -83,18 +84,27 @@ class FleetHandle:
     def lose(self, drone: int, text: str = "fell silent") -> None:
         """Take a drone out of the air."""
         self._check(drone)
+        self._check_text(text)
         self._world.drain()
         if self._world.drones[drone].airborne:
             self._world.remove(drone, "drone_lost", text)
 
     def note(self, text: str, drone: int = -1) -> None:
         """Write a line among the sortie's events; drone −1 is the whole fleet."""
+        self._check(drone, first=-1)
+        self._check_text(text)
         self._world.note(drone, "own", text)
 
-    def _check(self, drone: int) -> None:
+    def _check(self, drone: int, first: int = 0) -> None:
         n = len(self._world.drones)
-        if not 0 <= drone < n:
-            raise PluginError(f"event {self._event.model}: drone {drone}, must be 0 … {n - 1}")
+        if not (isinstance(drone, Integral) and first <= drone < n):
+            must = f"must be a whole number, {first} … {n - 1}"
+            raise PluginError(f"event {self._event.model}: drone {drone!r:.60}, {must}")
+
+    def _check_text(self, text: object) -> None:
+        """The record holds text that UTF-8 can write."""
+        if not isinstance(text, str) or any("\ud800" <= letter <= "\udfff" for letter in text):
+            raise PluginError(f"event {self._event.model}: text {text!r:.60}, must be a str that UTF-8 can write")
 
 
 class OwnEvents:

@@ -17,6 +17,7 @@ from sortie.fleet.flight.viewpoints import Move
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Directive, Disc, FleetView, Reposition, Representation, TaskPhase
 from sortie.policies.verification.invariants import parse
+from sortie.scenarios.plugins.reference import PluginError
 from sortie.scenarios.schema import PolicyChange
 from sortie.sim.engine import sortie as engine
 from sortie.sim.engine.audit import Audit
@@ -368,6 +369,28 @@ def test_an_event_of_one_s_own_sees_the_drones_of_the_frame_and_weakens_a_link_o
     assert world._loss_db().sum() == 9.0
     its.set_loss_db(4.0)
     assert world._loss_db().tolist() == [[0.0, 4.0, 4.0], [4.0, 0.0, 4.0], [4.0, 4.0, 0.0]]
+
+
+@pytest.mark.parametrize("text", [5, None, b"storm", "half of a pair \ud800"])
+def test_an_event_of_one_s_own_writes_no_note_that_the_record_cannot_hold(text: Any) -> None:
+    world = _world()
+    its = FleetHandle(world, world._scenario, SimpleNamespace(model="mine"), 3)  # type: ignore[arg-type]
+    for act in (lambda: its.note(text), lambda: its.lose(0, text)):
+        with pytest.raises(PluginError, match=r"^event mine: text .+, must be a str that UTF-8 can write$"):
+            act()
+    assert world.drones[0].airborne
+    assert world._recorder.rows["events"] == []
+
+
+@pytest.mark.parametrize("drone", [-2, 3, 1.5, "a", None])
+def test_an_event_of_one_s_own_notes_something_of_the_fleet_or_of_a_drone_alone(drone: Any) -> None:
+    world = _world()
+    its = FleetHandle(world, world._scenario, SimpleNamespace(model="mine"), 3)  # type: ignore[arg-type]
+    with pytest.raises(PluginError, match=rf"^event mine: drone {drone!r}, must be a whole number, -1 … 2$"):
+        its.note("x", drone)
+    for fits in (-1, 2, np.int64(1)):
+        its.note("x", fits)
+    assert [row[1] for row in world._recorder.rows["events"]] == [-1, 2, 1]
 
 
 def test_a_phase_begins_with_its_frame_whatever_the_clock_rounds() -> None:

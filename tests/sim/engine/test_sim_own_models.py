@@ -143,7 +143,7 @@ def test_it_may_lose_a_drone_and_take_energy(models: str) -> None:
     [
         ("loss", r"^event mine.py:Storm: a loss of -1 dB, must be finite and ≥ 0$"),
         ("loss_nan", r"^event mine.py:Storm: a loss of nan dB, must be finite and ≥ 0$"),
-        ("drone", r"^event mine.py:Storm: drone 99, must be 0 … \d$"),
+        ("drone", r"^event mine.py:Storm: drone 99, must be a whole number, 0 … \d$"),
     ],
 )
 def test_what_an_event_may_not_do_is_refused(wrong: str, message: str, models: str) -> None:
