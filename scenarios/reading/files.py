@@ -14,8 +14,11 @@ from typing import Any
 from pydantic import BaseModel
 
 from sortie.scenarios.plugins.reference import is_file
+from sortie.scenarios.reading.call_text import read_call
 from sortie.scenarios.reading.explain import sections_of
-from sortie.scenarios.reading.strict_yaml import read_scalar
+from sortie.scenarios.reading.nodes import Node, ScenarioError, problems
+from sortie.scenarios.reading.nodes import plain as plain_value
+from sortie.scenarios.reading.strict_yaml import read_yaml
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import ModelName
 from sortie.scenarios.traces import located
@@ -38,9 +41,8 @@ MODELS = {
 changes of policy policies, events of kind `own` events, and `metrics` metrics."""
 
 
-_FUNCTION = re.compile(r"(.+)(:[^\W\d]\w*(?:\([^()]*\))?)")
-_CALLED = re.compile(r"(.*[^(\s])\s*\(((?:\s*[^\W\d]\w*\s*=[^=(),]+,?)*)\s*\)")
-"""A model's name, and `key=value, …` in brackets."""
+_FUNCTION = re.compile(r"(.+)(:[^\W\d]\w*)")
+_PARAMETER = re.compile(r"([^\W\d]\w*)\s*=\s*(.+)", re.DOTALL)
 _CALLABLE = frozenset(field.rpartition(".")[2] for field in MODELS) - {"name", "recorded_fusion"} | {"model"}
 
 
@@ -67,11 +69,23 @@ def without_brackets(sections: Any) -> Any:
         return sections
     plain = {k: v if str(k).endswith("params") else without_brackets(v) for k, v in sections.items()}
     for name in _CALLABLE & plain.keys():
-        called = _CALLED.fullmatch(plain[name]) if isinstance(plain[name], str) else None
-        if called is not None:
-            pairs = (part.partition("=") for part in called[2].split(",") if part.strip())
-            plain |= {name: called[1], params_of(name): {k.strip(): read_scalar(v.strip())[0] for k, _, v in pairs}}
+        model, parts = (read_call(plain[name]) if isinstance(plain[name], str) else None) or (None, [])
+        pairs = [_PARAMETER.fullmatch(part) for part in parts]
+        if model is not None and all(pairs):
+            plain |= {name: model, params_of(name): {p[1]: _value(f"{model}({p[0]})", p[2]) for p in pairs if p}}
     return plain
+
+
+def _value(source: str, text: str) -> object:
+    """A parameter's value, as YAML.
+
+    Raises:
+        ScenarioError: it is no YAML, or YAML that can be read in two ways, naming the source.
+    """
+    node = read_yaml(text, source, line=0) or Node(None, source, 0)
+    for issue in problems(node):
+        raise ScenarioError(str(issue))
+    return plain_value(node)
 
 
 def builtin(field: str) -> tuple[str, ...]:
@@ -195,5 +209,7 @@ def _given(sections: dict[str, Any], fields: Iterable[str]) -> Iterator[tuple[di
 
 def _split(text: str) -> tuple[str, str]:
     """`file.py:function` or `file.py:function(key=value)` as the file, and the rest with its colon; else a file alone."""
-    found = _FUNCTION.fullmatch(text)
-    return (found[1], found[2]) if found else (text, "")
+    called = read_call(text)
+    name = text if called is None else called[0]
+    found = _FUNCTION.fullmatch(name)
+    return (found[1], text[len(found[1]) :]) if found else (text, "")

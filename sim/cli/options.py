@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from sortie.policies.contract import PolicyError
+from sortie.scenarios.reading.call_text import split_at_commas
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli.console import err
@@ -43,16 +44,11 @@ def split_policies(text: str) -> list[str]:
     """Policies separated by commas; commas in brackets separate parameters.
 
     Raises:
-        PolicyError: none is named, or one is named twice.
+        PolicyError: a bracket is not closed, none is named, or one is named twice.
     """
-    names, depth = [""], 0
-    for letter in text:
-        depth += (letter == "(") - (letter == ")")
-        if letter == "," and depth == 0:
-            names.append("")
-        else:
-            names[-1] += letter
-    cleaned = [n.strip() for n in names if n.strip()]
+    cleaned = split_at_commas(text)
+    if cleaned is None:
+        raise PolicyError(f"policies {text!r}: a bracket is not closed, as in worked,best-2(received_budget=0.1)")
     if not cleaned:
         raise PolicyError("no policy named, as in --policies worked,all-4,silence")
     if len(set(cleaned)) < len(cleaned):

@@ -35,6 +35,7 @@ from sortie.sim.check.over_time import COURSES, Subject, TimeVerdict, judge_over
 from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import split_policies
 from sortie.sim.folders import RunError, write_text
+from sortie.sim.policy_text import name_and_params
 from sortie.sim.studies.overhead import SCENARIO, SECONDS, host_s, measure
 from sortie.sim.studies.plane_cost import machine
 
@@ -218,11 +219,9 @@ def _section(policy: str) -> PolicySection:
 
 def _called(reference: str, kind: str) -> tuple[str, Params]:
     """`name(key=value, …)` as the name and its parameters, written as in YAML."""
-    name, bracket, rest = reference.partition("(")
-    if bracket and not rest.endswith(")"):
-        raise RunError(f"{kind} {reference!r}: the bracket is not closed, as in best-2(received_budget=0.1)")
-    params = [f"policy.params.{p.strip()}" for p in rest[:-1].split(",") if p.strip()]
-    return name.strip(), loads("name: verify", overrides=params).policy.params
+    name, params = name_and_params(reference, kind)
+    overrides = [f"policy.params.{p}" for p in params or ()]
+    return name, loads("name: verify", overrides=overrides).policy.params
 
 
 def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant, ...]:

@@ -159,11 +159,33 @@ def test_parameters_in_brackets_stand_where_they_belong() -> None:
     assert named_files({"radio": {"link": "own.py:L(loss_db=3)"}}) == ["own.py"]
 
 
-@pytest.mark.parametrize("name", ["own.py:L(3)", "own.py:L(a=1", "own.py:L(a=(1))", "own.py:L(a=)", "(a=1)"])
+@pytest.mark.parametrize("name", ["own.py:L(3)", "own.py:L(a=1", "own.py:L(a=(1)", "own.py:L(a=)", "(a=1)"])
 def test_brackets_that_are_none_are_refused(name: str) -> None:
     assert without_brackets({"radio": {"link": name}}) == {"radio": {"link": name}}
     with pytest.raises(ScenarioError, match=r"^--set radio.link=.*, must be path/to/file.py:Name$"):
         loads("name: a", overrides=[f"radio.link={name}"])
+
+
+def test_values_in_brackets_are_yaml_with_lists_and_quoted_commas() -> None:
+    text = """own.py:L(speeds=[1, 2.5], name="a, b)", to={x: 1, y: 'c,d'}, said='it''s, so', who=it's)"""
+    params = {"speeds": [1, 2.5], "name": "a, b)", "to": {"x": 1, "y": "c,d"}, "said": "it's, so", "who": "it's"}
+    assert without_brackets({"radio": {"link": text}}) == {"radio": {"link": "own.py:L", "link_params": params}}
+    assert named_files({"radio": {"link": text}}) == ["own.py"]
+    moved = with_files({"radio": {"link": text}}, lambda name: f"/there/{name}")
+    assert moved == {"radio": {"link": f"/there/{text}"}}
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("yes", r"^own\.py:L\(a=yes\): yes, write true or false, or put it in quotes if it is text$"),
+        ("[1, .inf]", r"^own\.py:L\(a=\[1, \.inf\]\): 1: \.inf, must be a finite number$"),
+        ("'open", r"^own\.py:L\(a='open\): not YAML, "),
+    ],
+)
+def test_a_value_in_brackets_that_is_no_clear_yaml_is_named(value: str, message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        without_brackets({"radio": {"link": f"own.py:L(a={value})"}})
 
 
 def test_a_parameter_that_names_a_file_is_found_beside_the_scenario(

@@ -313,7 +313,7 @@ def test_a_policys_parameter_is_varied_for_each_of_them(tmp_path: Path) -> None:
         ),
         ("deputies(k=1)", "wurst-2", "9: policies.1: unknown policy 'wurst-2', did you mean worst-2? known: worked, "),
         ("deputies(k=1)", "deputies(q=1)", "9: policies.1: policy 'deputies' has no parameter 'q', it has: k, rho"),
-        ("deputies(k=1)", "deputies(k)", "9: policies.1: --set policy.params.k: must be key.path=value"),
+        ("deputies(k=1)", "deputies(k)", "9: policies.1: policy 'deputies(k)': 'k' in the bracket, must be key=value"),
         ("policies: [worked, deputies(k=1)]", "set: {policy.name: wirkt}", "3: base: unknown policy 'wirkt', known: "),
     ],
 )  # fmt: skip

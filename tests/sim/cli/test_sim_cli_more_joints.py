@@ -21,8 +21,10 @@ from sim_examples import BASE
 
 import sortie
 from sortie.perception.evaluation.condition import Sharing
+from sortie.policies.contract import PolicyError
 from sortie.policies.verification.invariants import Invariant
 from sortie.scenarios.intervals import Estimate
+from sortie.scenarios.reading.load import ScenarioError
 from sortie.sim.cli import console
 from sortie.sim.cli import paper as paper_command
 from sortie.sim.cli import verify as verify_command
@@ -653,3 +655,25 @@ def test_a_policy_that_is_named_wins_over_the_one_that_is_set(here: Path, capsys
 
 def test_commas_in_brackets_separate_parameters() -> None:
     assert split_policies(" a(x=1, y=f(2,3)) ,b, ") == ["a(x=1, y=f(2,3))", "b"]
+    assert split_policies("a(x=[1, 2], y='c, d)'),b") == ["a(x=[1, 2], y='c, d)')", "b"]
+    with pytest.raises(PolicyError, match=r"^policies 'a\(x=1,b': a bracket is not closed"):
+        split_policies("a(x=1,b")
+
+
+def test_quoted_commas_and_brackets_reach_a_policy_of_ones_own(here: Path) -> None:
+    name, params = "d (1)/own.py:decide", {"x": "a, b", "y": "(", "z": 2.5}
+    text = f"""{name}( x = "a, b", y='(', z=2.5, )"""
+    flown = loaded("s.yaml", [], text).policy
+    assert (flown.name, flown.params) == (name, params)
+    assert verify_command._called(text, "link") == (name, params)
+    with pytest.raises(ScenarioError, match=r"policy\.params\.x: a list of 2, must be a number, true, false or text$"):
+        loaded("s.yaml", [], f"{name}(x=[1, 2.5])")
+
+
+def test_what_is_wrong_in_the_bracket_of_a_policy_is_said_of_the_policy(here: Path) -> None:
+    for policy, message in (
+        ("best-2(0.1)", r"^policy 'best-2\(0.1\)': '0.1' in the bracket, must be key=value$"),
+        ("best-2(rho=[0.1)", r"^policy 'best-2\(rho=\[0.1\)': the bracket is not closed"),
+    ):
+        with pytest.raises(PolicyError, match=message):
+            loaded("s.yaml", [], policy)
