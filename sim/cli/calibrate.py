@@ -14,6 +14,7 @@ from sortie.policies.registry import resolve
 from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.report_text import points
 from sortie.sim.cli.console import out, stages
+from sortie.sim.cli.options import refuse
 from sortie.sim.folders import ensure_files
 from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means
 from sortie.sim.user_errors import user_errors
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 
 def calibrate(
+    context: typer.Context,
     out_file: Annotated[
         Path, typer.Option("--out", help="File for the calibration (safetensors); its card is written beside it.")
     ] = Path("runs/calibrate/surrogate.safetensors"),
@@ -49,6 +51,8 @@ def calibrate(
     ] = 1,
 ) -> None:
     """Fit the surrogate to the torch detector and evaluate it on held-out scenes. An interrupted run continues."""
+    if fly is None:
+        refuse(context, ("made", "policies", "rate_hz", "towns"), "--fly")
     from sortie.perception.surrogate.calibrate import calibrate as make  # here: torch takes a second to import
 
     chosen = [p.strip() for p in policies.split(",")]
@@ -57,8 +61,6 @@ def calibrate(
             resolve(p)
         if fly is not None and load_conditions(fly) is None:
             load(fly)
-        if made is not None and fly is None:
-            raise ValueError("--made goes with --fly: there is nothing else to do with it")
         if made is None:
             ensure_files(out_file)
     if made is None:

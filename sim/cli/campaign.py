@@ -41,6 +41,7 @@ app = typer.Typer(
 
 @app.command("run")
 def run(
+    context: typer.Context,
     campaign: Annotated[str, typer.Argument(help="A campaign file, or a library campaign's name.")],
     workers: Annotated[
         int | None,
@@ -54,7 +55,7 @@ def run(
         tuple[Path, Path, Path] | None,
         typer.Option(
             metavar="CA CERT KEY",
-            help="TLS with the scheduler: PEM files of the authority's certificate, your certificate, its key.",
+            help="With --scheduler: PEM files of the authority's certificate, your certificate, its key.",
         ),
     ] = None,
     worker_memory: Annotated[
@@ -67,7 +68,9 @@ def run(
     ] = None,
     wait_for_workers: Annotated[
         float,
-        typer.Option(metavar="SECONDS", help="How long to wait while a cluster has no workers.", min=0),
+        typer.Option(
+            metavar="SECONDS", help="With --scheduler: how long to wait while the cluster has no workers.", min=0
+        ),
     ] = 300.0,
     out_dir: Annotated[
         Path | None, typer.Option("--out", help="The campaign's folder; default: runs/campaign-NAME.")
@@ -84,9 +87,12 @@ def run(
         with ended_by_sigterm():
             from sortie._api import campaign_folder
             from sortie.scenarios.reading.campaign import load_campaign
+            from sortie.sim.cli.options import refuse
             from sortie.sim.folders import RunError
 
-            if scheduler is not None and workers is not None:
+            if scheduler is None:
+                refuse(context, ("security", "wait_for_workers"), "--scheduler")
+            elif workers is not None:
                 raise RunError("--workers and --scheduler: name one of them")
             name = load_campaign(campaign).campaign.campaign
             folder = out_dir or campaign_folder(name)

@@ -12,16 +12,20 @@ import typer
 import sortie
 from sortie.policies.registry import POLICIES
 from sortie.scenarios.reading.load import load_conditions
-from sortie.sim.cli.conditions import compare_conditions, refuse
+from sortie.sim.cli.conditions import compare_conditions
 from sortie.sim.cli.console import bars, out, stages
-from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded, split_policies
+from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded, refuse, split_policies
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
 from sortie.sim.studies.compare import Flown, chosen_seeds, in_town_of
 from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
 from sortie.sim.studies.multifidelity import METRICS
 
+PRECISE = ("metric", "pilot", "most_seeds", "kept")
+"""Options that go with --half-width."""
+
 
 def compare(
+    context: typer.Context,
     scenario: ScenarioArgument,
     policies: Annotated[
         str,
@@ -88,12 +92,9 @@ def compare(
     """Fly a scenario or a set of conditions under several policies with equal seeds and draws, and print the comparison."""
     conditions = load_conditions(scenario)
     if conditions is not None:
-        refuse(
-            {
-                "seed": seed, "seeds": seeds, "own-fusion": own_fusion or None, "recording": recording, "report": report, "readme": readme,
-                "half-width": half_width, "metric": metric, "pilot": pilot, "most-seeds": most_seeds, "kept": kept,
-            }
-        )  # fmt: skip
+        one = ("seeds", "own_fusion", "recording", "report", "readme", "half_width", *PRECISE)
+        refuse(context, ("seed",), "a scenario, not with a set of conditions: its file has its seeds")
+        refuse(context, one, "a scenario, not with a set of conditions")
         named = list(POLICIES) if policies == "all" else split_policies(policies)
         return compare_conditions(conditions, named, set_ or [], out_file, by_torch=by_torch)
     if by_torch:
@@ -115,9 +116,7 @@ def compare(
                 kept=kept or True,
             )  # fmt: skip
     else:
-        alone = {"metric": metric, "pilot": pilot, "most-seeds": most_seeds, "kept": kept}
-        if given := [name for name, value in alone.items() if value is not None]:
-            raise RunError(f"--{given[0]} goes with --half-width")
+        refuse(context, PRECISE, "--half-width")
         chosen = chosen_seeds(base, seed, seeds)
         with bars() as bar:
             each = {label: bar(label, len(chosen) * base.duration_s) for label in labels}

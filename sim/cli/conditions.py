@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -20,21 +20,9 @@ from sortie.scenarios.report_text import number, points, size
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import bars, out
 from sortie.sim.cli.options import SetOption
-from sortie.sim.folders import RunError, ensure_files, write_text
+from sortie.sim.folders import ensure_files, write_text
 from sortie.sim.studies.conditions import FIXED, Cell, best_fixed, fly_all, summarise
 from sortie.sim.studies.in_flight import torch_answers
-
-
-def refuse(options: Mapping[str, object]) -> None:
-    """Options of `sortie compare` that say nothing over a set of conditions, by name; None is not given.
-
-    Raises:
-        RunError: the first that is given.
-    """
-    for name, given in options.items():
-        if given is not None:
-            own = ": its file has its seeds" if name == "seed" else ""
-            raise RunError(f"--{name} goes with a scenario, not with a set of conditions{own}")
 
 
 def compare_conditions(

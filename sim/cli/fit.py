@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from sortie.sim.cli.console import out, stages
+from sortie.sim.cli.options import refuse
 from sortie.sim.folders import ensure_files, write_text
 from sortie.sim.user_errors import user_errors
 
@@ -67,6 +68,7 @@ def fit_codebook(
 
 @app.command("errors")
 def fit_errors(
+    context: typer.Context,
     boxes: Annotated[
         Boxes, typer.Argument(help="The detector whose boxes are fitted: the neural network or the surrogate.")
     ] = Boxes.torch,
@@ -78,10 +80,14 @@ def fit_errors(
             help="With surrogate: number of towns. The network's boxes are those of the validation split.", min=4
         ),
     ] = 60,
-    bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
+    bench_seed: Annotated[int, typer.Option(help="With torch: seed of the benchmark.", min=0)] = 0,
     bench_dir: BenchOption = Path("runs/bench"),
 ) -> None:
     """Fit how uncertain the places of boxes are, by score and distance, so that drones can send covariances."""
+    if boxes is Boxes.surrogate:
+        refuse(context, ("bench_seed", "bench_dir"), "sortie fit errors torch")
+    else:
+        refuse(context, ("towns",), "sortie fit errors surrogate")
     from sortie.perception.files import ERRORS, beside
     from sortie.perception.training import box_errors
     from sortie.perception.uncertainty import errors_text

@@ -17,7 +17,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
 from sortie.sim.cli.console import bars, err, out
-from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded
+from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded, refuse
 from sortie.sim.cli.view import view
 from sortie.sim.engine.watchers import Watcher, Watchers
 from sortie.sim.folders import RunError, settled
@@ -28,6 +28,7 @@ from sortie.sim.results.needs import ensure_room
 
 
 def fly(
+    context: typer.Context,
     scenario: Annotated[
         str | None,
         typer.Argument(help="A scenario file or a library scenario's name; leave it out with --from-campaign."),
@@ -82,6 +83,8 @@ def fly(
     ] = None,
 ) -> None:
     """Fly one sortie, print its outcome and save the run."""
+    if mavlink is None:
+        refuse(context, ("pace", "mavlink_key"), "--mavlink")
     if campaign is not None or run is not None:
         flown, seed, number, expected = again(campaign, run, (scenario, policy, seed, set_, replication))
         own = None
@@ -127,8 +130,6 @@ def fly(
 
 def _watching(live: bool, mavlink: str | None, pace: float, key: Path | None) -> Watchers:
     """The observers of a sortie. They are imported here because a viewer takes a third of a second to load."""
-    if key is not None and mavlink is None:
-        raise RunError("--mavlink-key without --mavlink: there is nothing to sign")
     watchers: list[Watcher] = []
     if live:
         from sortie.sim.playback.viewer import LiveViewer

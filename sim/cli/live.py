@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from sortie.sim.cli.console import err, out, stages
-from sortie.sim.cli.options import PolicyOption, SetOption, loaded
+from sortie.sim.cli.options import PolicyOption, SetOption, loaded, refuse
 from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.user_errors import user_errors
 
@@ -25,6 +25,7 @@ SHOWN = 20
 
 
 def live(
+    context: typer.Context,
     scenario: Annotated[str, typer.Argument(help="A scenario file or a library scenario's name.")] = "paper_replay",
     policy: PolicyOption = None,
     begin: Annotated[float, typer.Option(help="Time of the scenario at which the flight begins, s.", min=0)] = 0.0,
@@ -84,6 +85,8 @@ def live(
     Topics, types and QoS are those of ROS 2, so that its nodes can join: /fleet/context, /drone_0/to_drone_1/directive.
     Ctrl-C ends the flight and prints the measurements.
     """
+    if not mavlink:
+        refuse(context, ("origin", "mavlink_key"), "--mavlink")
     try:
         number = int(os.environ.get("ROS_DOMAIN_ID", "0")) if domain is None else domain
     except ValueError as error:
@@ -100,8 +103,6 @@ def live(
         from sortie.sim.live.session import fly_live
         from sortie.sim.live.watchdog import parse_fallback
 
-    if mavlink_key is not None and not mavlink:
-        raise RunError("--mavlink-key without --mavlink: there is no telemetry to check")
     ensure_files(out_file)
     with stages() as report:
         result = fly_live(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated
 
 import typer
@@ -11,6 +12,7 @@ from sortie.scenarios.reading.call_text import split_at_commas
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli.console import err
+from sortie.sim.folders import RunError
 from sortie.sim.policy_text import policy_overrides
 
 ScenarioArgument = Annotated[str, typer.Argument(help="A scenario file or a library scenario's name.")]
@@ -38,6 +40,23 @@ def loaded(scenario: str, set_: list[str] | None, policy: str | None) -> Scenari
             f"{policy} flies to the end: the changes and commands of {own.name} are its own policy's", soft_wrap=True
         )
     return flown
+
+
+def refuse(context: typer.Context, names: Collection[str], goes_with: str) -> None:
+    """Refuse options that do nothing in this call of a command.
+
+    Args:
+        context: the command's.
+        names: the options, as the command's parameters are called.
+        goes_with: what they do something with.
+
+    Raises:
+        RunError: one is given on the command line, naming it.
+    """
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name) if parameter.name in names else None
+        if source is not None and source.name == "COMMANDLINE":
+            raise RunError(f"{parameter.opts[0]} goes with {goes_with}")
 
 
 def split_policies(text: str) -> list[str]:

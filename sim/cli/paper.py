@@ -16,6 +16,7 @@ from sortie.perception.evaluation.condition import Absent, CellsBy, Serve, Ways
 from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow, differ_by_chance
 from sortie.perception.evaluation.verdict import ClaimVerdict
 from sortie.sim.cli.console import out, stages
+from sortie.sim.cli.options import refuse
 from sortie.sim.folders import RunError, ensure_between
 
 if TYPE_CHECKING:
@@ -81,6 +82,10 @@ def paper(
 
     Finished frames are kept, so an interrupted run continues.
     """
+    if frame is None:
+        refuse(context, ("ego", "show"), "--frame")
+    else:
+        refuse(context, ("against", "readme"), "the whole report, not with --frame")
     from sortie.perception.evaluation import figures, rows
     from sortie.perception.evaluation.results import TableSettings
     from sortie.perception.network.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
@@ -98,8 +103,6 @@ def paper(
             raise RunError(f"{name} is {value!r}, must be {' or '.join(allowed)}")
     given = {"temperature": temperature, "silent_weight": silent_weight}
     fusion_params = {name: value for name, value in given.items() if value != {"temperature": 1.0}.get(name, 0.0)}
-    if frame is not None and (readme is not None or against is not None):
-        raise RunError(f"--{'against' if readme is None else 'readme'} goes with the whole report, not with --frame")
     ensure_between(readme, report.BEGIN, report.END)
     try:
         ways = Ways(absent, serve)  # type: ignore[arg-type]

@@ -33,7 +33,7 @@ from sortie.sim.check.kits import KITS
 from sortie.sim.check.kits import verify as verify_model
 from sortie.sim.check.over_time import COURSES, Subject, TimeVerdict, judge_over_time
 from sortie.sim.cli.console import bars, err, out
-from sortie.sim.cli.options import split_policies
+from sortie.sim.cli.options import refuse, split_policies
 from sortie.sim.folders import RunError, write_text
 from sortie.sim.policy_text import name_and_params
 from sortie.sim.studies.overhead import SCENARIO, SECONDS, host_s, measure
@@ -42,6 +42,7 @@ from sortie.sim.studies.plane_cost import machine
 Kept = tuple[str, FleetView | None, Scenario]
 """What failed, a view that shows it if one alone does, and a scenario that flies it."""
 WRITTEN = "# A counterexample, written by sortie verify.\n"
+FOR_POLICIES = ("invariants", "drones", "budget", "views", "scenario", "courses", "flights", "out_dir")
 COLOURS = {
     "holds": "green", "fails": "red", "proved": "green", "proved over the reals": "green", "refuted": "red",
     "searched": "yellow", "drawn": "yellow",
@@ -49,6 +50,7 @@ COLOURS = {
 
 
 def verify(
+    context: typer.Context,
     model: Annotated[
         list[str],
         typer.Argument(
@@ -94,6 +96,7 @@ def verify(
     if len(model) > 2 or (model[0] in KITS and len(model) == 1):
         raise RunError(f"verify {' '.join(model)}, must be [KIND] REF, as in: sortie verify link houses.py:Blocked")
     if kind != "policy":
+        refuse(context, FOR_POLICIES, "policies")
         return _verify_model(kind, reference)
     policy, section = reference, _section(reference)
     flown = None if scenario is None else sortie.load(scenario)

@@ -14,9 +14,10 @@ from sortie.sim.user_errors import user_errors
 
 
 def worst(
+    context: typer.Context,
     folder: Annotated[Path, typer.Argument(help="A campaign's folder.")],
     metric: Annotated[str, typer.Argument(help="One of the campaign's metrics.")],
-    count: Annotated[int, typer.Option(help="How many runs to show.", min=1)] = 10,
+    count: Annotated[int, typer.Option(help="How many runs to show; at least those of --fly.", min=1)] = 10,
     policy: Annotated[str | None, typer.Option(help="Runs of this policy alone.")] = None,
     most: Annotated[
         bool | None,
@@ -30,7 +31,7 @@ def worst(
     with user_errors():
         from sortie.sim.campaign.worst import worst as find
 
-        found = find(folder, metric, count, policy, more_is_worse=most)
+        found = find(folder, metric, max(count, fly), policy, more_is_worse=most)
     table = Table(
         "run", "policy", *found.varied, metric, title="the most first" if found.more_is_worse else "the least first"
     )
@@ -46,4 +47,4 @@ def worst(
             markup=False,
         )
     for row in found.rows[:fly]:
-        fly_again(campaign=folder, run=row["run"], out_dir=folder / "worst" / f"run-{row['run']}")
+        fly_again(context, campaign=folder, run=row["run"], out_dir=folder / "worst" / f"run-{row['run']}")

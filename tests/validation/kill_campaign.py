@@ -109,7 +109,9 @@ def _trial(folder: Path, name: str, draw: random.Random, takes_s: float, whole: 
     victim, number = draw.choice(ENGINES[engine]), draw.choice([signal.SIGKILL, signal.SIGTERM])
     at_s, pick = draw.uniform(0, takes_s), draw.random()
     with _cluster(engine == "cluster") as (how, others):
-        driver = _command(folder, name, how if engine == "cluster" else ["--workers", engine])
+        driver = _command(
+            folder, name, [*how, "--wait-for-workers", "5"] if engine == "cluster" else ["--workers", engine]
+        )
         begin_s = time.monotonic()
         while time.monotonic() < begin_s + at_s or not (found := _victims(victim, driver.pid, others)):
             if driver.poll() is not None:
@@ -134,7 +136,7 @@ def _trial(folder: Path, name: str, draw: random.Random, takes_s: float, whole: 
 
 def _command(folder: Path, name: str, how: list[str]) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "sortie", "campaign", str(folder / "killed.yaml"), *how]
-    command += ["--out", str(folder / name), "--no-report", "--wait-for-workers", "5"]
+    command += ["--out", str(folder / name), "--no-report"]
     return subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
     )

@@ -122,8 +122,6 @@ def test_campaign(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         "5",
         "--worker-memory",
         "1.5",
-        "--wait-for-workers",
-        "7",
         "--out",
         "out",
         "--resume",
@@ -134,17 +132,17 @@ def test_campaign(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert seen.args == ("c.yaml",)
     given = {k: v for k, v in seen.kwargs.items() if k not in ("progress", "notice")}
     assert given == {
-        "out": Path("out"), "workers": 5, "scheduler": None, "security": None, "worker_memory_gb": 1.5, "wait_for_workers_s": 7.0,
+        "out": Path("out"), "workers": 5, "scheduler": None, "security": None, "worker_memory_gb": 1.5, "wait_for_workers_s": 300.0,
         "resume": True, "retry_failed": True,
     }  # fmt: skip
     seen._answer = sortie.CampaignResult(here / "out", 20, 0, 0, 90.0)
-    tls = ("--scheduler", "tcp://h:1", "--security", "ca.pem", "cert.pem", "key.pem")
+    tls = ("--scheduler", "tcp://h:1", "--security", "ca.pem", "cert.pem", "key.pem", "--wait-for-workers", "7")
     assert command("campaign", "run", "c.yaml", *tls, "--retry-failed", "--no-report") == 0
     assert "20 runs finished, none of them now" in capsys.readouterr().out
     given = {k: v for k, v in seen.kwargs.items() if k not in ("progress", "notice")}
     assert given == {
         "out": Path("runs/campaign-named"), "workers": None, "scheduler": "tcp://h:1",
-        "security": (Path("ca.pem"), Path("cert.pem"), Path("key.pem")), "worker_memory_gb": None, "wait_for_workers_s": 300.0,
+        "security": (Path("ca.pem"), Path("cert.pem"), Path("key.pem")), "worker_memory_gb": None, "wait_for_workers_s": 7.0,
         "resume": False, "retry_failed": True,
     }  # fmt: skip
 
@@ -170,6 +168,8 @@ def test_worst(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert "--from-campaign c --run 8 --view" in told
     command("campaign", "worst", "c", "m")
     assert (found.args, found.kwargs) == ((Path("c"), "m", 10, None), {"more_is_worse": None})
+    command("campaign", "worst", "c", "m", "--fly", "20")
+    assert found.args == (Path("c"), "m", 20, None), "all that fly are shown"
 
 
 def test_rank(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,5 +330,3 @@ def test_what_watches_a_flight_gets_its_options_and_every_second(here: Path, mon
             *(("close", name) for name in both),
         ]  # fmt: skip
     assert not fly._watching(False, None, 1.0, None)
-    with pytest.raises(sortie.RunError, match="--mavlink-key without --mavlink"):
-        fly._watching(True, None, 1.0, here / "key")

@@ -520,7 +520,7 @@ def test_a_key_that_is_none_is_named_and_not_told(content: bytes, tmp_path: Path
 
 def test_a_key_with_nothing_to_sign_is_named(tmp_path: Path) -> None:
     said = CliRunner().invoke(app, ["fly", "track_target", "--mavlink-key", str(tmp_path / "key")])
-    assert str(said.exception) == "--mavlink-key without --mavlink: there is nothing to sign"
+    assert str(said.exception) == "--mavlink-key goes with --mavlink"
     said = CliRunner().invoke(app, ["export", str(tmp_path), "--mcap", "--key", str(tmp_path / "key")])
     assert said.exit_code == 2
     assert "--key signs --tlog alone" in said.output

@@ -270,7 +270,7 @@ def test_a_key_needs_telemetry_and_an_owner(tmp_path: Path) -> None:
     path = tmp_path / "link.key"
     path.write_text(KEY.hex())
     done = CliRunner().invoke(app, ["live", "--mavlink-key", str(path)])
-    assert str(done.exception) == "--mavlink-key without --mavlink: there is no telemetry to check"
+    assert str(done.exception) == "--mavlink-key goes with --mavlink"
     path.chmod(0o644)
     done = CliRunner().invoke(app, ["live", "--mavlink", "udpin:127.0.0.1:0", "--mavlink-key", str(path)])
     assert "its mode is 644, must be 600" in str(done.exception)
