@@ -57,7 +57,7 @@ def sensor_errors(scenario: Scenario, positions_m: Array, seed: int, replication
         model = resolve("sensor", scenario.fleet.sensor, scenario.fleet.sensor_params)
         for drone in flying:
             rng = stream(seed, replication, drone, "own sensor")
-            errors[drone] = own_errors(model, times_s, np.array(positions_m[:, drone]), rng)
+            errors[drone] = own_errors(model, times_s, positions_m[:, drone], rng)
     for index, event in enumerate(scenario.events):
         if isinstance(event, PositionFault | HeadingFault | GnssLoss):
             for drone in [event.drone] if event.drone is not None else flying:
@@ -90,7 +90,7 @@ def _of_event(event: PositionFault | HeadingFault | GnssLoss, times_s: Array, rn
 
 def own_errors(model: OwnSensor, times_s: Array, positions_m: Array, rng: np.random.Generator) -> Array:
     """What a sensor of one's own returns for one drone, checked."""
-    given = checked_array("sensor", model, (len(times_s), COLUMNS), times_s.copy(), positions_m, rng)
+    given = checked_array("sensor", model, (len(times_s), COLUMNS), times_s, positions_m, rng)
     return scratch.copied(given)
 
 

@@ -6,6 +6,7 @@ Free of torch: a constructor imports what it needs when it is called, so that so
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
@@ -150,6 +151,13 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
                 raise PluginError(f"detector {found.name}: {what} returns {column} that is not finite")
         return made
 
+    def apart(jobs: Jobs) -> list[tuple[Capture, list[Share]]]:
+        """The jobs with copies of all arrays: the detector may change them, and other drones have received the same."""
+        names = ("tracks", "boxes", "people")
+        return [
+            (ego, [s._replace(**{n: deepcopy(getattr(s, n)) for n in names}) for s in shares]) for ego, shares in jobs
+        ]
+
     def checked(jobs: Jobs, several: Sequence[Any]) -> list[Boxes]:
         if len(several) != len(jobs) or not all(isinstance(each, Boxes) for each in several):
             raise PluginError(
@@ -163,17 +171,20 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
             raise PluginError(f"detector {found.name}: count_boxes returns {number!r:.60}, must be a whole number ≥ 0")
         return int(number)
 
-    found.detect = lambda jobs: checked(jobs, detect(jobs))
+    found.detect = lambda jobs: checked(jobs, detect(apart(jobs)))
     found.truth = lambda t_s, ego: boxes(truth(t_s, ego), "truth")
     found.count_boxes = counted
     if isinstance(made, DetectsAhead):
         begin = found.begin
 
         def begun(jobs: Jobs) -> Callable[[], list[Boxes]]:
-            finish = begin(jobs)
+            finish = begin(apart(jobs))
             return lambda: checked(jobs, checked_call("detector", finish))
 
         found.begin = begun
+    if isinstance(made, DetectsMany):
+        many = found.detect_many
+        found.detect_many = lambda moments: many([apart(jobs) for jobs in moments])
     detector: Detector = found
     return detector
 

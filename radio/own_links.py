@@ -92,5 +92,5 @@ def changed_snr(model: LinkModel, t_s: float, positions_m: FloatArray, snr_db: F
         PluginError: it fails, or returns another shape or a number that is not finite.
     """
     diagonal = np.eye(len(snr_db), dtype=bool)
-    given = checked_array("link", model.snr_db, snr_db.shape, t_s, positions_m.copy(), snr_db.copy(), left_out=diagonal)
+    given = checked_array("link", model.snr_db, snr_db.shape, t_s, positions_m, snr_db, left_out=diagonal)
     return np.where(diagonal, np.nan, given)

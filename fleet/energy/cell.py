@@ -164,7 +164,7 @@ def own_cell_v(model: OwnCell, soc: Array) -> Array:
     Raises:
         PluginError: it fails, or returns another shape, no voltage or a falling one.
     """
-    volts = checked_array("cell", model, soc.shape, soc.copy())
+    volts = checked_array("cell", model, soc.shape, soc)
     if volts.min() <= 0.0:
         k = int(volts.argmin())
         raise PluginError(f"cell {name_of(model)}: {volts[k]:g} V at a charge of {soc[k]:.3f}, must be above 0")

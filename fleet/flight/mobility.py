@@ -218,7 +218,7 @@ def positions_m(model: OwnMobility, times_s: Array, starts_m: Array, rng: np.ran
         PluginError: it fails, or returns what cannot be flown.
     """
     shape = (len(times_s), *starts_m.shape)
-    found = checked_array("mobility", model, shape, times_s.copy(), starts_m.copy(), rng)
+    found = checked_array("mobility", model, shape, times_s, starts_m, rng)
     name, frame_s = name_of(model), float(times_s[1] - times_s[0])
     low, high = np.array((-FAR_M, -FAR_M, 0.0)), np.array((FAR_M, FAR_M, FAR_M))
     wrong = ((found < low) | (found > high)).any(axis=-1)

@@ -164,7 +164,7 @@ def fleet_power_w(fleet: Fleet, motion: Trajectories) -> Array:
 
 def own_power_w(model: PowerModel, air_mps: Array, acceleration_mps2: Array, climb_mps: Array, mass_kg: Array) -> Array:
     """What a power model of one's own returns, checked."""
-    power_w = checked_array("power", model, climb_mps.shape, air_mps, acceleration_mps2, climb_mps.copy(), mass_kg)
+    power_w = checked_array("power", model, climb_mps.shape, air_mps, acceleration_mps2, climb_mps, mass_kg)
     if (power_w < 0.0).any():
         raise PluginError(f"power {name_of(model)}: returns {power_w.min():g} W, must be ≥ 0")
     return power_w

@@ -71,10 +71,10 @@ class SceneModel:
 
     @property
     def parked_cars(self) -> Cars:
-        """The parked cars inside `rect`."""
-        pose, size = self._parked_pose, self._parked_size
-        x, y, yaw = pose.T
-        return Cars(self._parked_ids, x, y, yaw, size[:, 0], size[:, 1], size[:, 2], self._parked_colour)
+        """The parked cars inside `rect`, in arrays that may be changed."""
+        (x, y, yaw), size = self._parked_pose.T.copy(), self._parked_size.copy()
+        ids, colour = self._parked_ids.copy(), self._parked_colour.copy()
+        return Cars(ids, x, y, yaw, size[:, 0], size[:, 1], size[:, 2], colour)
 
     def moving_cars(self, t_s: float) -> Cars:
         """The targets and the moving cars inside `rect` at `t_s`."""

@@ -196,10 +196,12 @@ def checked_array(
 ) -> NDArray[np.float64]:
     """Call a user's model, and check that it returns finite numbers of a shape, but for those left out.
 
+    The model gets copies of arrays, so that it may change them.
+
     Raises:
         PluginError: it fails, or returns no numbers, another shape or a number that is not finite.
     """
-    answer = checked_call(kind, function, *args)
+    answer = checked_call(kind, function, *(np.array(arg) if isinstance(arg, np.ndarray) else arg for arg in args))
     try:
         if answer is None or np.iscomplexobj(answer):  # NumPy would make them nan, and drop the imaginary part
             raise TypeError

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from perception_examples import EMPTY, capture
 
 from sortie.perception.detectors import make_detector
+from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.types import Boxes
+from sortie.perception.types import Boxes, Share
 from sortie.scenarios.plugins.reference import PluginError
-from sortie.scenarios.schema import Perception
+from sortie.scenarios.schema import Perception, Scene
 
 CODE = """
 import numpy as np
@@ -25,7 +28,22 @@ class Ahead:
         self.made_of, self.what = (scene, config, seed, replication), what
 
     def detect(self, jobs):
+        return self.spoil(jobs) if self.what == "spoils" else [Boxes.empty() for _ in jobs]
+
+    def spoil(self, jobs):
+        for _, shares in jobs:
+            for share in shares:
+                for name in ("tracks", "boxes", "people"):
+                    getattr(share, name).xy_m[:] = 99.0
         return [Boxes.empty() for _ in jobs]
+
+    def detect_many(self, moments):
+        return [boxes for jobs in moments for boxes in self.spoil(jobs)]
+
+    def truth_many(self, t_s, egos):
+        return []
+
+    calibration = "none"
 
     def begin(self, jobs):
         def finish():
@@ -88,6 +106,30 @@ def test_what_it_computes_in_the_background_is_checked(made: Callable[[str], Any
     finish = made(what).begin([(capture(), [])])
     with pytest.raises(PluginError, match=message):
         finish()
+
+
+@pytest.mark.parametrize("how", ["detect", "begin", "detect_many"])
+def test_it_cannot_change_what_other_drones_received(made: Callable[[str], Any], how: str) -> None:
+    found = made("spoils")
+    boxes = Boxes(np.zeros((1, 2)), np.ones((1, 2)), np.zeros(1), np.ones(1))
+    tracks = dataclasses.replace(Tracks.empty(), xy_m=np.zeros((1, 2)))
+    share = Share(capture(drone=1), "boxes", 0.0, None, 1.0, tracks=tracks, boxes=boxes, people=boxes)
+    jobs = [(capture(), [share])]
+    {"detect": found.detect, "begin": lambda j: found.begin(j)(), "detect_many": lambda j: found.detect_many([j])}[how](
+        jobs
+    )
+    assert not boxes.xy_m.any()
+    assert not tracks.xy_m.any()
+
+
+def test_parked_cars_stay_where_they_are_whatever_a_detector_does_to_them() -> None:
+    scene = SceneModel(Scene(), None, (-50.0, -50.0, 50.0, 50.0))
+    before = scene.cars_at(0.0)
+    parked = scene.parked_cars
+    for column in (parked.ids, parked.x_m, parked.y_m, parked.length_m, parked.colour):
+        column[:] = 99
+    assert len(before)
+    np.testing.assert_array_equal(scene.cars_at(0.0).table(), before.table())
 
 
 def test_its_truth_and_its_count_are_checked(made: Callable[[str], Any]) -> None:

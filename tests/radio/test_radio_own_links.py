@@ -95,6 +95,19 @@ def test_a_link_model_cannot_change_the_flight() -> None:
         own.advance()
 
 
+def test_a_path_loss_cannot_change_the_distances_that_antennas_and_jammers_use() -> None:
+    def by_kilometres(distance_m: Any, height_a_m: Any, height_b_m: Any, carrier_ghz: float) -> Any:
+        distance_m /= 1000.0
+        height_a_m += 1e3
+        height_b_m -= 1e3
+        return free_space_loss_db(np.maximum(1000.0 * distance_m, 1.0), carrier_ghz)
+
+    plain, own = (channel(STILL, antenna="dipole", path_loss=loss) for loss in ("free_space", by_kilometres))
+    assert_allclose(own.snr_db, plain.snr_db)
+    jammer = [((0.0, 0.0, 60.0), 20.0)]
+    assert_allclose(own.noise_rise_db(jammer), plain.noise_rise_db(jammer))
+
+
 def test_its_random_numbers_are_its_own_and_the_same_each_time() -> None:
     class Random(Less):
         def __init__(self, drones: int, frame_s: float, rng: np.random.Generator) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from sortie.scenarios import scratch
@@ -458,6 +459,18 @@ def test_what_is_left_out_need_not_be_finite_and_the_rest_must_be() -> None:
         checked_array("link", lambda: given[:, ::-1], (2, 2), left_out=out)
     with pytest.raises(PluginError, match="must be finite"):
         checked_array("link", lambda: given, (2, 2))
+
+
+def test_a_model_gets_arrays_that_it_may_change() -> None:
+    given = np.arange(4.0)[None]
+
+    def changes(first: NDArray[np.float64], second: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
+        first *= factor
+        second[:] = 0.0
+        return first
+
+    assert checked_array("power", changes, (4,), given[0], given, 2.0).tolist() == [0.0, 2.0, 4.0, 6.0]
+    assert given.tolist() == [[0.0, 1.0, 2.0, 3.0]]
 
 
 def test_a_built_in_name_is_never_a_plug_in_s(monkeypatch: pytest.MonkeyPatch) -> None:

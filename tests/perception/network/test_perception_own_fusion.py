@@ -48,6 +48,10 @@ infinite = lambda agents, takes_part, weight: agents[:, 0] / 0.0
 whole = lambda agents, takes_part, weight: agents[:, 0].int()
 def fails(agents, takes_part, weight):
     raise KeyError("ego")
+def changes(agents, takes_part, weight):
+    for given in (agents, takes_part, weight):
+        given.zero_()
+    return agents[:, 0]
 """
 
 
@@ -113,6 +117,12 @@ def test_weights_keep_what_a_fusion_learned_and_need_it(models: str, tmp_path: P
         InputError, match=r"tensor fusion\.model\.layer\.weight has shape \[80, 80, 1, 1\], must be \[8"
     ):
         load_weights(path, OwnFusion(name, {"channels": 8}))
+
+
+def test_a_fusion_cannot_change_the_maps_and_the_weights_of_others(models: str) -> None:
+    given = torch.ones(1, 2, 3, 4, 4), torch.ones(1, 2, 4, 4, dtype=torch.bool), torch.ones(1, 2)
+    assert not OwnFusion(f"{models}:changes")(*given).any()
+    assert all(bool(each.all()) for each in given)
 
 
 def fused(reference: str, params: dict[str, object]) -> torch.Tensor:
