@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 
 _PIECE = re.compile(r"""(?<![^=,:(\[{\s])(?:"(?:\\.|[^"\\])*"|'(?:''|[^'])*')|.""", re.DOTALL)
 """A quoted text, where a value may begin; else one letter."""
@@ -16,17 +17,11 @@ def split_at_commas(text: str) -> list[str] | None:
         >>> split_at_commas("a(x=1, y=[2, 3]), b='c, d'")
         ['a(x=1, y=[2, 3])', "b='c, d'"]
     """
-    parts, open_brackets = [""], list[str]()
-    for piece in _PIECE.findall(text):
-        if piece in _CLOSING:
-            open_brackets.append(piece)
-        elif piece in _CLOSING.values() and (not open_brackets or _CLOSING[open_brackets.pop()] != piece):
-            return None
-        if piece == "," and not open_brackets:
-            parts.append("")
-        else:
-            parts[-1] += piece
-    return None if open_brackets else [part.strip() for part in parts if part.strip()]
+    marks = _marks(text)
+    if marks is None:
+        return None
+    parts = (text[begin + 1 : end].strip() for begin, end in pairwise((-1, *marks[0], len(text))))
+    return [part for part in parts if part]
 
 
 def read_call(text: str) -> tuple[str, list[str]] | None:
@@ -38,8 +33,21 @@ def read_call(text: str) -> tuple[str, list[str]] | None:
         >>> read_call("all-4(received_budget=0.1)"), read_call("d (x)/own.py:f(y=2)"), read_call("silence")
         (('all-4', ['received_budget=0.1']), ('d (x)/own.py:f', ['y=2']), None)
     """
-    for at, letter in enumerate(text) if text.endswith(")") else ():
-        name, parts = text[:at].rstrip(), split_at_commas(text[at + 1 : -1]) if letter == "(" else None
-        if name and parts is not None:
-            return name, parts
-    return None
+    _, opens = _marks(text) or ([], -1)
+    name = text[: max(opens, 0)].rstrip()
+    return (name, split_at_commas(text[opens + 1 : -1]) or []) if name and text[opens] == "(" else None
+
+
+def _marks(text: str) -> tuple[list[int], int] | None:
+    """Where commas stand outside of brackets and quotes, and where the bracket opens that ends the text, else −1."""
+    commas, unclosed, opens = list[int](), list[int](), -1
+    for found in _PIECE.finditer(text):
+        piece, at, opens = found[0], found.start(), -1
+        if piece in _CLOSING:
+            unclosed.append(at)
+        elif piece in _CLOSING.values():
+            if not unclosed or _CLOSING[text[opens := unclosed.pop()]] != piece:
+                return None
+        elif piece == "," and not unclosed:
+            commas.append(at)
+    return None if unclosed else (commas, opens)

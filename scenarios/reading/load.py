@@ -171,8 +171,12 @@ def validated(root: Node, model: type[Model]) -> Model:
     """The tree as a frozen model. Raises ScenarioError, with the first of its issues."""
     found = {issue.path: issue for issue in problems(root)}
     try:
+        sections = without_brackets(plain(root))
+    except ScenarioError as error:
+        raise ScenarioError(f"{root.source}: {error}") from error
+    try:
         # through JSON, where strict still lets a list be a tuple and a whole number a float
-        made = model.model_validate_json(json.dumps(without_brackets(plain(root))), strict=True)
+        made = model.model_validate_json(json.dumps(sections), strict=True)
     except ValidationError as error:
         for issue in explain(error, root, model):
             above = (found.get(issue.path[:n]) for n in range(len(issue.path) + 1))

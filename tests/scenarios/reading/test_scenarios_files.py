@@ -186,6 +186,8 @@ def test_values_in_brackets_are_yaml_with_lists_and_quoted_commas() -> None:
 def test_a_value_in_brackets_that_is_no_clear_yaml_is_named(value: str, message: str) -> None:
     with pytest.raises(ScenarioError, match=message):
         without_brackets({"radio": {"link": f"own.py:L(a={value})"}})
+    with pytest.raises(ScenarioError, match=f"^s.yaml: {message[1:]}"):
+        loads(f'name: a\nradio: {{link: "own.py:L(a={value})"}}', "s.yaml")
 
 
 def test_a_parameter_that_names_a_file_is_found_beside_the_scenario(
