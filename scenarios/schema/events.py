@@ -112,7 +112,7 @@ class CameraBlocked(BaseEvent):
 
 class SlowPerception(BaseEvent):
     kind: Literal["slow_perception"]
-    drone: DroneId = Field(description="Whose features and boxes are ready later.")
+    drone: DroneId = Field(description="The drone with features and boxes that are ready later.")
     until_s: float | None = Field(None, ge=0, description="When it ends; left out, never.")
     extra_s: float = Field(0.2, gt=0, le=10, description="Added to the time from sensing to features ready to send.")
 

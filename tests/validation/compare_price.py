@@ -193,7 +193,7 @@ def tables() -> dict[str, Table]:
             costs, "Planned for ±1 AP point in both gains. Processor time; a seed is three sorties.",
         ),
         "price_gains": Table(
-            [Column("gain over `worked`"), Column("correlation", ".2f"), Column("of the first eight", ".2f"), Column("predicted variance", ".0f", " %", 100),
+            [Column("gain over `worked`"), Column("correlation", ".2f"), Column("correlation in the first eight seeds", ".2f"), Column("predicted variance", ".0f", " %", 100),
              Column("cost ratio for this gain alone", ".2f"), Column("deviation between seeds", ".1f", factor=100), Column("by torch alone", **points),  # type: ignore[arg-type]
              Column("with the surrogate", **points)],  # type: ignore[arg-type]
             gains, about,
