@@ -57,7 +57,7 @@ def open_engine(
             yield cluster
         return
     if security is not None:
-        raise RunError("--security: needs --scheduler")
+        raise RunError("--security goes with --scheduler")
     count = max(1, workers)
     processes = Processes(count, machine_memory_b() // count if memory_b is None else memory_b)
     try:

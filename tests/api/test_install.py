@@ -91,6 +91,7 @@ def test_the_projects_own_tests_run_and_so_do_its_scenarios(project: Path) -> No
     assert "2 passed" in run(project, "-m", "pytest", "-p", "no:cacheprovider")
 
 
+@pytest.mark.slow
 def test_a_policy_that_imports_the_projects_own_package_flies(project: Path) -> None:
     done = run(
         project, "-m", "sortie", "fly", "mine.yaml", "--policy", "mine.py:decide", "--no-recording", "--out", "runs/a"

@@ -122,6 +122,7 @@ def test_conditions_are_put_under_the_instrument() -> None:
     assert under(Sharing(0.1), "masked", "norm") == Sharing(0.1, unsent="masked", cells_by="norm")
 
 
+@pytest.mark.slow
 def test_frames_left_out_are_the_whole_test_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SIZES, "test", (2, 1))
     first = bench_frames(0, 1, tmp_path)

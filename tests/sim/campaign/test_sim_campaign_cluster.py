@@ -220,7 +220,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tu
         ),
         (
             lambda ours, theirs: ["--workers", "0", "--security", *ours],
-            "--security: needs --scheduler",
+            "--security goes with --scheduler",
         ),
         (
             lambda ours, theirs: ["--scheduler", "tls://127.0.0.1:1", "--security", ours[0], "nowhere.pem", ours[2]],

@@ -44,6 +44,7 @@ with limited(None):
 """
 
 
+@pytest.mark.slow
 @LINUX
 def test_allocations_beyond_the_limit_fail_and_only_those() -> None:
     said = subprocess.run([sys.executable, "-c", TAKES], check=True, capture_output=True, text=True).stdout

@@ -223,6 +223,7 @@ def test_a_broken_golden_outcome_is_named_and_replaced(tmp_path: Path, text: str
     assert differences(path, {"a": 1}) == {}
 
 
+@pytest.mark.slow
 def test_another_sortie_than_the_files_own_is_never_its_golden_outcome(tmp_path: Path) -> None:
     path = tmp_path / "short.yaml"
     path.write_text(SHORT)
@@ -296,6 +297,7 @@ def test_yaml_of_other_projects_loads_nothing_heavy(tmp_path: Path) -> None:
     assert not {"torch", "numpy", "pyarrow", "pydantic", "simpy"} & set(loaded)
 
 
+@pytest.mark.slow
 def test_a_new_project_with_one_yaml_passes_and_fails_as_it_should(tmp_path: Path) -> None:
     """A user's project: pytest, the installed package, scenario files, one of them broken, and YAML of others."""
     (tmp_path / "good.yaml").write_text(SHORT + EXPECT.splitlines()[1] + "\n" + EXPECT.splitlines()[2] + "\n")

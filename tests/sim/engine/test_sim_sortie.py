@@ -44,8 +44,20 @@ def test_the_same_sortie_twice_is_the_same_record(base: SortieRecord) -> None:
 WITH_NANS = {"descriptors", "directives", "mission", "transmissions"}  # NaN ≠ NaN; the fingerprint compares their bytes
 
 
-@pytest.mark.parametrize("kernels", ["", "Haswell", pytest.param("Prescott", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("extra", [[], ["perception.detector=surrogate", "radio.shadowing_distance_m=30"]])
+SURROGATE = ["perception.detector=surrogate", "radio.shadowing_distance_m=30"]
+
+
+@pytest.mark.parametrize(
+    ("extra", "kernels"),
+    [
+        ([], ""),
+        (SURROGATE, "Haswell"),
+        *(
+            pytest.param(extra, kernels, marks=pytest.mark.slow)
+            for extra, kernels in (([], "Haswell"), ([], "Prescott"), (SURROGATE, ""), (SURROGATE, "Prescott"))
+        ),
+    ],
+)
 def test_another_process_gives_the_same_fingerprint_whatever_matrix_kernels_its_machine_has(
     extra: list[str], kernels: str, base: SortieRecord
 ) -> None:

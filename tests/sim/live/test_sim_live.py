@@ -289,6 +289,7 @@ def test_the_bench_counts_every_topic(flown: Flown) -> None:
 # --- loss, interruption, options ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", path_without(tmp_path, "pymavlink"))  # no drone has a vehicle
     scenario, told = tmp_path / "s.yaml", tmp_path / "told" / "live.json"

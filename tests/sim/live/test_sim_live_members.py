@@ -43,6 +43,7 @@ def test_a_drone_that_starts_late_is_shared_with_and_shares() -> None:
     assert "drone 1: its process started" in "\n".join(describe_changes(result))
 
 
+@pytest.mark.slow
 def test_a_drone_that_was_killed_comes_back_and_is_believed() -> None:
     """Its counters begin above those that it used before."""
     result = fly_live(

@@ -175,6 +175,7 @@ def test_the_fallback_is_a_safe_rung() -> None:
         fly_live(example(), decide_within_s=2.0)
 
 
+@pytest.mark.slow
 def test_a_drone_flies_on_as_its_policy_dies(tmp_path: Path) -> None:
     """Drone 0's policy dies at its eleventh decision of the live flight; the flight in simulation has another process."""
     (tmp_path / "mine.py").write_text(
