@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sortie.policies.verification.pure import HEAP, home_of, is_trusted
+from sortie.policies.verification.pure import HEAP, home_of, is_own_cache
 from sortie.policies.verification.source_checks import RESERVED
 from sortie.policies.verification.symbols import Refused
 from sortie.scenarios.plugins.user_code import is_users
@@ -145,7 +145,7 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
         found = [value.__func__]
     elif isinstance(value, property):
         found = [value.fget, value.fset]
-    elif home_of(type(value)) in _UNCHANGING or (hasattr(value, "cache_info") and is_trusted(str(value.__module__))):
+    elif home_of(type(value)) in _UNCHANGING or is_own_cache(value):
         found = []
     elif hasattr(value, "__wrapped__") or hasattr(value, "cache_info"):
         raise Refused("keeps results from one decision to the next (functools)")

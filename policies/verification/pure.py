@@ -183,6 +183,11 @@ def is_trusted(home: str) -> bool:
     return home in ("sortie", "sortie.policies") or home.startswith(_TRUSTED)
 
 
+def is_own_cache(value: Any) -> bool:
+    """Whether this is a function of Sortie's own that keeps results (`functools.cache`)."""
+    return hasattr(value, "cache_info") and is_trusted(str(value.__module__))
+
+
 def is_seeded(path: str) -> bool:
     """Whether this is a random generator with a seed of its own."""
     return path in _SEEDED
@@ -234,7 +239,7 @@ def cannot_call(function: Any) -> str | None:
     if isinstance(function, functools.partial):
         return cannot_call(function.func)
     if hasattr(function, "cache_info"):
-        return None if is_trusted(str(function.__module__)) else "keeps results (functools.cache)"
+        return None if is_own_cache(function) else "keeps results (functools.cache)"
     home = home_of(kind)
     if is_users(home) or kind is operator.itemgetter or isinstance(function, Enum):
         return None

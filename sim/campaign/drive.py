@@ -135,8 +135,7 @@ class Stop:
             if unit != self._unit:
                 self._close()
                 self._unit = unit
-            if value is not None:
-                self._open[self._plan.policies.index(label)].append(value)
+            self._open[self._plan.policies.index(label)].append(math.nan if value is None else value)
         if rows["run"][-1].as_py() + 1 == self._plan.runs:
             self._close()
         compared = self._means[1:] if rule.difference else self._means
@@ -146,9 +145,9 @@ class Stop:
         return all(mean_interval(m, within, rule.confidence).reaches(rule.half_width) for m in compared)
 
     def _close(self) -> None:
-        means = [float(np.mean(v)) if v else math.nan for v in self._open]
-        for kept, value in zip(self._means, means, strict=True):
-            value -= means[0] if self._rule is not None and self._rule.difference else 0.0
-            if not math.isnan(value):
-                kept.append(value)
+        first, paired = self._open[0], self._rule is not None and self._rule.difference
+        for kept, values in zip(self._means, self._open, strict=True):
+            of_scenes = [v - f for v, f in zip(values, first, strict=True)] if paired else values
+            if known := [v for v in of_scenes if not math.isnan(v)]:
+                kept.append(float(np.mean(known)))
         self._open = [[] for _ in self._open]

@@ -45,7 +45,7 @@ def of_vehicles(share: Share) -> Share:
     tracks = share.tracks
     if tracks is None or not np.any(person := tracks.kind == PERSON):
         return share
-    return share._replace(tracks=tracks.take(~person), cut=len(tracks) >= MAX_TRACKS)
+    return share._replace(tracks=tracks.take(~person), cut=share.cut or len(tracks) >= MAX_TRACKS)
 
 
 Job = tuple[Capture, list[Share]]

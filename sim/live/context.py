@@ -155,8 +155,7 @@ class ReplaySenses:
         mission = scenario.mission
         self._scene = SceneModel(scenario.perception.scene, mission.target, trace.bounds, mission.more_targets)
         self._cameras = cameras_of(scenario.fleet)[drone]
-        station = scenario.fleet.station(drone)
-        blind = (0,) if station is not None and not station.camera else ()
+        blind = (0,) if drone in scenario.fleet.without_camera else ()
         self._flight = FlightSenses(
             trace.motion, scenario.frame_s, self._scene.height_field, [self._cameras], blind=blind
         )

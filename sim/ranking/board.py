@@ -103,7 +103,7 @@ def sentences(ranked: Ranked) -> Iterator[str]:
         "[dim]AP: average precision in the mission region in conditions with one, else in the full scene; 0 where a policy "
         "failed. Intervals cover conditions, each with its own town and draws. A place is a range where the paired "
         "differences, corrected for all pairs, do not separate policies. found, seen: share of the time with boxes on the "
-        "target, share of the region in view. unsafe: decisions of a sortie after which a drone with a low battery sent maps, "
+        "target, share of the region in view. unsafe: decisions of a sortie after which a drone with a low battery sent more than boxes, "
         "or told no peer of the target in its region. verified: what `sortie verify` finds. decides: median time of a "
         "decision on this machine.[/dim]"
     )

@@ -7,12 +7,12 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import numpy as np
 from rich.table import Table
 
 from sortie.scenarios.report_text import number, percent, points, size, table
 from sortie.sim.results.summary import PLURAL
 from sortie.sim.studies.compare import BLOCK_S, BY_BOTH, Compared, Flown, Gain
+from sortie.sim.studies.conditions import mean_of_known
 from sortie.sim.studies.multifidelity import Precision
 
 BEGIN, END = "<!-- compare:begin -->", "<!-- compare:end -->"
@@ -85,7 +85,7 @@ def explanations(flown: Flown) -> Iterator[str]:
             yield f"[bold]{policy}[/bold]: sent nothing; every drone saw with its own eyes only"
             continue
         parts = ", ".join(f"{percent(n / total)} {fate}" for fate, n in sorted(fates.items(), key=lambda f: -f[1]))
-        age = _mean(s.outcome["data_age_s"]["p50"] for s in sorties)
+        age = mean_of_known(s.outcome["data_age_s"]["p50"] for s in sorties)
         fused = "nothing fused" if age is None else f"fused data {age:.2f} s old at the median"
         yield f"[bold]{policy}[/bold]: {total} payloads{in_all}, {parts}; {fused}"
 
@@ -152,7 +152,7 @@ def side_by_side(flown: Flown) -> dict[str, list[str]]:
 
     def mean(*path: str, text: Callable[[Any], str]) -> list[str]:
         values = [[_at(s.outcome, path) for s in of] for of in _by_policy(flown).values()]
-        return [text(_mean(of)) + _some(sum(v is not None for v in of), len(sorties)) for of in values]
+        return [text(mean_of_known(of)) + _some(sum(v is not None for v in of), len(sorties)) for of in values]
 
     def gain(metric: str) -> list[str]:
         return [_gain(gains.get((policy, metric)), len(sorties)) for policy in _by_policy(flown)]
@@ -186,7 +186,7 @@ def side_by_side(flown: Flown) -> dict[str, list[str]]:
         "  compute": mean("energy_j", "compute", text=_kilojoules),
     }
     least = [[min(s.outcome["battery"].values(), default=None) for s in of] for of in _by_policy(flown).values()]
-    rows["charge left, least"] = [percent(_mean(values)) for values in least]
+    rows["charge left, least"] = [percent(mean_of_known(values)) for values in least]
     return {name: cells for name, cells in rows.items() if cells}
 
 
@@ -204,11 +204,6 @@ def _at(result: Any, path: Sequence[str]) -> float | None:
     for part in path:
         result = result[part]
     return None if result is None else float(result)
-
-
-def _mean(values: Iterator[float | None] | Sequence[float | None]) -> float | None:
-    kept = [v for v in values if v is not None]
-    return float(np.mean(kept)) if kept else None
 
 
 def _kilojoules(value: float) -> str:

@@ -112,7 +112,7 @@ def _fly(
         float(ap),
         float(np.mean([r["bytes"]["data_sent"] for r in results])),
         float(np.mean([r["energy_j"]["total"] for r in results])),
-        _mean(r["deadline_miss_rate"] for r in results),
+        mean_of_known(r["deadline_miss_rate"] for r in results),
     )
 
 
@@ -145,14 +145,14 @@ def summarise(cells: Sequence[Cell]) -> list[Summary]:
             Summary(
                 p, mean, (gain.mean, gain.low, gain.high), mean / oracle if oracle else None,
                 float(np.mean([c.data_bytes for c in mine])), float(np.mean([c.energy_j for c in mine])),
-                _mean(c.miss_rate for c in mine),
+                mean_of_known(c.miss_rate for c in mine),
             )
         )  # fmt: skip
     return rows
 
 
-def _mean(values: Iterable[float | None]) -> float | None:
-    """Of those that are known."""
+def mean_of_known(values: Iterable[float | None]) -> float | None:
+    """The mean of those that are known; None if none is."""
     known = [v for v in values if v is not None]
     return float(np.mean(known)) if known else None
 

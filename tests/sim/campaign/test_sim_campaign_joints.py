@@ -96,6 +96,17 @@ def test_differences_are_of_one_unit_and_may_be_below_zero() -> None:
     assert not stop(6, half_width=wanted * 1.0001).enough(table(below))
 
 
+def test_differences_are_of_the_scenes_that_both_policies_have() -> None:
+    """As above, beside scenes in which the second policy, or the first, has no value."""
+    gaps: Values = [
+        [[0.4, 0.0], [0.9, 0.6], [0.8, None]],
+        [[0.3, None], [None, 0.49], [0.68, 0.1]],
+    ]
+    wanted = width([-0.1, -0.11, -0.12], 0.95, difference=True)
+    assert stop(12, half_width=wanted * 1.0001, difference=True).enough(table(gaps))
+    assert not stop(12, half_width=wanted * 0.9999, difference=True).enough(table(gaps))
+
+
 def test_of_three_policies_every_difference_is_narrow_enough() -> None:
     three: Values = [[[0.4], [0.6], [0.8]], [[0.5], [0.7], [0.91]], [[0.1], [0.6], [0.9]]]
     assert not stop(9, 3, half_width=0.1, difference=True).enough(table(three))
