@@ -387,6 +387,7 @@ def campaign(
     security: tuple[str | Path, str | Path, str | Path] | None = None,
     worker_memory_gb: float | None = None,
     wait_for_workers_s: float = 300.0,
+    by_torch: int | None = None,
     resume: bool = False,
     retry_failed: bool = False,
     progress: Callable[[Any], None] | None = None,
@@ -405,6 +406,8 @@ def campaign(
         worker_memory_gb: memory limit of a worker, GB; a run that needs more is recorded as failed. None divides the
             machine's memory among the workers; on a cluster, the workers' own limits apply.
         wait_for_workers_s: how long to wait while a cluster has no workers, s.
+        by_torch: so many draws (replications if nothing is drawn) are flown by the torch detector as well, into the folder
+            `by_torch` within the campaign's. The report then estimates what torch would find over all of them.
         resume: only continue; raise an error if the folder has no campaign.
         retry_failed: fly failed runs once more.
         progress: called with a `sortie.sim.campaign.drive.Progress` after each batch.
@@ -420,6 +423,7 @@ def campaign(
         >>> done.rows.group_by("policy").aggregate([("ap50.mission", "mean")])    # doctest: +SKIP
     """
     from sortie.scenarios.reading.campaign import load_campaign
+    from sortie.sim.campaign.by_torch import FOLDER, plan_by_torch
     from sortie.sim.campaign.drive import run_campaign
     from sortie.sim.campaign.engine import open_engine
     from sortie.sim.campaign.plan import make_plan
@@ -440,16 +444,25 @@ def campaign(
     count = len(os.sched_getaffinity(0)) if workers is None else workers
     with user_errors():
         plan = make_plan(study)
-        ensure_usable(folder, plan)
+        parts = [(plan, folder, plan.units)]
+        if by_torch is not None:
+            parts.append((plan_by_torch(study, by_torch, plan), folder / FOLDER, by_torch))
+        for its, where, _ in parts:
+            ensure_usable(where, its)
         with open_engine(
             count, scheduler, security=files, wait_s=wait_for_workers_s, notice=tell,
             memory_b=None if worker_memory_gb is None else round(worker_memory_gb * 1e9),
         ) as engine:  # fmt: skip
             watch = (lambda p: None) if progress is None else progress
-            done = run_campaign(
-                plan, folder, engine, resume_only=resume, retry_failed=retry_failed, progress=watch, notice=tell
-            )
-    return CampaignResult(folder, done.finished, done.failed, done.flown, done.seconds)
+            done = [
+                run_campaign(
+                    its, where, engine, resume_only=resume and where == folder, retry_failed=retry_failed, units=units,
+                    progress=watch, notice=tell,
+                )
+                for its, where, units in parts
+            ]  # fmt: skip
+    total = (sum(getattr(p, name) for p in done) for name in ("finished", "failed", "flown", "seconds"))
+    return CampaignResult(folder, *total)
 
 
 def open_campaign(folder: str | Path) -> CampaignResult:

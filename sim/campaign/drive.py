@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -32,6 +33,8 @@ class Progress:
     """By this driver."""
     seconds: float
     """Since this driver began."""
+    by_torch: bool = False
+    """Whether it is the part that the torch detector flies."""
 
     @property
     def per_second(self) -> float:
@@ -49,6 +52,7 @@ def run_campaign(
     *,
     resume_only: bool = False,
     retry_failed: bool = False,
+    units: int | None = None,
     progress: Callable[[Progress], None] = lambda p: None,
     notice: Callable[[str], None] = lambda line: None,
 ) -> Progress:
@@ -58,6 +62,7 @@ def run_campaign(
 
     Args:
         retry_failed: runs that failed count as missing.
+        units: fly the first so many; None: all.
         notice: called with a line for each thing that was found changed in the folder, and is put right.
 
     Raises:
@@ -67,14 +72,16 @@ def run_campaign(
     try:
         for line in store.complaints():
             notice(line)
-        done = _drive(plan, store, engine, progress)
+        done = _drive(plan, store, engine, plan.runs if units is None else units * plan.unit_runs, progress)
         store.export()
         return done
     finally:
         store.close()
 
 
-def _drive(plan: CampaignPlan, store: CampaignStore, engine: Engine, progress: Callable[[Progress], None]) -> Progress:
+def _drive(
+    plan: CampaignPlan, store: CampaignStore, engine: Engine, runs: int, progress: Callable[[Progress], None]
+) -> Progress:
     stop = Stop(plan)
     frontier = 0
     begin_s, flown = time.perf_counter(), 0
@@ -93,22 +100,23 @@ def _drive(plan: CampaignPlan, store: CampaignStore, engine: Engine, progress: C
         return False
 
     def state(of: int) -> Progress:
-        return Progress(min(store.finished, of), of, store.failed, flown, time.perf_counter() - begin_s)
+        seconds = time.perf_counter() - begin_s
+        return Progress(min(store.finished, of), of, store.failed, flown, seconds, plan.by_torch)
 
     def tasks() -> Iterator[Task]:
-        for run in store.missing():
+        for run in itertools.takewhile(lambda run: run < runs, store.missing()):
             yield run, plan.task(run)
 
     if enough():
         return state(store.runs_of(frontier - 1).stop)
-    progress(state(plan.runs))
+    progress(state(runs))
     for results in engine.results(plan.code, tasks()):
         store.add(results)
         flown += len(results)
         if enough():
             return state(store.runs_of(frontier - 1).stop)
-        progress(state(plan.runs))
-    return state(plan.runs)
+        progress(state(runs))
+    return state(runs)
 
 
 class Stop:

@@ -110,13 +110,25 @@ class CampaignPlan:
         return len(self.points) if drawn_fields(self.campaign) else self.campaign.replications
 
     @property
+    def unit_runs(self) -> int:
+        """Runs of one unit; they stand together."""
+        return self.runs // self.units
+
+    @property
+    def by_torch(self) -> bool:
+        """Whether it is the torch detector's part of a campaign (`sortie.sim.campaign.by_torch`)."""
+        return bool(self.spec.get("by_torch"))
+
+    @property
     def unit(self) -> str:
         """What a unit is."""
         return "draw" if drawn_fields(self.campaign) else "replication"
 
     @property
     def shard(self) -> int:
-        """Runs in one file of the table; policies of one scene never stand in two."""
+        """Runs of one part; policies of one scene never stand in two. By torch a unit, so that more of them can follow."""
+        if self.by_torch:
+            return self.unit_runs
         p = len(self.policies)
         return max(1, min(5000, max(30, self.runs // 20)) // p) * p
 
@@ -179,8 +191,11 @@ class CampaignPlan:
         return task_key(self.task(run), self.code)
 
 
-def make_plan(study: Study) -> CampaignPlan:
+def make_plan(study: Study, **more: Any) -> CampaignPlan:
     """A campaign's plan, checked before anything is flown.
+
+    Args:
+        more: further entries of its specification.
 
     Raises:
         PolicyError: an unknown policy or parameter.
@@ -215,6 +230,7 @@ def make_plan(study: Study) -> CampaignPlan:
             "policies": [[label, section] for label, section in policies],
             "files": file_digests([file for some in reading for file in named_files(some)]),
             "code": flight_code([sections, columns, spec]),
+            **more,
         }
     )
 

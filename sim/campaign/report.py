@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sortie.scenarios.intervals import Estimate, Floats, Paired, mean_interval, paired
 from sortie.scenarios.report_text import ALL_EQUAL, NONE, number, prefixed, table
+from sortie.sim.campaign.by_torch import FOLDER, answers, depends_on_detector, read_torch
 from sortie.sim.campaign.drive import Stop
 from sortie.sim.campaign.figures import costs, draw_pareto, draw_varied, drawn, on_front, with_values
 from sortie.sim.campaign.rows import CampaignRows, is_accuracy, read_rows, winner_metrics
@@ -88,6 +89,7 @@ def _lines(rows: CampaignRows, folder: Path, pictures: dict[str, bool]) -> Itera
         yield "Draws of this design are spread more evenly than independent ones, so the intervals are on the wide side."
     yield from _by_policy(rows)
     if _independent(rows):
+        yield from _by_torch(rows, folder)
         yield from _varied(rows, pictures[VARIED])
         yield from _pareto(rows, pictures[PARETO])
     yield from _sensitivity(rows)
@@ -143,6 +145,43 @@ def _by_policy(rows: CampaignRows) -> Iterator[str]:
                 for means in [rows.by_unit(metric)]
             ),
         )
+
+
+def _by_torch(rows: CampaignRows, folder: Path) -> Iterator[str]:
+    """Means by the torch detector, where it flew some of the units."""
+    if (torch := read_torch(folder, rows)) is None:
+        return
+    units, unit = len(np.unique(torch.unit)), rows.plan.unit
+    yield "\n## By the torch detector\n"
+    yield (
+        f"The torch detector flew the first {units} {unit}s as well; all figures above are the surrogate's. *Torch alone* is the "
+        f"mean over these {units}. *With the surrogate* also uses what the surrogate found in the other {unit}s, as a control "
+        "variate. That adds no bias, however wrong the surrogate is, and makes an interval narrower where the two detectors "
+        f"correlate from {unit} to {unit}, but a little wider where they do not. × says how many times as many {unit}s torch alone "
+        f"would need for the interval with the surrogate. Rows: `{folder / FOLDER / TABLE}`."
+    )
+    metrics = list(depends_on_detector(rows, torch))
+    for differences in (False, True)[: len(rows.plan.policies)]:
+        if differences:
+            yield f"\nDifferences from **{rows.plan.policies[0]}**, paired:"
+        yield ""
+        yield from table(
+            ("metric", "policy", "torch alone", "with the surrogate", "correlation", "×"),
+            (
+                (
+                    a.metric,
+                    a.policy,
+                    _interval(a.alone, signed=differences),
+                    _interval(a.with_surrogate, signed=differences),
+                    number(a.correlation, ".2f"),
+                    number(a.worth, ".3g"),
+                )
+                for metric in metrics
+                for a in answers(rows, torch, metric, differences=differences)
+            ),
+        )
+    if same := [metric for metric in rows.plan.campaign.metrics if metric not in metrics]:
+        yield f"\nBoth detectors gave the same values of {', '.join(same)}."
 
 
 def _varied(rows: CampaignRows, picture: bool) -> Iterator[str]:

@@ -76,14 +76,18 @@ class CampaignRows:
         return (known & whole).ravel() & mask, int(mask.sum()) // policies
 
     def by_unit(self, metric: str, mask: NDArray[np.bool_] | None = None) -> Floats:
+        """As `every_unit`, of the units that have a scene that counts; NaN for a policy that never has a value."""
+        means = self.every_unit(metric, mask)
+        return np.asarray(means[~np.isnan(means).all(axis=1)])
+
+    def every_unit(self, metric: str, mask: NDArray[np.bool_] | None = None) -> Floats:
         """Means [units, policies] over the grid points of a unit, each the mean of its replications, over the scenes that
-        count (`counted`) and the units that have one; NaN for a policy that never has a value."""
+        count (`counted`); NaN where there is none. A unit's row is its number."""
         use, _ = self.counted(metric, mask)
         counts = self._count(use)
         with np.errstate(invalid="ignore"):
             of_points = self._count(use, self.values(metric)) / counts
-            means = np.nansum(of_points, axis=1) / (counts > 0).sum(axis=1)
-        return np.asarray(means[~np.isnan(means).all(axis=1)])
+            return np.asarray(np.nansum(of_points, axis=1) / (counts > 0).sum(axis=1))
 
     def _count(self, which: NDArray[np.bool_], weights: Floats | None = None) -> Floats:
         """[units, points, policies]: how many of these runs, or the sum of their weights."""
@@ -130,7 +134,7 @@ def read_rows(folder: Path) -> CampaignRows:
             raise RunError(f"{folder}: no part is finished yet{go_on}")
     table = pa.concat_tables(parts)
     unit = table["unit"].to_numpy()
-    whole = np.bincount(unit)[unit] == plan.runs // plan.units
+    whole = np.bincount(unit)[unit] == plan.unit_runs
     if not whole.any():
         raise RunError(f"{folder}: no {plan.unit} is finished at all its grid points yet, go on with the campaign")
     kept = table.filter(whole)

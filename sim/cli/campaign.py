@@ -72,6 +72,14 @@ def run(
             metavar="SECONDS", help="With --scheduler: how long to wait while the cluster has no workers.", min=0
         ),
     ] = 300.0,
+    by_torch: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Fly the first N draws (replications if nothing is drawn) by the torch detector as well, and estimate its "
+            "means over all draws, with the surrogate's sorties as a control variate.",
+        ),
+    ] = None,
     out_dir: Annotated[
         Path | None, typer.Option("--out", help="The campaign's folder; default: runs/campaign-NAME.")
     ] = None,
@@ -99,8 +107,8 @@ def run(
             with _bar(name) as show:
                 done = sortie.campaign(
                     campaign, out=folder, workers=workers, scheduler=scheduler, security=security,
-                    worker_memory_gb=worker_memory, wait_for_workers_s=wait_for_workers, resume=resume,
-                    retry_failed=retry_failed, progress=show, notice=_notice,
+                    worker_memory_gb=worker_memory, wait_for_workers_s=wait_for_workers, by_torch=by_torch,
+                    resume=resume, retry_failed=retry_failed, progress=show, notice=_notice,
                 )  # fmt: skip
     except KeyboardInterrupt as end:
         where = "" if folder is None else f" in {folder}"
@@ -180,7 +188,7 @@ def _bar(name: str) -> Iterator[Callable[[Progress], None]]:
         def show(p: Progress) -> None:
             left = "" if math.isinf(p.left_s) else f", {p.left_s / 60:.0f} min left"
             failed = f", {p.failed} failed" if p.failed else ""
-            text = f"{60 * p.per_second:.0f} a minute{left}{failed}"
+            text = f"{'by torch, ' * p.by_torch}{60 * p.per_second:.0f} a minute{left}{failed}"
             bar.update(task, completed=p.finished, total=p.of, description=text)
 
         yield show

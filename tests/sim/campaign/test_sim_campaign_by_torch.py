@@ -1,0 +1,163 @@
+"""A campaign whose first units the torch detector flies as well, and what both detectors together say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaign_examples import BASE, CAMPAIGN, rows_on_disk, table_bytes, write
+
+import sortie
+from sortie.scenarios.control_variates import controlled_mean
+from sortie.scenarios.reading.campaign import load_campaign
+from sortie.sim.campaign import by_torch
+from sortie.sim.campaign.by_torch import answers, depends_on_detector, plan_by_torch, read_torch
+from sortie.sim.campaign.drive import Progress, run_campaign
+from sortie.sim.campaign.plan import CampaignPlan, make_plan
+from sortie.sim.campaign.report import write_report
+from sortie.sim.campaign.rows import read_rows
+from sortie.sim.campaign.work import RunResult, Task, task_key
+from sortie.sim.folders import RunError
+
+SCORED = BASE.replace("detector: none", "detector: surrogate")
+METRICS = CAMPAIGN.replace("[bytes.data_sent, energy_j.total]", "[ap50.full_scene, energy_j.total]")
+
+
+class TwoDetectors:
+    """Rows that follow from the task: torch finds half of what the surrogate finds, and an offset that the draw decides."""
+
+    workers = 1
+
+    def __init__(self, wave: float = 0.01) -> None:
+        self.wave, self.flown = wave, list[int]()
+
+    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
+        for run, task in tasks:
+            self.flown.append(run)
+            scenario = json.loads(task)["scenario"]
+            charge = scenario["fleet"]["battery"]["initial_soc"]
+            cheap = 0.8 * charge + 0.1 * (scenario["policy"]["name"] == "worked")
+            torch = 0.5 * cheap + 0.01 + self.wave * np.sin(100 * charge)
+            value = torch if scenario["perception"]["detector"] == "torch" else cheap
+            yield [RunResult(run, task_key(task, code), "done", "", "0" * 16, (value, 7.0))]
+
+
+def plans(tmp_path: Path, text: str = METRICS, units: int = 3) -> tuple[CampaignPlan, CampaignPlan]:
+    study = load_campaign(write(tmp_path, text, SCORED))
+    plan = make_plan(study)
+    return plan, plan_by_torch(study, units, plan)
+
+
+def flown(tmp_path: Path, units: int = 3, text: str = METRICS, wave: float = 0.01) -> Path:
+    plan, torch = plans(tmp_path, text, units)
+    run_campaign(plan, tmp_path / "c", TwoDetectors())
+    run_campaign(torch, tmp_path / "c" / by_torch.FOLDER, TwoDetectors(wave), units=units)
+    return tmp_path / "c"
+
+
+def test_a_run_by_torch_differs_from_the_campaign_s_own_in_its_detector_alone(tmp_path: Path) -> None:
+    plan, torch = plans(tmp_path)
+    for run in range(plan.runs):
+        ours, its = json.loads(plan.task(run)), json.loads(torch.task(run))
+        assert its["scenario"]["perception"].pop("detector") == "torch"
+        assert ours["scenario"]["perception"].pop("detector") == "surrogate"
+        assert ours == its
+    assert " torch " in torch.code
+    assert plan.key(0) != torch.key(0)
+
+
+def test_more_units_may_follow_and_the_table_is_that_of_one_flight(tmp_path: Path) -> None:
+    _, torch = plans(tmp_path)
+    seen: list[Progress] = []
+    for folder, steps in (("at once", [5]), ("by and by", [2, 5])):
+        for units in steps:
+            engine = TwoDetectors()
+            run_campaign(torch, tmp_path / folder, engine, units=units, progress=seen.append)
+    assert engine.flown == list(range(2 * torch.unit_runs, 5 * torch.unit_runs)), "only what is new"
+    assert (seen[-1].finished, seen[-1].of) == (5 * torch.unit_runs,) * 2
+    once, twice = (table_bytes(tmp_path / folder) for folder in ("at once", "by and by"))
+    assert once == twice
+    assert rows_on_disk(tmp_path / "at once") == 5 * 8
+
+
+def test_the_mean_uses_the_surrogate_s_other_draws(tmp_path: Path) -> None:
+    """Against the estimator itself, fed with each draw's mean over grid points and replications."""
+    plan, _ = plans(tmp_path)
+    folder = flown(tmp_path, 5)
+    rows = read_rows(folder)
+    torch = read_torch(folder, rows)
+    assert torch is not None
+    charge = np.array([plan.varied(2 * draw)["fleet.battery.initial_soc"] for draw in range(6)])
+    cheap, own = 0.8 * charge, 0.4 * charge + 0.01 + 0.01 * np.sin(100 * charge)
+    first, second = answers(rows, torch, "ap50.full_scene", differences=False)
+    expected = controlled_mean(own[:5], cheap[:5], cheap[5:])
+    assert second.policy == "best-2(received_budget=0.1)"
+    assert second.with_surrogate.mean == pytest.approx(expected.estimate.mean)
+    assert second.alone.mean == pytest.approx(own[:5].mean())
+    assert first.alone.mean == pytest.approx(own[:5].mean() + 0.05)
+    assert second.correlation == pytest.approx(np.corrcoef(own[:5], cheap[:5])[0, 1])
+    (apart,) = answers(rows, torch, "ap50.full_scene", differences=True)
+    assert apart.alone.mean == pytest.approx(-0.05)
+    assert list(depends_on_detector(rows, torch)) == ["ap50.full_scene"]
+
+
+def test_where_torch_is_the_surrogate_and_an_offset_the_interval_is_that_of_all_draws(tmp_path: Path) -> None:
+    """The mean over forty draws and the offset, whichever ten torch flew; the interval is much narrower than torch's alone."""
+    folder = flown(tmp_path, 10, METRICS.replace("{count: 6}", "{count: 40, method: random}"), wave=0.0)
+    rows = read_rows(folder)
+    torch = read_torch(folder, rows)
+    assert torch is not None
+    first = answers(rows, torch, "ap50.full_scene", differences=False)[0]
+    everything = rows.every_unit("ap50.full_scene")[:, 0].mean()
+    assert first.with_surrogate.mean == pytest.approx(0.5 * everything + 0.01)
+    assert first.correlation == pytest.approx(1.0)
+    assert first.worth > 2
+
+
+def test_the_report_has_both_and_says_what_depends_on_no_detector(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    told = write_report(flown(tmp_path)).read_text()
+    assert "The torch detector flew the first 3 draws as well" in told
+    assert "Both detectors gave the same values of energy_j.total." in told
+    section = told.partition("## By the torch detector")[2].partition("## By varied field")[0]
+    assert section.count("| ap50.full_scene |") == 3, "two means and a difference"
+
+
+@pytest.mark.parametrize(
+    ("text", "base", "units", "told"),
+    [
+        (METRICS, BASE, 3, "--by-torch: perception.detector is none, must be surrogate"),
+        (METRICS, SCORED, 7, "--by-torch: 7, must be from 2 to the campaign's 6 draws"),
+        (METRICS, SCORED, 1, "--by-torch: 1, must be from 2 to the campaign's 6 draws"),
+        (
+            METRICS.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n", "").replace(
+                "{count: 6}", "{count: 6, method: morris}"
+            ),
+            SCORED, 3, "--by-torch: sample.method is morris, whose means have no intervals",
+        ),
+        (
+            METRICS.replace("vary:", "vary:\n  perception.detector: {kind: grid, values: [surrogate, torch]}"),
+            SCORED, 3, "--by-torch: perception.detector is varied, must be surrogate",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_estimated_is_refused_before_anything_flies(
+    text: str, base: str, units: int, told: str, tmp_path: Path
+) -> None:
+    with pytest.raises(RunError) as error:
+        sortie.campaign(write(tmp_path, text, base), out=tmp_path / "c", by_torch=units)
+    assert str(error.value) == told
+    assert not (tmp_path / "c").exists()
+
+
+def test_another_campaign_s_rows_by_torch_are_refused(tmp_path: Path) -> None:
+    folder = flown(tmp_path)
+    _, other = plans(tmp_path, METRICS.replace("seed: 5", "seed: 6"))
+    (folder / by_torch.FOLDER).rename(tmp_path / "old")
+    run_campaign(other, folder / by_torch.FOLDER, TwoDetectors(), units=3)
+    with pytest.raises(RunError) as error:
+        read_torch(folder, read_rows(folder))
+    assert str(error.value) == f"{folder / 'by_torch'}: holds results of another campaign"
