@@ -135,6 +135,7 @@ class Agent:
         handshake_bytes: Callable[[], int],
         guard: Guard | None = None,
         reads: Callable[[FleetView], FleetView] | None = None,
+        check: Callable[[Sequence[Directive], FleetView], None] = check_directives,
     ) -> None:
         """Put a drone together; `start` begins its process.
 
@@ -152,6 +153,7 @@ class Agent:
             handshake_bytes: what its sharing method puts on every link and frame before payloads, at the moment.
             guard: has the last word before the gates; None where there are no invariants.
             reads: gives what the drone reads in place of what it heard; None where that is the same.
+            check: refuses a policy's answer that breaks the contract.
         """
         self.drone, self.status, self.memory = memory.drone, memory.status, memory
         self.here: Capture | None = None
@@ -169,7 +171,7 @@ class Agent:
         self._sealer = sealer
         self._phase_s = phase_s
         self._handshake_bytes = handshake_bytes
-        self._guard, self._reads = guard, reads
+        self._guard, self._reads, self._check = guard, reads, check
         self._period_s = rules.descriptor_period_s
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
@@ -332,7 +334,7 @@ class Agent:
         is_heard = view is heard
         changed = differing(self._asked_of, directives, view) if is_heard and self._ids is memory.ids else None
         if changed is None:
-            check_directives(directives, view)
+            self._check(directives, view)
             self._asked_of = {d.destination: d for d in directives}
             self._ids = memory.ids if is_heard else None
             peers = [peer for peer in view.age_s if peer != me]

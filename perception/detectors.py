@@ -20,8 +20,11 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.perception.uncertainty import BoxErrors
 from sortie.scenarios.disc import Disc
-from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call, resolve
+from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call, real_array, resolve
 from sortie.scenarios.schema import Perception
+
+MOST_BOXES = 1_000_000
+"""A detector's count of boxes in one payload at most."""
 
 
 class Detector(Protocol):
@@ -142,10 +145,11 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
             raise PluginError(f"detector {found.name}: {what} returns {made!r:.60}, must be Boxes")
         n = len(made)
         for column, shape in (("xy_m", (n, 2)), ("size_m", (n, 2)), ("yaw_rad", (n,)), ("score", (n,))):
-            value = np.asarray(getattr(made, column))
-            if value.shape != shape:
+            value = real_array(getattr(made, column))
+            if value is None or value.shape != shape:
                 raise PluginError(
-                    f"detector {found.name}: {what} returns {column} of shape {value.shape}, must be {shape}"
+                    f"detector {found.name}: {what} returns {column} of shape {np.shape(getattr(made, column))}, must be "
+                    f"numbers of shape {shape}"
                 )
             if not np.isfinite(value).all():
                 raise PluginError(f"detector {found.name}: {what} returns {column} that is not finite")
@@ -158,8 +162,9 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
             (ego, [s._replace(**{n: deepcopy(getattr(s, n)) for n in names}) for s in shares]) for ego, shares in jobs
         ]
 
-    def checked(jobs: Jobs, several: Sequence[Any]) -> list[Boxes]:
-        if len(several) != len(jobs) or not all(isinstance(each, Boxes) for each in several):
+    def checked(jobs: Jobs, several: Any) -> list[Boxes]:
+        whole = isinstance(several, Sequence) and len(several) == len(jobs)
+        if not whole or not all(isinstance(each, Boxes) for each in several):
             raise PluginError(
                 f"detector {found.name}: detect returns {several!r:.60}, must be Boxes for each of the jobs"
             )
@@ -167,8 +172,9 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
 
     def counted(capture: Capture, roi: Disc | None) -> int:
         number = count(capture, roi)
-        if not isinstance(number, Integral) or number < 0:
-            raise PluginError(f"detector {found.name}: count_boxes returns {number!r:.60}, must be a whole number ≥ 0")
+        if not isinstance(number, Integral) or not 0 <= int(number) <= MOST_BOXES:
+            must = f"must be a whole number from 0 to {MOST_BOXES:,}"
+            raise PluginError(f"detector {found.name}: count_boxes returns {number!r:.60}, {must}")
         return int(number)
 
     found.detect = lambda jobs: checked(jobs, detect(apart(jobs)))

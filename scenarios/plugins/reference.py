@@ -14,6 +14,7 @@ import re
 import traceback
 from collections.abc import Callable, Mapping
 from importlib.metadata import EntryPoint, entry_points
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -202,19 +203,25 @@ def checked_array(
         PluginError: it fails, or returns no numbers, another shape or a number that is not finite.
     """
     answer = checked_call(kind, function, *(np.array(arg) if isinstance(arg, np.ndarray) else arg for arg in args))
-    try:
-        if answer is None or np.iscomplexobj(answer):  # NumPy would make them nan, and drop the imaginary part
-            raise TypeError
-        found = np.asarray(answer, dtype=float)
-    except (TypeError, ValueError) as failure:
-        must = f"must be numbers of shape {shape}"
-        raise PluginError(f"{kind} {name_of(function)}: returns {_shown(answer)}, {must}") from failure
+    if (found := real_array(answer)) is None:
+        raise PluginError(f"{kind} {name_of(function)}: returns {_shown(answer)}, must be numbers of shape {shape}")
     if found.shape != shape:
         raise PluginError(f"{kind} {name_of(function)}: returns shape {found.shape}, must be {shape}")
     wrong = ~np.isfinite(found) & (True if left_out is None else ~left_out)
     if wrong.any():
         raise PluginError(f"{kind} {name_of(function)}: returns {found[wrong][0]}, must be finite")
     return found
+
+
+def real_array(values: object) -> NDArray[np.float64] | None:
+    """Numbers as an array; None of what is no numbers. NumPy alone reads text, makes None nan and drops imaginary parts."""
+    try:
+        found = np.asarray(values)
+        if found.dtype.kind in "biuf" or (found.dtype.kind == "O" and all(isinstance(v, Real) for v in found.flat)):
+            return found.astype(float)
+        return None
+    except (TypeError, ValueError, OverflowError):
+        return None
 
 
 def _shown(answer: object) -> str:

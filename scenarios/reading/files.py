@@ -43,6 +43,8 @@ changes of policy policies, events of kind `own` events, and `metrics` metrics."
 
 _FUNCTION = re.compile(r"(.+)(:[^\W\d]\w*)")
 _PARAMETER = re.compile(r"([^\W\d]\w*)\s*=\s*(.+)", re.DOTALL)
+_POLICIES = {"policy": {"name"}, "changes": {"name"}, "makes": {"policy"}}
+"""Sections that name a policy, and the field that does."""
 _CALLABLE = frozenset(field.rpartition(".")[2] for field in MODELS) - {"name", "recorded_fusion"} | {"model"}
 
 
@@ -56,19 +58,22 @@ def params_of(field: str) -> str:
     return "params" if field in ("name", "model") else f"{field.removesuffix('_model')}_params"
 
 
-def without_brackets(sections: Any) -> Any:
+def without_brackets(sections: Any, within: str = "") -> Any:
     """Plain sections, valid or not, in which models are named without brackets; their parameters stand where they belong.
+
+    Args:
+        within: the key that the sections stand under.
 
     Example:
         >>> without_brackets({"radio": {"link": "own.py:Name(loss_db=3)", "link_params": {"clear_s": 1}}})
         {'radio': {'link': 'own.py:Name', 'link_params': {'loss_db': 3}}}
     """
     if isinstance(sections, list):
-        return [without_brackets(each) for each in sections]
+        return [without_brackets(each, within) for each in sections]
     if not isinstance(sections, dict):
         return sections
-    plain = {k: v if str(k).endswith("params") else without_brackets(v) for k, v in sections.items()}
-    for name in _CALLABLE & plain.keys():
+    plain = {k: v if str(k).endswith("params") else without_brackets(v, k) for k, v in sections.items()}
+    for name in (_CALLABLE | _POLICIES.get(within, set())) & plain.keys():
         model, parts = (read_call(plain[name]) if isinstance(plain[name], str) else None) or (None, [])
         pairs = [_PARAMETER.fullmatch(part) for part in parts]
         if model is not None and all(pairs):

@@ -67,13 +67,12 @@ def _lines(rows: CampaignRows, folder: Path, pictures: dict[str, bool]) -> Itera
     if plan.campaign.description:
         yield f"\n{plan.campaign.description.strip()}"
     failed = len(_failures(rows))
-    shape = f"{plan.units} {plan.unit}s"
-    grid = f" at {len(plan.grid)} grid points" if len(plan.grid) > 1 else ""
-    count = plan.campaign.replications
-    more = "s" if count > 1 else ""
+    shape = [_count(plan.units, plan.unit)]
+    shape += [_count(len(plan.grid), "grid point")] * (len(plan.grid) > 1)
+    shape += [_count(plan.campaign.replications, "replication")] * (plan.unit == "draw")
+    shape += [f"{len(plan.policies)} policies on the same draws" if len(plan.policies) > 1 else "1 policy"]
     yield (
-        f"\n{rows.all.num_rows} of {plan.runs} runs: {shape}{grid}, {count} replication{more}, "
-        f"{len(plan.policies)} policies on the same draws; {failed} failed. Base scenario `{plan.campaign.base}`, "
+        f"\n{rows.all.num_rows} of {plan.runs} runs: {' × '.join(shape)}; {failed} failed. Base scenario `{plan.campaign.base}`, "
         f"seed {plan.campaign.seed}, Sortie {plan.code}. {_intervals(rows)}"
     )
     if (stop := plan.campaign.stop_when) is not None and _stopped(rows):
@@ -105,13 +104,18 @@ duckdb.sql("from '{folder}/{TABLE}'")
 ```"""
 
 
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'s' * (number != 1)}"
+
+
 def _lost(rows: CampaignRows) -> Iterator[str]:
     """Units that failed runs remove from the means, counted by policy."""
     plan, lost = rows.plan, rows.lost()
     if units := int(lost.any(axis=1).sum()):
         whose = ", ".join(f"{label} {n}" for label, n in zip(plan.policies, lost.sum(axis=0), strict=True) if n)
+        at = "all runs of a policy at a grid point" if len(plan.grid) > 1 else "a policy's runs"
         yield (
-            f"{units} of the {plan.unit}s are left out of all means, where a policy's runs failed ({whose}): "
+            f"{units} of the {plan.unit}s {'is' if units == 1 else 'are'} left out of all means, where {at} failed ({whose}): "
             "policies are compared on the same draws."
         )
     if none := [p for i, p in enumerate(plan.policies) if not rows.done[rows.policy == i].any()]:
@@ -128,7 +132,7 @@ def _by_policy(rows: CampaignRows) -> Iterator[str]:
     )
     if any(some.values()):
         yield (
-            f"\nA scene is one replication of a {rows.plan.unit} at a grid point. It counts for a metric where every policy "
+            f"\nA scene is one replication{' of a draw' * (rows.plan.unit == 'draw')} at a grid point. It counts for a metric where every policy "
             "that ever has a value of the metric has one, so that policies are compared on the same scenes."
         )
     valued = with_values(rows)

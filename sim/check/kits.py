@@ -301,7 +301,8 @@ SHORT = {"name": "verify", "duration_s": 3.0, "perception": {"detector": "none"}
 
 
 def _flown(**changes: Any) -> SortieRecord:
-    return run_sortie(build({**SHORT, **changes}))
+    """A short sortie with every table that a record may have."""
+    return run_sortie(build({**SHORT, "record": {"views": True, "beliefs": True}, **changes}))
 
 
 def _event(reference: str, params: Params) -> Subject:

@@ -48,8 +48,10 @@ def compare_conditions(
         out.print(f"no car was to be seen in {', '.join(blind)}: no accuracy counts what was flown there")
     rows = summarise(cells)
     fixed = best_fixed(rows)
+    flown = [p for p in policies if p in FIXED]
+    oracle = "oracle" if flown else fixed
     table = _figures(
-        "all conditions", "policy", "AP", f"over {fixed}, 95 %", "oracle", "data", "kJ", "missed",
+        "all conditions", "policy", "AP", f"over {fixed}, 95 %", f"of {oracle}", "data", "kJ", "missed",
     )  # fmt: skip
     for r in rows:
         gain = "–" if r.policy == fixed else points(r.gain, "+.1f")
@@ -59,12 +61,15 @@ def compare_conditions(
             "–" if r.miss_rate is None else f"{r.miss_rate:.1%}",
         )  # fmt: skip
     out.print(table)
-    flown = ", ".join(p for p in policies if p in FIXED)
-    first = f"the best fixed policy ({flown})" if flown else "the first policy, as no fixed one flew"
+    best = f", the best of {', '.join(flown)} (they follow one rule in every condition)" if flown else ""
+    share = (
+        "of oracle: share of the AP that the best of these in each condition would reach"
+        if flown
+        else f"of {fixed}: share of its AP"
+    )
     out.print(
-        f"[dim]over {fixed}: AP points over {first}, and the interval of their mean over conditions; oracle: of the AP of "
-        f"{'the best fixed policy of each condition' if flown else 'the first policy'}; data and energy of a sortie; missed: "
-        "payloads past their deadline[/dim]"
+        f"[dim]over {fixed}: AP points over {fixed}{best}, and the interval of their mean over conditions; {share}; data and "
+        "energy of a sortie; missed: payloads past their deadline[/dim]"
     )
     if out_file is not None:
         found = {

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call, resolve
+from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call, real_array, resolve
 from sortie.scenarios.schema import Own, Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.world import World
@@ -32,6 +32,8 @@ class FleetHandle:
         frame_s: time between two frames.
     """
 
+    __slots__ = ("_event", "_index", "_world", "frame_s")
+
     def __init__(self, world: World, scenario: Scenario, event: Own, index: int) -> None:
         self._world, self._event, self._index = world, event, index
         self.frame_s = scenario.frame_s
@@ -42,19 +44,24 @@ class FleetHandle:
 
     @property
     def positions_m(self) -> NDArray[np.float64]:
-        """[N, 3], ENU: where the drones are."""
+        """[N, 3], ENU: where the drones are. To be read; an event cannot move them."""
         frame = min(int(self.t_s / self.frame_s + 1e-6), len(self._world.motion.position_m) - 1)
-        return np.array(self._world.motion.position_m[frame], dtype=float)
+        return _read_only(np.array(self._world.motion.position_m[frame], dtype=float))
 
     @property
     def airborne(self) -> NDArray[np.bool_]:
-        """[N]: who flies."""
-        return np.array([drone.airborne for drone in self._world.drones])
+        """[N]: who flies. To be read; `lose` takes a drone out of the air."""
+        return _read_only(np.array([drone.airborne for drone in self._world.drones]))
 
     def set_loss_db(self, loss_db: ArrayLike) -> None:
         """Weaken links by this event, until the next call or its end: [N, N] dB, sender by receiver, or one number."""
         n = len(self._world.drones)
-        given = np.broadcast_to(np.asarray(loss_db, dtype=float), (n, n)).copy()
+        asked = self._numbers(loss_db, f"of shape ({n}, {n}), or one number")
+        if asked.shape not in ((), (n, n)):
+            raise PluginError(
+                f"event {self._event.model}: a loss of shape {asked.shape}, must be of shape ({n}, {n}), or one number"
+            )
+        given = np.broadcast_to(asked, (n, n)).copy()
         np.fill_diagonal(given, 0.0)
         wrong = ~(np.isfinite(given) & (given >= 0.0))
         if wrong.any():
@@ -66,10 +73,15 @@ class FleetHandle:
         if position_m is None:
             self._world.jammers.pop(self._index, None)
             return
-        x_m, y_m, z_m = map(float, position_m)
-        if not np.isfinite([x_m, y_m, z_m, power_dbm]).all():
+        at_m, power = self._numbers(position_m, "three, ENU"), self._numbers(power_dbm, "one")
+        if at_m.shape != (3,) or power.shape:
+            raise PluginError(
+                f"event {self._event.model}: a jammer of {power_dbm!r:.60} dBm at {position_m!r:.60}, must be one number at three"
+            )
+        if not np.isfinite([*at_m, power]).all():
             raise PluginError(f"event {self._event.model}: a jammer of {power_dbm} dBm at {position_m}, must be finite")
-        self._world.jammers[self._index] = ((x_m, y_m, z_m), float(power_dbm))
+        x_m, y_m, z_m = at_m.tolist()
+        self._world.jammers[self._index] = ((x_m, y_m, z_m), float(power))
 
     def drain(self, drone: int, lost_fraction: float) -> None:
         """Take a fraction of the energy that a drone's battery has left."""
@@ -95,6 +107,11 @@ class FleetHandle:
         self._check_text(text)
         self._world.note(drone, "own", text)
 
+    def _numbers(self, given: object, must: str) -> NDArray[np.float64]:
+        if (found := real_array(given)) is None:
+            raise PluginError(f"event {self._event.model}: {given!r:.60}, must be numbers, {must}")
+        return found
+
     def _check(self, drone: int, first: int = 0) -> None:
         n = len(self._world.drones)
         if not (isinstance(drone, Integral) and first <= drone < n):
@@ -105,6 +122,11 @@ class FleetHandle:
         """The record holds text that UTF-8 can write."""
         if not isinstance(text, str) or any("\ud800" <= letter <= "\udfff" for letter in text):
             raise PluginError(f"event {self._event.model}: text {text!r:.60}, must be a str that UTF-8 can write")
+
+
+def _read_only(values: NDArray[Any]) -> NDArray[Any]:
+    values.flags.writeable = False
+    return values
 
 
 class OwnEvents:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from numbers import Real
 from typing import Protocol
 
-from sortie.scenarios.plugins.reference import PluginError, checked_call, resolve
+import numpy as np
+
+from sortie.scenarios.plugins.reference import PluginError, checked_call, real_array, resolve
 from sortie.scenarios.schema import Scenario
 from sortie.sim.results.record import SortieRecord
 
@@ -43,6 +44,7 @@ def own_metric(name: str, metric: OwnMetric, record: SortieRecord) -> float | No
     value = checked_call("metric", metric, record)
     if value is None:
         return None
-    if not (isinstance(value, Real) and math.isfinite(value)):
+    found = real_array(value) if isinstance(value, Real) else None
+    if found is None or not np.isfinite(found):
         raise PluginError(f"metric {name}: returns {value!r:.60}, must be a finite number or None")
-    return float(value)
+    return float(found)

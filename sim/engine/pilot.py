@@ -262,13 +262,24 @@ class Pilot:
             self._steer(self.drone, read)
         directives = ask(self.policy, read)
         if self._keep is not None:
-            check_directives(directives, read)  # before its parts are read
+            self.check(directives, read)  # before its parts are read
             self._keep(self.drone, self.policy.name, read, directives, asked)
         if self._rules or shown is not None:
             directives = self._within_rules(read, directives)
         if shown is not None:
             self._judge_shown(shown.view, directives)
         return directives
+
+    def check(self, directives: Sequence[Directive], view: FleetView) -> None:
+        """Refuse an answer that breaks the contract.
+
+        Raises:
+            PolicyError: as `check_directives`, with the policy's name.
+        """
+        try:
+            check_directives(directives, view)
+        except PolicyError as error:
+            raise PolicyError(f"policy {self.policy.name!r} on drone {self.drone}: {error}") from error
 
     def _follow_phase(self, view: FleetView) -> None:
         me = view.me
@@ -280,7 +291,7 @@ class Pilot:
 
     def _within_rules(self, view: FleetView, directives: Sequence[Directive]) -> Sequence[Directive]:
         name, audit = self.policy.name, self._audit
-        check_directives(directives, view)  # before the rules read them
+        self.check(directives, view)  # before the rules read them
         self._fresh = ask(self.policy, just_heard(view)) if self._asks_fresh else ()
         if self._shielded:
             directives = enforce(self._rules, view, directives, self._fresh)

@@ -255,6 +255,7 @@ def build(
             handshake_bytes=pilots[i].handshake_bytes,
             guard=pilots[i].guard,
             reads=pilots[i].reads,
+            check=pilots[i].check,
         )
         for i in drones
     ]

@@ -14,7 +14,6 @@ from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
 from typing import NamedTuple
 
-from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, Disc, FleetView, PolicyError, Representation
 from sortie.policies.registry import describe_error
 from sortie.scenarios.schema import Scenario
@@ -104,7 +103,7 @@ def _decide(pilot: Pilot, ask: Ask) -> Decision:
     try:
         directives = pilot(ask.view.frozen)
         elapsed_ns = time.thread_time_ns() - begin_ns
-        check_directives(directives, ask.view)
+        pilot.check(directives, ask.view)
         return Decision(ask.number, tuple([_plain(d) for d in directives]), elapsed_ns=elapsed_ns)
     except Exception as error:
         return Decision(ask.number, fault=str(error) if isinstance(error, PolicyError) else describe_error(error))

@@ -187,6 +187,8 @@ def side_by_side(flown: Flown) -> dict[str, list[str]]:
     }
     least = [[min(s.outcome["battery"].values(), default=None) for s in of] for of in _by_policy(flown).values()]
     rows["charge left, least"] = [percent(mean_of_known(values)) for values in least]
+    own = dict.fromkeys(name for s in flown.sorties for name in s.outcome["metrics"])
+    rows |= {f"metrics.{name}": mean("metrics", name, text=lambda v: number(v, ".4g")) for name in own}
     return {name: cells for name, cells in rows.items() if cells}
 
 

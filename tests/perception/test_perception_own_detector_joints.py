@@ -135,5 +135,5 @@ def test_parked_cars_stay_where_they_are_whatever_a_detector_does_to_them() -> N
 def test_its_truth_and_its_count_are_checked(made: Callable[[str], Any]) -> None:
     with pytest.raises(PluginError, match="truth returns None, must be Boxes"):
         made("truth").truth(5.0, capture())
-    with pytest.raises(PluginError, match="count_boxes returns -1, must be a whole number"):
+    with pytest.raises(PluginError, match="count_boxes returns -1, must be a whole number from 0 to 1,000,000"):
         made("count").count_boxes(capture(), None)

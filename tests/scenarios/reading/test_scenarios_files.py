@@ -166,6 +166,19 @@ def test_brackets_that_are_none_are_refused(name: str) -> None:
         loads("name: a", overrides=[f"radio.link={name}"])
 
 
+def test_a_policy_s_name_takes_parameters_in_brackets_and_no_other_name_does() -> None:
+    flown = {"name": "all-4(rho=0.1)", "changes": [{"at_s": 1, "name": "p.py:decide(k=2)"}]}
+    plain = {
+        "name": "all-4",
+        "params": {"rho": 0.1},
+        "changes": [{"at_s": 1, "name": "p.py:decide", "params": {"k": 2}}],
+    }
+    given = {"name": "mine(a=1)", "fleet": {"makes": [{"name": "small(b=2)", "policy": "best-2(rho=0.2)"}]}}
+    make = {"name": "small(b=2)", "policy": "best-2", "policy_params": {"rho": 0.2}}
+    wanted = {"name": "mine(a=1)", "fleet": {"makes": [make]}, "policy": plain}
+    assert without_brackets({**given, "policy": flown}) == wanted
+
+
 def test_values_in_brackets_are_yaml_with_lists_and_quoted_commas() -> None:
     text = """own.py:L(speeds=[1, 2.5], name="a, b)", to={x: 1, y: 'c,d'}, said='it''s, so', who=it's)"""
     params = {"speeds": [1, 2.5], "name": "a, b)", "to": {"x": 1, "y": "c,d"}, "said": "it's, so", "who": "it's"}

@@ -120,11 +120,11 @@ def test_failed_runs_are_counted_listed_and_taken_out_with_their_replication(tmp
     """Run 4 is `worked` in the second replication: what is left are 1300 and 1500 B, and 2300 and 2700 B."""
     flown = rows(tmp_path, {4: "ValueError: planted"})
     text = told(flown, tmp_path)
+    assert "12 of 12 runs: 3 replications × 2 grid points × 2 policies on the same draws; 1 failed." in text
     assert (
-        "12 of 12 runs: 3 replications at 2 grid points, 3 replications, 2 policies on the same draws; 1 failed."
+        "1 of the replications is left out of all means, where all runs of a policy at a grid point failed (worked 1)"
         in text
     )
-    assert "1 of the replications are left out of all means, where a policy's runs failed (worked 1)" in text
     assert (
         f"- run 4 (worked, seed 94): ValueError: planted  \n  `sortie fly --from-campaign {tmp_path} --run 4`" in text
     )

@@ -167,7 +167,7 @@ def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> No
     text = write_report(folder).read_text()
     assert text == write_report(folder).read_text()
     for part in (
-        "48 of 48 runs: 6 draws at 2 grid points, 2 replications, 2 policies on the same draws; 1 failed.",
+        "48 of 48 runs: 6 draws × 2 grid points × 2 replications × 2 policies on the same draws; 1 failed.",
         "- run 3 (best-2(received_budget=0.1), seed ",
         "ValueError: planted",
         f"sortie fly --from-campaign {folder} --run 3",
@@ -327,7 +327,7 @@ def test_one_draw_gives_no_interval(tmp_path: Path) -> None:
 
     rows = rows_of(tmp_path, ONE_METRIC.replace("{count: 6}", "{count: 1}"), lambda fields, policy: policy)
     told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
-    assert "1 draws, 1 replication" in told
+    assert "1 draw × 1 replication × 2 policies" in told
     assert "One draw gives no interval: ask for more, by `sample.count`." in told
 
 

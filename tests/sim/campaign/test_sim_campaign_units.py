@@ -86,7 +86,7 @@ def test_a_policy_that_fails_where_it_is_hard_gains_nothing_by_it(tmp_path: Path
     rows = read_rows(folder)
     assert rows.by_unit("bytes.data_sent").mean(axis=0).tolist() == [0.0, 1.0]
     assert winner(rows, "bytes.data_sent") == "worked"
-    said = "2 of the draws are left out of all means, where a policy's runs failed (best-2(received_budget=0.1) 2): policies are"
+    said = "2 of the draws are left out of all means, where all runs of a policy at a grid point failed (best-2(received_budget=0.1) 2): policies are"
     assert said in write_report(folder).read_text()
 
 

@@ -88,6 +88,9 @@ class Late:
 def many(record):
     return [1.0]
 
+def tables(record, *, names):
+    return sum(record.tables[name].num_rows for name in names)
+
 def any_number(record):
     return np.random.random()
 
@@ -177,9 +180,16 @@ def test_each_rule_fails_for_a_model_that_breaks_it(kind: str, name: str, fails:
         assert found[rule].startswith(what), found
 
 
+def test_a_metric_is_asked_with_the_tables_that_a_scenario_may_ask_for() -> None:
+    assert all(c.holds for c in verify("metric", "broken.py:tables", {"names": ["beliefs", "views"]}))
+
+
 def test_boxes_of_a_wrong_shape_are_told() -> None:
     (check,) = verify("detector", "broken.py:Blind", {"size": 3})
-    assert check.what == "alone: detector broken.py:Blind: detect returns size_m of shape (1, 3), must be (1, 2)"
+    assert (
+        check.what
+        == "alone: detector broken.py:Blind: detect returns size_m of shape (1, 3), must be numbers of shape (1, 2)"
+    )
 
 
 def test_a_kind_or_a_model_that_is_not_there_is_an_error() -> None:

@@ -91,6 +91,17 @@ class Short(Omniscient):
         return []
 
 
+class Forgets(Omniscient):
+    def detect(self, jobs):
+        super().detect(jobs)
+
+
+class Texts(Omniscient):
+    def truth(self, t_s, ego):
+        boxes = super().truth(t_s, ego)
+        return Boxes(boxes.xy_m, boxes.size_m, boxes.yaw_rad, np.full(len(boxes), "sure"))
+
+
 class Storm:
     """Weakens every link, jams, empties the battery of drone 1, and loses drone 2, as its parameters say."""
 
@@ -110,6 +121,20 @@ class Storm:
             fleet.set_loss_db(np.where(np.eye(5, k=1), np.nan, 3.0))
         if self.wrong == "drone":
             fleet.lose(99)
+        if self.wrong == "loss_of_each":
+            fleet.set_loss_db(np.array([50.0, 0.0, 0.0, 0.0, 0.0]))
+        if self.wrong == "loss_text":
+            fleet.set_loss_db("30")
+        if self.wrong == "place":
+            fleet.jam((0.0, 0.0), 30.0)
+        if self.wrong == "power":
+            fleet.jam((0.0, 0.0, 0.0), "30")
+        if self.wrong == "moves":
+            fleet.positions_m[:] = 0.0
+        if self.wrong == "lands":
+            fleet.airborne[:] = False
+        if self.wrong == "invents":
+            fleet.loss_db = 30.0
 
     def step(self, fleet):
         self.steps.append(fleet.t_s)
@@ -133,6 +158,10 @@ def sent(record, *, times=1.0):
 
 def nothing(record):
     return None
+
+
+def huge(record):
+    return 10**400
 
 
 def words(record):

@@ -79,6 +79,8 @@ def test_an_edited_file_has_another_digest(models: str) -> None:
         ("radio.link=mine.py:constant", r"^link constant: TypeError: "),
         ("perception.detector=mine.py:Half", r"^detector mine.py:Half has no 'truth', must have detect, truth, count_boxes, camera_views$"),
         ("perception.detector=mine.py:Short", r"^detector mine.py:Short: detect returns \[\], must be Boxes for each of the jobs$"),
+        ("perception.detector=mine.py:Forgets", r"^detector mine.py:Forgets: detect returns None, must be Boxes for each of the jobs$"),
+        ("perception.detector=mine.py:Texts", r"^detector mine.py:Texts: truth returns score of shape \(\d+,\), must be numbers of shape \(\d+,\)$"),
         ("fleet.airframe.power_model=mine.py:negative", r"^power negative: returns -1 W, must be ≥ 0$"),
         ("fleet.battery.cell_model=mine.py:falling", r"^cell falling: falls from 4 to 3.99997 V at a charge of 0.000, must not fall as the charge rises$"),
         ("fleet.battery={cell_model: mine.py:straight, cell_params: {empty_v: 0}}", r"^cell straight: 0 V at a charge of 0.000, must be above 0$"),
@@ -144,6 +146,13 @@ def test_it_may_lose_a_drone_and_take_energy(models: str) -> None:
         ("loss", r"^event mine.py:Storm: a loss of -1 dB, must be finite and ≥ 0$"),
         ("loss_nan", r"^event mine.py:Storm: a loss of nan dB, must be finite and ≥ 0$"),
         ("drone", r"^event mine.py:Storm: drone 99, must be a whole number, 0 … \d$"),
+        ("loss_of_each", r"^event mine.py:Storm: a loss of shape \(5,\), must be of shape \(5, 5\), or one number$"),
+        ("loss_text", r"^event mine.py:Storm: '30', must be numbers, of shape \(5, 5\), or one number$"),
+        ("place", r"^event mine.py:Storm: a jammer of 30.0 dBm at \(0.0, 0.0\), must be one number at three$"),
+        ("power", r"^event mine.py:Storm: '30', must be numbers, one$"),
+        ("moves", r"^event Storm.begin: ValueError: assignment destination is read-only \(mine.py, line \d+\)$"),
+        ("lands", r"^event Storm.begin: ValueError: assignment destination is read-only \(mine.py, line \d+\)$"),
+        ("invents", r"^event Storm.begin: AttributeError: 'FleetHandle' object has no attribute 'loss_db'"),
     ],
 )
 def test_what_an_event_may_not_do_is_refused(wrong: str, message: str, models: str) -> None:
@@ -173,6 +182,7 @@ def test_a_saved_run_keeps_its_metrics_without_their_file(models: str, tmp_path:
     ("function", "message"),
     [
         ("words", r"^metric all \(mine.py:words\): returns 'many', must be a finite number or None$"),
+        ("huge", r"^metric all \(mine.py:huge\): returns 10{59}, must be a finite number or None$"),
         ("endless", r"^metric all \(mine.py:endless\): returns inf, must be a finite number or None$"),
         ("fails", r"^metric fails: KeyError: 'no such table' \(mine.py, line \d+\)$"),
         ("gone", r"^metric file 'mine.py' has no function or class 'gone'$"),

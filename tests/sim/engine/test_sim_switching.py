@@ -193,11 +193,11 @@ def test_a_shield_that_cannot_be_is_refused_before_the_flight(invariant: str, me
 # --- a user's policy -----------------------------------------------------------------------------
 
 BROKEN = {
-    "greedy": ("[Directive(view.ego, p, rho=7.0) for p in view.peers]", r"directive 0→\d: rho is 7\.0, must be in \[0, 1\]"),
-    "stray": ("[Directive(view.ego, 77)]", r"directive 0→77: destination 77 is not a peer in the view"),
+    "greedy": ("[Directive(view.ego, p, rho=7.0) for p in view.peers]", r"^policy '.*greedy' on drone \d: directive 0→\d: rho is 7\.0, must be in \[0, 1\]"),
+    "stray": ("[Directive(view.ego, 77)]", r"^policy '.*stray' on drone \d: directive 0→77: destination 77 is not a peer in the view"),
     "empty": ("None", r"policy '.*empty' on drone \d returns NoneType, must be a sequence of directives"),
     "crash": ("[1 / 0]", r"policy '.*crash' on drone \d raises ZeroDivisionError: division by zero \(mine\.py, line 4\)"),
-    "wrong": ("['features']", "a policy returns Directive, got str"),
+    "wrong": ("['features']", r"^policy '.*wrong' on drone \d: a policy returns Directive, got str"),
 }  # fmt: skip
 
 

@@ -102,6 +102,16 @@ def test_a_comparison_is_headed_by_its_sorties_and_by_what_its_intervals_cover()
         assert words in caption
 
 
+def test_metrics_of_ones_own_have_a_row_each_with_the_mean_of_what_is_known() -> None:
+    both = flown()
+    for k, compared in enumerate(both.sorties):
+        compared.outcome["metrics"] = {"first_s": 1.5 * k, "found": None if k < 2 else k}
+    rows = side_by_side(both)
+    by_policy = {p: [k for k, s in enumerate(both.sorties) if s.policy == p] for p in "ab"}
+    assert rows["metrics.first_s"] == [f"{1.5 * sum(ks) / 2:.4g}" for ks in by_policy.values()]
+    assert rows["metrics.found"][0] in ("–", "2 (1 of 2)", "3 (1 of 2)")
+
+
 def test_the_table_and_the_markdown_have_the_same_cells() -> None:
     rows = side_by_side(flown())
     table = comparison_table(flown())

@@ -129,7 +129,7 @@ def test_the_command_prints_and_keeps_each_policy_s_own_figures(
         ["poor", "0.02", "0.400", "[bold]0.500[/bold]", "0.450"], ["rich", "0.25", "0.600", "[bold]0.800[/bold]", "0.300"],
     ]  # fmt: skip
     assert [str(c.header) for c in second.columns] == [
-        "policy", "AP", "over all-4, 95 %", "oracle", "data", "kJ", "missed",
+        "policy", "AP", "over all-4, 95 %", "of oracle", "data", "kJ", "missed",
     ]  # fmt: skip
     rows = cells_of(second)
     assert [row[:2] + row[3:] for row in rows] == [
