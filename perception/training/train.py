@@ -43,6 +43,8 @@ CHECK_STEPS, CHECK_FRAMES, CHECK_EGOS = 100, 12, 2
 
 log_to_nowhere = logging.getLogger("sortie.train")
 Scalars = Callable[[int, dict[str, float]], None]
+CURVE = {"loss": "train/loss", "lr": "train/lr", "ap_single": "validation/ap_single", "ap_full": "validation/ap_full"}
+"""The columns of `loss.csv` after the step, and the name of the value in each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,15 @@ class TrainResult:
     validation: Difference
     frames: int
     minutes: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Progress:
+    """How far a run has come: its steps, the time they took, and the losses of the last 50."""
+
+    step: int = 0
+    spent_s: float = 0.0
+    recent: tuple[float, ...] = ()
 
 
 def learning_rate(step: int, steps: int, peak: float = PEAK_LR) -> float:
@@ -94,6 +105,7 @@ def train(
         device: as `device_named` takes it.
         progress: called with (stage, done, of).
         scalars: called with (step, values by name) for loss curves: train/loss, train/lr, validation/ap_single, validation/ap_full.
+            A resumed run first calls it with the rows that `loss.csv` already has.
 
     Raises:
         ValueError: weights that cannot be read, a benchmark of another range than the network's, or no such device.
@@ -129,13 +141,12 @@ def train(
     run = {**asdict(recipe), "model": asdict(config), "benchmark": bench.key()}
     work.mkdir(parents=True, exist_ok=True)
     checkpoint = work / "checkpoint.safetensors"
-    done, spent = _restore(checkpoint, run, net, optimiser, log) if resume else (0, 0.0)
+    before = _restore(checkpoint, run, net, optimiser, log) if resume else _Progress()
+    done, recent = before.step, before.recent
     curve = work / "loss.csv"
-    if done == 0:
-        curve.write_text("step,loss,lr,ap_single,ap_full\n")
+    for step, row in _resume_curve(curve, done):
+        show(step, row)
     replicas = [copy.deepcopy(net) for _ in range(SHARDS)]
-    recent: list[float] = []  # a resumed run's mean begins anew; its weights do not know
-    loss = float("nan")
     with ThreadPoolExecutor(SHARDS) as pool:
         saved_s = time.monotonic()
         for step in range(done, recipe.steps):
@@ -158,11 +169,10 @@ def train(
             values, grads = zip(*(job.result() for job in jobs), strict=True)
             apply(net, replicas, list(grads), optimiser)
             done = step + 1
-            recent = [*recent[-49:], float(np.mean(values))]
-            loss = float(np.mean(recent))
+            recent = (*recent[-49:], float(np.mean(values)))
             late = minutes is not None and time.monotonic() - begun > 60 * minutes
             if done % 10 == 0 or done == recipe.steps or late:
-                row = {"train/loss": loss, "train/lr": rate}
+                row = {"train/loss": float(np.mean(recent)), "train/lr": rate}
                 if done % CHECK_STEPS == 0 and done < recipe.steps:
                     gain = validate(copy.deepcopy(net), check, where, CHECK_EGOS)
                     row |= {"validation/ap_single": gain.ap_a, "validation/ap_full": gain.ap_b}
@@ -172,11 +182,13 @@ def train(
                 log.info("step %d of %d, %s", done, recipe.steps, ", ".join(f"{k} {v:.4g}" for k, v in row.items()))
             if done % SAVE_STEPS == 0 or done == recipe.steps or late or time.monotonic() - saved_s > SAVE_S:
                 saved_s = time.monotonic()
-                _save(checkpoint, {**run, "step": done, "spent_s": spent + time.monotonic() - begun}, net, optimiser)
+                now = _Progress(done, before.spent_s + time.monotonic() - begun, recent)
+                _save(checkpoint, {**run, **asdict(now)}, net, optimiser)
             if late:
                 log.info("stopped after %.1f minutes at step %d of %d", minutes, done, recipe.steps)
                 break
-    spent += time.monotonic() - begun
+    spent = before.spent_s + time.monotonic() - begun
+    loss = float(np.mean(recent))
 
     facts = {**asdict(recipe), "done": done, "loss": round(loss, 4), "minutes": round(spent / 60, 1)}
     levels = validate_all(net, validation, bench, where, lambda i, n: tell("validating", i, n))
@@ -221,11 +233,23 @@ def _begin_from(net: CarNet, path: Path, log: logging.Logger) -> None:
         log.info("begin anew: %s", ", ".join(anew))
 
 
+def _resume_curve(path: Path, done: int) -> list[tuple[int, dict[str, float]]]:
+    """The rows of the loss curve up to the checkpoint; the file loses later ones, because their steps are done again."""
+    rows: list[dict[str, str]] = []
+    if done and path.is_file():
+        with path.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if int(row["step"]) <= done]
+    with replacing(path) as part, part.open("w", newline="") as file:
+        kept = csv.DictWriter(file, ("step", *CURVE))
+        kept.writeheader()
+        kept.writerows(rows)
+    return [(int(row["step"]), {CURVE[c]: float(row[c]) for c in CURVE if row[c]}) for row in rows]
+
+
 def _note(path: Path, step: int, row: dict[str, float]) -> None:
     """One more line of the loss curve."""
-    columns = ("train/loss", "train/lr", "validation/ap_single", "validation/ap_full")
     with path.open("a", newline="") as file:
-        csv.writer(file).writerow([step, *(f"{row[c]:.4g}" if c in row else "" for c in columns)])
+        csv.writer(file).writerow([step, *(f"{row[c]:.4g}" if c in row else "" for c in CURVE.values())])
 
 
 def _save(path: Path, facts: dict[str, Any], net: CarNet, optimiser: torch.optim.Optimizer) -> None:
@@ -241,17 +265,17 @@ def _save(path: Path, facts: dict[str, Any], net: CarNet, optimiser: torch.optim
 
 def _restore(
     path: Path, run: dict[str, Any], net: CarNet, optimiser: torch.optim.Optimizer, log: logging.Logger
-) -> tuple[int, float]:
-    """Load a checkpoint of the same run; (0, 0.0) when there is none or it belongs to another."""
+) -> _Progress:
+    """Load a checkpoint of the same run; no progress when there is none or it belongs to another."""
     from safetensors import safe_open
 
     if not path.is_file():
-        return 0, 0.0
+        return _Progress()
     with safe_open(path, framework="pt") as file:
         facts = json.loads(file.metadata()["sortie"])
-        if any(facts.get(k) != v for k, v in run.items()):
+        if "recent" not in facts or any(facts.get(k) != v for k, v in run.items()):
             log.info("%s belongs to another run (%s); starting anew", path, facts)
-            return 0, 0.0
+            return _Progress()
         tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (not a mapping)
     net.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("net.")})
     state: dict[int, dict[str, Tensor]] = {}
@@ -261,4 +285,4 @@ def _restore(
             state.setdefault(int(index), {})[key] = value
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     log.info("resuming at step %d", facts["step"])
-    return int(facts["step"]), float(facts["spent_s"])
+    return _Progress(facts["step"], facts["spent_s"], tuple(facts["recent"]))

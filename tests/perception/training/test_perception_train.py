@@ -4,6 +4,8 @@ import json
 import logging
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -243,3 +245,69 @@ def test_a_share_of_the_steps_is_on_the_varied_scenes(
     assert len(steps) == 19
     assert steps.count(78) == sum(stream(0, 0, step, "train.varied").random() < 0.3 for step in range(19)) > 0
     assert steps.count(77) > steps.count(78)
+
+
+class Killed(Exception):
+    """The run ends in the middle of a step."""
+
+
+class Runs:
+    """Runs of thirty steps that compute no gradients: the loss of a step is its square root. Checkpoints at 15 and 30."""
+
+    def __init__(self, folder: Path, scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder, self.killed_at = folder, 99
+        self.published: list[dict[str, Any]] = []
+        monkeypatch.setattr(training, "SAVE_STEPS", 15)
+        monkeypatch.setattr(training, "make_split", lambda *_, **__: [scene_file])
+        monkeypatch.setattr(training, "draw_batch", self._draw)
+        monkeypatch.setattr(
+            training, "gradients", lambda net, step, *_: (step**0.5, map(torch.zeros_like, net.parameters()))
+        )
+        gain = SimpleNamespace(ap_a=0.25, ap_b=0.5)
+        monkeypatch.setattr(training, "validate_all", lambda *_: [SimpleNamespace(gain=gain)])
+        monkeypatch.setattr(training, "publish", lambda net, out, bench, runs, levels: self.published.append(runs[-1]))
+
+    def _draw(self, frames: Frames, seed: int, step: int, shard: int) -> int:
+        if step == self.killed_at:
+            raise Killed
+        return step
+
+    def train(self, name: str, killed_at: int = 99) -> list[tuple[int, dict[str, float]]]:
+        """The values of the loss curves."""
+        self.killed_at = killed_at
+        seen: list[tuple[int, dict[str, float]]] = []
+        train(self.folder / name / "w.safetensors", Recipe(steps=30), device="cpu", scalars=lambda *at: seen.append(at))
+        return seen
+
+    def curve(self, name: str) -> str:
+        return (self.folder / name / "loss.csv").read_text()
+
+
+@pytest.fixture
+def runs(tmp_path: Path, scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> Runs:
+    return Runs(tmp_path, scene_file, monkeypatch)
+
+
+def test_a_run_that_was_killed_and_resumed_has_the_loss_and_the_curves_of_the_whole_one(runs: Runs) -> None:
+    """Rows after the checkpoint are written again, not twice; the recording gets those from before it as well."""
+    whole = runs.train("whole")
+    assert [step for step, _ in whole] == [10, 20, 30, 30]
+    with pytest.raises(Killed):
+        runs.train("parts", killed_at=22)
+    assert runs.curve("parts") == runs.curve("whole")[: len(runs.curve("parts"))]
+    assert "\n20," in runs.curve("parts")
+    resumed = runs.train("parts")
+    assert runs.curve("parts") == runs.curve("whole")
+    assert [step for step, _ in resumed] == [10, 20, 30, 30]
+    assert all(now == pytest.approx(then, rel=1e-3) for (_, now), (_, then) in zip(resumed, whole, strict=True))
+    assert runs.published[1]["loss"] == runs.published[0]["loss"] == round(sum(k**0.5 for k in range(30)) / 30, 4)
+
+
+def test_a_finished_run_that_is_started_again_writes_the_same_card_and_the_same_curve(runs: Runs) -> None:
+    runs.train("whole")
+    curve = runs.curve("whole")
+    again = runs.train("whole", killed_at=0)  # no step is left
+    first, second = runs.published
+    assert {**second, "minutes": first["minutes"]} == first
+    assert runs.curve("whole") == curve
+    assert [step for step, _ in again] == [10, 20, 30, 30]
