@@ -132,7 +132,7 @@ class FleetBatteries:
     def step(
         self, dt_s: float, rotor_w: Sequence[float], duty: Sequence[float], airtime_share: Sequence[float]
     ) -> None:
-        """Drain every flying drone's pack for `dt_s`.
+        """Drain every flying drone's pack for `dt_s`; packs on the ground take on the temperature of the air.
 
         Args:
             dt_s: length of the step, s.
@@ -151,7 +151,11 @@ class FleetBatteries:
         radio_j, ohmic_j = self.energy_j["radio"], self.energy_j["ohmic"]
         self._now_s += dt_s
         for i, down in enumerate(landed):
-            if down or (mains and i in mains):
+            if mains and i in mains:
+                continue
+            if down:
+                if self._packs[i].ambient_c is not None:
+                    self._warm(i, 0.0, dt_s)
                 continue
             if traces and i in traces:
                 self._follow(i, dt_s)

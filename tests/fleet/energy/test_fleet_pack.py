@@ -64,6 +64,19 @@ def test_cold_raises_resistance_and_the_pack_warms_itself() -> None:
     assert b.temperature_c[0] > 0
 
 
+def test_a_pack_on_the_ground_cools_to_the_air_while_one_in_flight_stays_warm() -> None:
+    b = FleetBatteries((Battery(ambient_c=-10), Battery(), Battery(ambient_c=-10)), (), 3)
+    steady(b, 300.0, dt_s=1.0)
+    warm_c, spent = b.temperature_c[0], b.spent_j[0]
+    b.land(0, "told to")
+    b.land(1, "told to")
+    b.step(900.0, [HOVER_W] * 3, [0.5] * 3, [0.1] * 3)
+    assert b.temperature_c[0] == pytest.approx(-10 + (warm_c + 10) / math.e)
+    assert b.temperature_c[1] == 25.0
+    assert b.temperature_c[2] > warm_c
+    assert b.spent_j[0] == spent
+
+
 def test_without_a_temperature_packs_stay_at_25_degrees() -> None:
     b = FleetBatteries(Battery(), (), 1)
     steady(b, 60.0)
