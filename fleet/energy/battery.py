@@ -296,11 +296,12 @@ class FleetBatteries:
         return spent_j
 
     def _read_off(self, drone: int) -> None:
-        """Charge, and the voltage at the present current, from the energy left."""
+        """Charge, and the voltage at the present current, from the energy left; 0 V where the pack no longer gives it."""
         at = self.energy_left_j[drone] / self._full_j[drone] * STEPS
         k = int(at)
         cells, (soc, volts) = self.cells[drone], self._curves[drone][:2]
         self.soc[drone] = soc[k] + (at - k) * (soc[k + 1] - soc[k])
         open_v = cells * (volts[k] + (at - k) * (volts[k + 1] - volts[k]))
-        ohmic_v = self.current_a[drone] * self._resistance_ohm[drone]
-        self.voltage_v[drone] = open_v - ohmic_v
+        resistance = self._resistance_ohm[drone] * resistance_factor(self.temperature_c[drone])
+        lag_v = cells * self._polarised_v[drone]
+        self.voltage_v[drone] = max(0.0, open_v - lag_v - self.current_a[drone] * resistance)

@@ -160,6 +160,20 @@ def test_charge_falls_faster_on_fewer_cells() -> None:
     assert 0.95 - b.soc[0] == pytest.approx(4 / 3 * (0.95 - b.soc[1]), rel=0.05)
 
 
+def test_the_voltage_after_a_fault_is_that_of_the_cold_and_polarised_pack() -> None:
+    """Between that of the step before and that of the next; a lost cell takes its own share of it."""
+    cold = Battery(ambient_c=-5, polarisation=Polarisation(resistance_mohm=5, time_s=20))
+    b = FleetBatteries(cold, (), 2)
+    steady(b, 60.0)
+    before_v, whole_v = b.voltage_v
+    b.fault(0, 0.001)
+    b.drop_cell(1)
+    after_v, three_cells_v = b.voltage_v
+    assert three_cells_v == pytest.approx(3 / 4 * whole_v, abs=0.001)
+    steady(b, 0.1)
+    assert b.voltage_v[0] < after_v < before_v
+
+
 # --- a trace in place of the model ---------------------------------------------------------------
 
 
@@ -235,6 +249,7 @@ def test_the_ledger_holds_with_every_effect_on(
                 b.drop_cell(i)
             elif isinstance(happens, float):
                 b.fault(i, happens)
+            assert b.voltage_v[i] >= 0
         b.step(dt_s, [rotor_w, 0.0, rotor_w], [duty, 0.0, duty], [airtime, 0.0, airtime])
         for i in range(3):
             assert 0 <= b.soc[i] <= charge[i] + 2e-6  # never rises; the look-up is good to 1e-6
