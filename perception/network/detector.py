@@ -2,7 +2,9 @@
 
 A capture costs nothing until a job needs it. Features, confidences and single-drone boxes of a capture are
 kept for the latest 64 captures, so a frame that is shared to four peers is rendered and encoded once. Every
-network call has the same shapes whatever else is computed, so the same capture gives the same numbers.
+network call has the same shapes whatever else is computed, so the same pictures give the same boxes. Pictures of a
+capture depend slightly on which captures are rendered in the same call or were rendered before (perception/README.md).
+The same calls in the same order give the same boxes.
 """
 
 from __future__ import annotations

@@ -231,8 +231,9 @@ def with_detector(contender: Contender, detector: str) -> Contender:
 def shared_detector() -> DetectorMaker:
     """Makes detectors so that sorties of one seed, flown one after the other, share the torch detector.
 
-    Policies do not change where drones fly, so the sorties of a seed mostly encode the same captures. The numbers do not
-    depend on it.
+    Policies do not change where drones fly, so the sorties of a seed mostly encode the same captures. Boxes may
+    differ slightly from those of a detector of its own, because captures are rendered together with others
+    (perception/README.md).
     """
     last: list[tuple[object, Detector | None]] = []
 
