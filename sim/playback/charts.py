@@ -19,6 +19,7 @@ from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback.canvas import Canvas, line
 from sortie.sim.results import palette
+from sortie.sim.results.link_traffic import mean_goodput
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.palette import Floats
 from sortie.sim.results.record import TABLES
@@ -120,13 +121,12 @@ class Charts:
     # --- plots -----------------------------------------------------------------------------------
 
     def _goodput(self, descriptors: pa.Table) -> None:
-        """The mean goodput of each drone's links that were ever measured; a gap before the first measurement."""
+        """The mean goodput of each drone's links that were tried lately; a gap while there are none."""
         drone, t_s = descriptors["drone"].to_numpy(), descriptors["t_s"].to_numpy()
         links = descriptors["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(-1, max(1, self._n - 1))
         if self._n < 2:
             return
-        measured = links > 0
-        mean = np.where(measured.any(axis=1), links.sum(axis=1) / np.maximum(measured.sum(axis=1), 1), np.nan)
+        mean = mean_goodput(links)
         for i in range(self._n):
             self._canvas.scalars(f"plots/goodput/{i}", t_s[drone == i], mean[drone == i])
 

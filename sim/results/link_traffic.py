@@ -6,9 +6,21 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from sortie.scenarios.link_state import is_tried
+
 Floats = NDArray[np.float64]
 
 RECENT_S = 1.0
+
+
+def mean_goodput(links: Floats) -> Floats:
+    """The mean over each row's links [..., link] that were measured or are silent, Mb/s; NaN where there are none.
+
+    A probed link is left out: its value says that its peer's descriptors arrive, and is no rate.
+    """
+    tried = is_tried(links)
+    total, count = np.where(tried, links, 0.0).sum(axis=-1), tried.sum(axis=-1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 class LinkTraffic:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from sortie.perception.metrics.ap import average_precision
 from sortie.perception.scene.traffic import TargetPath
-from sortie.scenarios.link_state import is_tried
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema.events import Jam
 from sortie.sim.folders import RunError
 from sortie.sim.results.accuracy import matched
+from sortie.sim.results.link_traffic import mean_goodput
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
 from sortie.sim.results.sentences import event_in_words
@@ -302,10 +302,7 @@ def _goodput(axes: Axes, record: SortieRecord) -> None:
         return
     drone, t_s = table["drone"].to_numpy(), _column(table, "t_s")
     links = table["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(len(t_s), _drones(record) - 1)
-    known = is_tried(links)
-    mean = np.where(
-        known.any(axis=1), np.where(known, links, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan
-    )
+    mean = mean_goodput(links)
     edges = _edges(record)
     for i in range(_drones(record)):
         own = (drone == i) & ~np.isnan(mean)

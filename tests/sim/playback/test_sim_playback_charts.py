@@ -74,11 +74,15 @@ def test_batteries_are_in_percent_and_each_drone_s_own(seconds: tuple[float, ...
     assert made["plots/battery/1"] == [(0, 80), (1, 79), (2, 78), (3, 77)]
 
 
-def test_goodput_is_the_mean_of_the_links_that_were_ever_measured(seconds: tuple[float, ...]) -> None:
-    said = [(0.2, 0, [10.0, 30.0]), (0.7, 0, [40.0, 0.0]), (1.5, 1, [0.0, 0.0]), (2.5, 1, [5.0, 7.0])]
+def test_goodput_is_the_mean_of_the_links_that_were_tried_lately(seconds: tuple[float, ...]) -> None:
+    """A probed link reads 2^-9 Mb/s at most, and is left out. A silent one reads 2^-10, and carries nothing."""
+    said = [
+        (0.2, 0, [10.0, 30.0]), (0.7, 0, [40.0, 0.0]), (1.2, 0, [60.0, 2.0**-9]), (1.7, 0, [60.0, 2.0**-10]),
+        (1.5, 1, [0.0, 2.0**-9]), (2.5, 1, [5.0, 7.0]),
+    ]  # fmt: skip
     given = {"descriptors": [{"t_s": t_s, "drone": d, "goodput_mbps": links} for t_s, d, links in said], "states": []}
     made = drawn(given, drones=3, seconds=seconds)
-    assert made["plots/goodput/0"] == [(0.2, 20.0), (0.7, 40.0)]
+    assert made["plots/goodput/0"] == [(0.2, 20.0), (0.7, 40.0), (1.2, 60.0), (1.7, pytest.approx(30.0, abs=1e-3))]
     (first_s, gap), second = made["plots/goodput/1"]
     assert (first_s, math.isnan(gap), second) == (1.5, True, (2.5, 6.0))
     assert "plots/goodput/2" not in made
