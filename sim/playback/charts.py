@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+from numpy.typing import NDArray
 
 from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.scenarios.representation import REPRESENTATION_OF
@@ -58,6 +59,8 @@ class Charts:
         self._received: Floats = np.zeros((0, len(TABLES["receptions"])))
         self._window: deque[Sighting] = deque()
         self._carried: dict[tuple[int, int], str] = {}
+        self._up: NDArray[np.bool_] = np.zeros(self._n, bool)
+        self._decided: dict[int, str] = {}
         self._lanes: dict[int, str] = {}
         self._lane_colours: dict[int, dict[str, palette.Rgba]] = defaultdict(dict)
         self._phase: dict[int, str] = {}
@@ -100,8 +103,7 @@ class Charts:
         self._losses(seconds, new["receptions"])
         self._accuracy(seconds, seen)
         self._phases(new["mission"])
-        self._decisions(new["directives"])
-        self._down(states)
+        self._decisions(new["directives"], states)
         self._events(new["events"])
         if known_s >= self._scenario.duration_s and not self._over:
             self._end_lanes()
@@ -220,12 +222,12 @@ class Charts:
                 self._phase[group] = phase
                 self._state(phase_lane(group), t_s, phase)
 
-    def _decisions(self, directives: pa.Table) -> None:
+    def _decisions(self, directives: pa.Table, states: pa.Table) -> None:
         """Log each change of what a link carries, in words; a drone's lane shows the highest rung of its links."""
-        changes = []
+        changes, decided = [], []
         for change in transitions(directives, self._carried):
             changes.append(change)
-            self._lane(change["t_s"], change["drone"])
+            decided.append((change["t_s"], change["drone"], self._best(change["drone"])))
         if changes:
             columns = rr.TextLog.columns(
                 text=[decision_in_words(x) for x in changes],
@@ -233,19 +235,26 @@ class Charts:
                 color=[palette.drone_colour(x["drone"]) for x in changes],
             )
             self._canvas.columns("log/decisions", np.array([x["t_s"] for x in changes]), columns)
+        self._drone_lanes(decided, states)
 
-    def _lane(self, t_s: float, drone: int) -> None:
-        """Show what the drone sends on its best link."""
+    def _best(self, drone: int) -> str:
+        """What the drone was last to send on its best link."""
         levels = [level for (sender, _), level in self._carried.items() if sender == drone]
-        self._show(t_s, drone, max(levels, key=lambda level: RUNGS.index(level.split(" ")[0])))
+        return max(levels, key=lambda level: RUNGS.index(level.split(" ")[0]))
 
-    def _down(self, states: pa.Table) -> None:
-        """Who is down sends nothing, whatever was last decided."""
-        down = ~states["airborne"].to_numpy()
-        drones, first = np.unique(states["drone"].to_numpy()[down], return_index=True)
-        for drone, t_s in zip(drones.tolist(), states["t_s"].to_numpy()[down][first].tolist(), strict=True):
-            if drone in self._lanes:
-                self._show(t_s, drone, "nothing")
+    def _drone_lanes(self, decided: list[tuple[float, int, str]], states: pa.Table) -> None:
+        """Show what each drone decided to send on its best link, and "nothing" while it is down."""
+        up = states["airborne"].to_numpy().reshape(-1, self._n)
+        frames, drones = np.nonzero(np.diff(up, axis=0, prepend=self._up[None]))
+        t_s = states["t_s"].to_numpy()[:: self._n]
+        turns = zip(t_s[frames].tolist(), drones.tolist(), up[frames, drones].tolist(), strict=True)
+        for at_s, drone, change in sorted([*turns, *decided], key=lambda row: row[0]):
+            if isinstance(change, str):
+                self._decided[drone] = change
+            else:
+                self._up[drone] = change
+            if drone in self._decided:
+                self._show(at_s, drone, self._decided[drone] if self._up[drone] else "nothing")
 
     def _show(self, t_s: float, drone: int, level: str) -> None:
         """Let a drone's lane show a level from now on."""

@@ -12,7 +12,7 @@ import pytest
 from record_by_hand import record, rows, tables_of
 
 from sortie.scenarios.schema import Scenario
-from sortie.sim.playback.charts import Charts
+from sortie.sim.playback.charts import OVER, Charts
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.sightings import sightings
 
@@ -21,14 +21,18 @@ Series = dict[str, list[tuple[float, float]]]
 
 
 class Kept:
-    """A canvas that keeps the points of plot lines."""
+    """A canvas that keeps the points of plot lines, and the states of lanes."""
 
     def __init__(self) -> None:
         self.points: Series = {}
+        self.states: dict[str, list[tuple[float, str]]] = {}
 
     def static(self, path: str, *shown: Any) -> None: ...
 
-    def columns(self, path: str, t_s: Any, columns: Any) -> None: ...
+    def columns(self, path: str, t_s: Any, columns: Any) -> None:
+        if path.startswith("lanes/"):
+            texts = [text for column in columns for (text,) in column.as_arrow_array().to_pylist()]
+            self.states.setdefault(path, []).extend(zip(np.asarray(t_s, float).tolist(), texts, strict=True))
 
     def scalars(self, path: str, t_s: Any, values: Any) -> None:
         pairs = zip(np.asarray(t_s, float).tolist(), np.asarray(values, float).tolist(), strict=True)
@@ -40,8 +44,8 @@ def scenario(drones: int) -> Scenario:
     return made.model_copy(update={"fleet": made.fleet.model_copy(update={"drones": drones})})
 
 
-def drawn(given: dict[str, list[dict[str, Any]]], drones: int = 2, seconds: tuple[float, ...] = (4.0,)) -> Series:
-    """What is plotted of these tables, which come up to each of these seconds."""
+def charted(given: dict[str, list[dict[str, Any]]], drones: int = 2, seconds: tuple[float, ...] = (4.0,)) -> Kept:
+    """What is drawn of these tables, which come up to each of these seconds."""
     flown = replace(record(), tables=tables_of(rows() | given))
     kept, of = Kept(), scenario(drones)
     charts = Charts(kept, of)  # type: ignore[arg-type]
@@ -59,7 +63,13 @@ def drawn(given: dict[str, list[dict[str, Any]]], drones: int = 2, seconds: tupl
         regions = Regions(flown.tables["mission"], flown.scenario.mission)
         charts.add(known_s, new, sightings({k: new[k] for k in ("fusions", "detections", "truths")}, regions))
         before = known_s
-    return {path: points for path, points in kept.points.items() if points and "marks" not in path}
+    return kept
+
+
+def drawn(given: dict[str, list[dict[str, Any]]], drones: int = 2, seconds: tuple[float, ...] = (4.0,)) -> Series:
+    """What is plotted of these tables."""
+    points = charted(given, drones, seconds).points
+    return {path: found for path, found in points.items() if found and "marks" not in path}
 
 
 @pytest.fixture(params=[(4.0,), (1.0, 2.0, 3.0, 4.0)], ids=["at once", "by seconds"])
@@ -124,3 +134,21 @@ def test_accuracy_is_of_the_scene_and_of_the_disc(seconds: tuple[float, ...]) ->
     assert made["plots/ap/full_scene"][0][1] == 0.5
     assert made["plots/ap/full_scene"][3][1] == pytest.approx(2.5 / 6)
     assert made["plots/ap/mission"] == [(3, 0.5), (4, pytest.approx(2 / 3))]
+
+
+def test_a_drone_s_lane_shows_nothing_each_time_that_it_is_down(seconds: tuple[float, ...]) -> None:
+    """It joins at 0.5 s, and is lost twice. While it is down the first time, only its peer decides."""
+    up = {0.0: False, 0.5: True, 1.0: True, 1.5: False, 2.0: True, 2.5: True, 3.0: False, 3.5: False}
+    states = [{"t_s": t_s, "drone": d, "airborne": d == 0 or flies} for t_s, flies in up.items() for d in range(2)]
+    directives = [
+        {"t_s": t_s, "drone": d, "peer": 1 - d, "representation": what, "rate_hz": 2.0, "roi_radius_m": NAN, "reason": ""}
+        for t_s, d, what in (
+            (0.6, 1, "detections"), (1.6, 0, "detections"), (2.1, 1, "raw"), (2.6, 1, "tracks"), (3.6, 0, "tracks")
+        )
+    ]  # fmt: skip
+    lanes = charted({"states": states, "directives": directives}, seconds=seconds).states
+    assert lanes["lanes/drone_1"] == [
+        (0.6, "detections at 2 Hz"), (1.5, "nothing"), (2.0, "detections at 2 Hz"), (2.1, "raw at 2 Hz"),
+        (2.6, "tracks at 2 Hz"), (3.0, "nothing"), (4.0, OVER),
+    ]  # fmt: skip
+    assert lanes["lanes/drone_0"] == [(1.6, "detections at 2 Hz"), (3.6, "tracks at 2 Hz"), (4.0, OVER)]
