@@ -164,10 +164,12 @@ class Drawing:
 
     def _land(self, t_s: Floats, position: Floats, attitude: Floats, airborne: NDArray[np.bool_]) -> None:
         """Put drones that are down on the ground where they came down (the record keeps their height), in place."""
+        if not len(t_s):
+            return
         for i in self._flying:
             turns = np.flatnonzero(np.diff(airborne[:, i])) + 1
             for begin, end in pairwise([0, *turns.tolist(), len(t_s)]):
-                up = bool(airborne[begin, i]) if begin < end else True
+                up = bool(airborne[begin, i])
                 if up == (i in self._resting):
                     self._turn(i, t_s[begin], position[begin - 1, i] if begin else self._last_position(i, position), up)
                 if not up:

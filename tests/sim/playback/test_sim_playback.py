@@ -662,6 +662,21 @@ def test_saving_changes_nothing_and_says_nothing(
     assert capfd.readouterr() == ("", "")  # Rerun tells of bad paths and values in log lines
 
 
+def test_seconds_without_a_frame_are_drawn_while_a_drone_is_down(tmp_path: Path) -> None:
+    """At 0.5 Hz every other second has none."""
+    slow = example(
+        "duration_s=4", "fleet.drones=2", "context.rate_hz=0.5", "events=[{kind: drone_lost, at_s: 2, drone: 1}]"
+    )
+    viewer = LiveViewer(to_file(tmp_path / "live.rrd"))
+    flown = run_sortie(slow, observer=viewer)
+    viewer.close()
+    save_rrd(flown, tmp_path / "saved.rrd")
+    live = read(tmp_path / "live.rrd")
+    assert_same(live, read(tmp_path / "saved.rrd"))
+    names = [label for _, _, (label,) in live["/world/drones/1/name"]["Points3D:labels"]]
+    assert [name.endswith("down") for name in names] == [False, True]
+
+
 @pytest.mark.parametrize("drones", [1, 12])
 def test_small_and_large_fleets_are_drawn(drones: int, tmp_path: Path) -> None:
     save_rrd(run_sortie(example("duration_s=2.5", f"fleet.drones={drones}")), tmp_path / "sortie.rrd")
