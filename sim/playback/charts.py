@@ -26,6 +26,7 @@ from sortie.sim.results.palette import Floats
 from sortie.sim.results.record import TABLES
 from sortie.sim.results.sentences import decision_in_words, event_in_words
 from sortie.sim.results.sightings import Sighting
+from sortie.sim.results.traffic import settled
 
 AP_WINDOW_S = 5.0
 MARKED = ("ap", "battery", "goodput", "traffic", "age", "lost", "medium")
@@ -134,12 +135,8 @@ class Charts:
 
     def _traffic(self, seconds: Sequence[tuple[float, float]], transmissions: pa.Table) -> None:
         """Mb/s by representation and fate, each line from the second in which it first carries anything."""
-        names = [
-            f"{r} {s}"
-            for r, s in zip(*(transmissions[k].to_pylist() for k in ("representation", "status")), strict=True)
-        ]
-        settled = np.column_stack([transmissions[k].to_numpy().astype(float) for k in ("t_done_s", "payload_bytes")])
-        self._kinds, self._settled = self._kinds + names, np.concatenate([self._settled, settled])
+        new_kinds, new = settled(transmissions)
+        self._kinds, self._settled = self._kinds + new_kinds, np.concatenate([self._settled, new])
         kinds, t_s = np.array(self._kinds, dtype=object), self._settled[:, 0]
         if not seconds:
             return

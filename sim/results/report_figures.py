@@ -22,6 +22,7 @@ from sortie.sim.results.link_traffic import mean_goodput
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
 from sortie.sim.results.sentences import event_in_words
+from sortie.sim.results.traffic import settled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -279,13 +280,10 @@ def draw_lanes(axes: Axes, record: SortieRecord) -> None:
 
 
 def _traffic(axes: Axes, record: SortieRecord) -> None:
-    sent = record.tables["transmissions"]
-    done, size = _column(sent, "t_done_s"), _column(sent, "payload_bytes")
-    kinds = np.array(
-        [f"{r} {s}" for r, s in zip(sent["representation"].to_pylist(), sent["status"].to_pylist(), strict=True)]
-    )
+    names, rows = settled(record.tables["transmissions"])
+    kinds, (done, size) = np.array(names), rows.T
     edges = _edges(record)
-    for kind in sorted(set(kinds.tolist())):
+    for kind in sorted(set(names)):
         representation, fate = kind.split(" ")
         if fate == "in_flight":
             continue

@@ -20,6 +20,8 @@ from sortie.sim.results.spool import batches
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
 Span = tuple[float, float]
 """From a time (inclusive) to another (exclusive)."""
+REST = {reason: status for status in (Status.LOST, Status.EXPIRED) for reason in REASONS[status]}
+"""What the rest of a payload that arrived in part came to, by its reason."""
 _BY = ["representation", "status", "reason"]
 
 
@@ -62,11 +64,9 @@ class Traffic:
             for status in DATA_STATUSES
         }
         for fate, s in self._sums.items():
-            if fate.status == "partial":
-                out["delivered"] += s.arrived_bytes
-                for status in (Status.LOST, Status.EXPIRED):
-                    if fate.reason in REASONS[status]:
-                        out[status] += s.payload_bytes - s.arrived_bytes
+            if fate.status == Status.PARTIAL:
+                out[Status.DELIVERED] += s.arrived_bytes
+                out[REST[fate.reason]] += s.payload_bytes - s.arrived_bytes
         return out
 
     def fates(self) -> dict[str, int]:
@@ -99,6 +99,23 @@ def traffic(tables: Mapping[str, pa.Table], spans: Sequence[Span]) -> list[Traff
                 now = row["count_all"], row["payload_bytes_sum"], row["arrived_bytes_sum"]
                 into[fate] = Sums(*(a + b for a, b in zip(before, now, strict=True)))
     return [Traffic(each) for each in sums]
+
+
+def settled(transmissions: pa.Table) -> tuple[list[str], NDArray[np.float64]]:
+    """What became of payloads, for plots. One that arrived in part is two pieces: what arrived, and the rest.
+
+    Returns:
+        Of each piece: representation and status (`features delivered`); when it was settled (NaN in flight) and bytes [K, 2].
+    """
+    what, status, reason = (transmissions[k].to_pylist() for k in _BY)
+    t_s, size, arrived = (
+        transmissions[k].to_numpy().astype(float) for k in ("t_done_s", "payload_bytes", "arrived_bytes")
+    )
+    partial = np.array([s == Status.PARTIAL for s in status], bool)
+    kinds = [f"{w} {REST[r] if s == Status.PARTIAL else s}" for w, s, r in zip(what, status, reason, strict=True)]
+    kinds += [f"{what[k]} {Status.DELIVERED}" for k in np.flatnonzero(partial).tolist()]
+    rest = np.where(partial, size - arrived, size)
+    return kinds, np.concatenate([np.column_stack([t_s, rest]), np.column_stack([t_s, arrived])[partial]])
 
 
 def feature_payload_p50(tables: Mapping[str, pa.Table], span: Span) -> float | None:

@@ -115,6 +115,25 @@ def test_traffic_is_of_the_second_in_which_it_ended(seconds: tuple[float, ...]) 
     }
 
 
+def test_a_payload_that_came_in_part_is_what_arrived_and_what_was_lost_or_expired(seconds: tuple[float, ...]) -> None:
+    sent = [
+        {
+            "t_done_s": t_s, "drone": 0, "peer": 1, "representation": "features", "status": fate, "reason": reason,
+            "payload_bytes": size, "arrived_bytes": arrived,
+        }
+        for t_s, fate, reason, size, arrived in (
+            (0.5, "delivered", "", 125_000, 125_000), (0.6, "partial", "deadline_in_service", 500_000, 375_000),
+            (1.5, "partial", "fragment_lost", 375_000, 125_000),
+        )
+    ]  # fmt: skip
+    made = {path.removeprefix("plots/traffic/"): v for path, v in drawn({"transmissions": sent}, seconds=seconds).items() if "traffic" in path}  # fmt: skip
+    assert made == {
+        "features_delivered": [(1, 4.0), (2, 1.0), (3, 0.0), (4, 0.0)],
+        "features_expired": [(1, 1.0), (2, 0.0), (3, 0.0), (4, 0.0)],
+        "features_lost": [(2, 2.0), (3, 0.0), (4, 0.0)],
+    }
+
+
 def test_ages_losses_and_the_channel_are_of_their_second(seconds: tuple[float, ...]) -> None:
     ages = [
         {"t_s": t_s, "drone": 0, "age_s": age_s} for t_s, age_s in ((0.0, 0.1), (0.99, 0.3), (1.0, 0.5), (3.5, 0.7))

@@ -217,9 +217,9 @@ def test_goodput_is_the_mean_over_links_that_were_measured_and_over_each_second(
 
 
 def test_traffic_is_drawn_in_the_second_in_which_it_ended_by_kind_and_fate() -> None:
-    """Mb/s: of 125,000 B in one second, 1."""
+    """Mb/s: of 125,000 B in one second, 1. The payload that came in part is what arrived and what was lost."""
     sent = [
-        {"t_done_s": t_s, "drone": 0, "peer": 1, "representation": what, "status": fate, "payload_bytes": size, "arrived_bytes": come}
+        {"t_done_s": t_s, "drone": 0, "peer": 1, "representation": what, "status": fate, "reason": "fragment_lost" if fate in ("lost", "partial") else "", "payload_bytes": size, "arrived_bytes": come}
         for t_s, what, fate, size, come in (
             (0.5, "features", "delivered", 125_000, 125_000), (0.9, "features", "lost", 250_000, 0), (1.0, "features", "delivered", 500_000, 500_000),
             (1.5, "features", "partial", 375_000, 250_000), (2.5, "detections", "delivered", 12_500, 12_500),
@@ -228,9 +228,8 @@ def test_traffic_is_drawn_in_the_second_in_which_it_ended_by_kind_and_fate() -> 
     ]  # fmt: skip
     flown = with_rows(transmissions=sent)
     assert curves(report_figures._traffic, flown) == {
-        "features delivered": [(1, 1.0), (2, 4.0), (3, 0.0), (4, 0.0)],
-        "features lost": [(1, 2.0), (2, 0.0), (3, 0.0), (4, 0.0)],
-        "features partial": [(1, 0.0), (2, 3.0), (3, 0.0), (4, 0.0)],
+        "features delivered": [(1, 1.0), (2, 6.0), (3, 0.0), (4, 0.0)],
+        "features lost": [(1, 2.0), (2, 1.0), (3, 0.0), (4, 0.0)],
         "detections delivered": [(1, 0.0), (2, 0.0), (3, 0.1), (4, 0.0)],
     }
     assert report_figures.delivered_mbps(flown) == pytest.approx(np.array([(1, 1.0), (2, 6.0), (3, 0.1), (4, 0.0)]))
