@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.scene.scene_model import MARGIN_M, SceneModel
 from sortie.scenarios.schema import Scenario
-from sortie.sim.playback.canvas import Canvas
+from sortie.sim.playback.canvas import Canvas, packed
 from sortie.sim.results import palette
 from sortie.sim.results.flown_scene import CIRCLE
 from sortie.sim.results.palette import Floats
@@ -34,6 +34,8 @@ class GroundMap:
         self._rate_hz = scenario.context.rate_hz
         self._groups = range(len(scenario.mission.phases_of))
         self._trail: Floats = np.zeros((0, self._n, 2))
+        self._flew: NDArray[np.bool_] = np.zeros(self._n, bool)
+        self._colours = np.array([palette.drone_colour(i) for i in range(self._n)], np.uint8)
         self._frames = 0
 
     def begin(self, ground: NDArray[np.uint8], houses: Floats) -> None:
@@ -43,7 +45,7 @@ class GroundMap:
             ground: roads and lots, [row, column, 3] at 1 m; its first row is the south edge.
             houses: x and y of the low and of the high corner, [K, 4 or more], ENU metres.
         """
-        canvas, n = self._canvas, self._n
+        canvas = self._canvas
         image = ground[::-1].copy()
         corners = np.concatenate([self._flat(houses[:, :2]), self._flat(houses[:, 2:4])], axis=1).astype(int)
         for x0, y1, x1, y0 in corners.tolist():
@@ -54,12 +56,9 @@ class GroundMap:
             [[(x_m, y_m), (x_m + SCALE_M, y_m)]], colors=[(240, 240, 240, 255)], radii=[-2.5], labels=[f"{SCALE_M:g} m"]
         )
         canvas.static("map/scale", scale)
-        colours = [palette.drone_colour(i) for i in range(n)]
-        names = [str(i) for i in range(n)]
-        canvas.static(
-            "map/drones", rr.Points2D.from_fields(radii=[-6.0], colors=colours, labels=names, draw_order=40.0)
-        )
-        canvas.static("map/trails", rr.LineStrips2D.from_fields(radii=[-1.5], colors=colours, draw_order=20.0))
+        names = [str(i) for i in range(self._n)]
+        canvas.static("map/drones", rr.Points2D.from_fields(radii=[-6.0], labels=names, draw_order=40.0))
+        canvas.static("map/trails", rr.LineStrips2D.from_fields(radii=[-1.5], colors=self._colours, draw_order=20.0))
         canvas.static(
             "map/mission", rr.LineStrips2D.from_fields(radii=[-2.5], colors=[palette.MISSION], draw_order=30.0)
         )
@@ -69,13 +68,14 @@ class GroundMap:
             rr.Points2D.from_fields(radii=[-8.0], colors=[palette.JAMMER], labels=["jammer"], draw_order=38.0),
         )
 
-    def add(self, t_s: Floats, position: Floats, mission: pa.Table) -> None:
-        """Draw the frames at `t_s` [T] from positions [T, N, 3] and the rows of `mission`."""
+    def add(self, t_s: Floats, position: Floats, airborne: NDArray[np.bool_], mission: pa.Table) -> None:
+        """Draw the frames at `t_s` [T] from positions [T, N, 3] and the rows of `mission`; drones that are down are grey."""
         canvas, n = self._canvas, self._n
         flat = self._flat(position[..., :2])
-        points = rr.Points2D.columns(positions=flat.reshape(-1, 2))
+        colours = np.where(airborne[..., None], self._colours, np.array(palette.FALLEN, np.uint8)).reshape(-1, 4)
+        points = rr.Points2D.columns(positions=flat.reshape(-1, 2), colors=packed(colours))
         canvas.columns("map/drones", t_s, points.partition([n] * len(t_s)))
-        self._trails(t_s, flat)
+        self._trails(t_s, flat, airborne)
         step = max(1, round(STEP_S * self._rate_hz))
         drawn = t_s[(self._frames + np.arange(len(t_s))) % step == 0]
         self._frames += len(t_s)
@@ -91,9 +91,13 @@ class GroundMap:
         columns = rr.Points2D.columns(positions=self._flat(places)).partition([len(places)])
         self._canvas.columns("map/jammers", np.array([t_s]), columns)
 
-    def _trails(self, t_s: Floats, flat: Floats) -> None:
+    def _trails(self, t_s: Floats, flat: Floats, airborne: NDArray[np.bool_]) -> None:
+        """A trail begins anew where a drone takes off."""
         for k in np.flatnonzero(np.floor(t_s + 1e-6) > np.floor(t_s - 1.0 / self._rate_hz + 1e-6)).tolist():
             self._trail = np.concatenate([self._trail, flat[k][None]])[-TRAIL_S:]
+            took_off = airborne[k] & ~self._flew
+            self._trail[:, took_off] = flat[k, took_off]
+            self._flew = airborne[k]
             strips = rr.LineStrips2D.columns(strips=list(self._trail.swapaxes(0, 1))).partition([self._n])
             self._canvas.columns("map/trails", t_s[k : k + 1], strips)
 

@@ -40,7 +40,8 @@ LEGEND = """
 
 Each drone has one colour, here and in the plots; its label is its number and charge, the **ring** on the ground
 what its camera sees straight below. Drones are drawn {span:.0f} m wide. The **pink ring** is the mission region, on the
-ground and once more above the roofs. An **orange ball** is a jammer that is on. The **map** has north up.
+ground and once more above the roofs. An **orange ball** is a jammer that is on. The **map** has north up. A
+drone that is down is grey.
 
 **Arrows** are links: as wide as the traffic of the last second; green carries 100 Mb/s or more, yellow 10,
 red 1 or less; grey: nothing is sent; a **red cross**: all but gone. **Marks** on the plots' floors: yellow, something

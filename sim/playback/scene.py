@@ -158,7 +158,7 @@ class Drawing:
         for group in self._groups:
             self._mission(group, new["mission"].filter(pc.equal(new["mission"]["group"], group)))
         self._follow(t_s)
-        self._map.add(t_s, position, new["mission"])
+        self._map.add(t_s, position, airborne, new["mission"])
         self._jammers(t_s)
         self._seen(list(seen))
 

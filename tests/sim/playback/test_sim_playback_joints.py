@@ -225,13 +225,30 @@ def test_a_trail_is_of_the_last_minute() -> None:
     t_s = np.arange(0, 150) / 2
     position = np.column_stack([100.0 + t_s, np.full(150, 50.0), np.full(150, 60.0)])[:, None]
     empty = tables_of({})["mission"]
-    made.add(t_s[:75], position[:75], empty)
-    made.add(t_s[75:], position[75:], empty)
+    up = np.ones((150, 1), bool)
+    made.add(t_s[:75], position[:75], up[:75], empty)
+    made.add(t_s[75:], position[75:], up[75:], empty)
     trails = kept.rows["map/trails strips"]
     assert [t for t, _ in trails] == [float(k) for k in range(75)]
     (last,) = trails[-1][1]
     assert [x for x, _ in last] == pytest.approx([float(k) for k in range(15, 75)])
     assert {y for _, y in last} == {300.0}
+
+
+def test_a_drone_is_grey_while_it_is_down_and_its_trail_begins_anew_where_it_takes_off() -> None:
+    """At 2 Hz: in the air until 2 s, and from 4 s on, 100 m further."""
+    made, kept = ground_map()
+    t_s = np.arange(0, 12) / 2
+    x_m = np.where(t_s < 2, 100.0 + t_s, np.where(t_s < 4, 101.5, 200.0 + t_s))
+    position = np.column_stack([x_m, np.full(12, 50.0), np.full(12, 60.0)])[:, None]
+    up = ((t_s < 2) | (t_s >= 4))[:, None]
+    for part in (slice(0, 5), slice(5, 12)):
+        made.add(t_s[part], position[part], up[part], tables_of({})["mission"])
+    own, grey = (packed(np.array([c], np.uint8))[0] for c in (palette.drone_colour(0), palette.FALLEN))
+    assert [c for _, (c,) in kept.rows["map/drones colors"]] == [own] * 4 + [grey] * 4 + [own] * 4
+    trails = {t: [x for x, _ in strip] for t, (strip,) in kept.rows["map/trails strips"]}
+    assert trails[3.0] == pytest.approx([0.0, 1.0, 1.5, 1.5])
+    assert trails[5.0] == pytest.approx([104.0] * 5 + [105.0])
 
 
 def test_regions_are_drawn_twice_a_second_through_all_slices() -> None:
@@ -245,7 +262,9 @@ def test_regions_are_drawn_twice_a_second_through_all_slices() -> None:
     t_s = np.arange(16) / 10
     position = np.zeros((16, 1, 3))
     for part in (slice(0, 3), slice(3, 16)):
-        made.add(t_s[part], position[part], mission.slice(part.start, part.stop - part.start))
+        made.add(
+            t_s[part], position[part], np.ones((16, 1), bool)[part], mission.slice(part.start, part.stop - part.start)
+        )
     rings = kept.rows["map/mission strips"]
     assert [(t, len(strips)) for t, strips in rings] == [(0.0, 1), (0.5, 1), (1.0, 0), (1.5, 0)]
     assert [math.hypot(x - 20.0, y - 290.0) for x, y in rings[0][1][0]] == pytest.approx(
