@@ -237,7 +237,7 @@ class Charts:
     def _best(self, drone: int) -> str:
         """What the drone was last to send on its best link."""
         levels = [level for (sender, _), level in self._carried.items() if sender == drone]
-        return max(levels, key=lambda level: RUNGS.index(level.split(" ")[0]))
+        return max(levels, key=_height)
 
     def _drone_lanes(self, decided: list[tuple[float, int, str]], states: pa.Table) -> None:
         """Show what each drone decided to send on its best link, and "nothing" while it is down."""
@@ -306,10 +306,19 @@ def _mark(name: str, colour: palette.Rgba, shape: rr.components.MarkerShape) -> 
     return rr.SeriesPoints(colors=[colour], markers=[shape], names=[name], marker_sizes=[4.0])
 
 
+def _height(level: str) -> tuple[int, float]:
+    """The rung of a level, and of levels on the same rung what they send a second: ρ times the rate."""
+    return RUNGS.index(level.split(" ")[0]), _after("ρ=", level, 1.0) * _after("at ", level, 0.0)
+
+
 def _level_colour(level: str) -> palette.Rgba:
     """The representation's colour, darker at lower rates."""
-    colour = palette.SENT[level.split(" ")[0]]
-    rate = re.search(r"at ([\d.]+) Hz", level)
-    light = 1.0 if rate is None else 0.55 + 0.45 * min(1.0, float(rate[1]) / 10.0)
-    r, g, b = (round(light * part) for part in colour[:3])
+    light = 0.55 + 0.45 * min(1.0, _after("at ", level, 10.0) / 10.0)
+    r, g, b = (round(light * part) for part in palette.SENT[level.split(" ")[0]][:3])
     return r, g, b, 255
+
+
+def _after(word: str, level: str, otherwise: float) -> float:
+    """The number after a word of a level."""
+    found = re.search(rf"{word}(\S+)", level)
+    return float(found[1]) if found else otherwise

@@ -171,3 +171,19 @@ def test_a_drone_s_lane_shows_nothing_each_time_that_it_is_down(seconds: tuple[f
         (2.6, "tracks at 2 Hz"), (3.0, "nothing"), (4.0, OVER),
     ]  # fmt: skip
     assert lanes["lanes/drone_0"] == [(1.6, "detections at 2 Hz"), (3.6, "tracks at 2 Hz"), (4.0, OVER)]
+
+
+def test_of_links_on_one_rung_a_lane_shows_the_one_that_sends_most() -> None:
+    """ρ times rate is 0.5 /s to drone 1; to drone 2 it is first 1 /s, and then 0.02 /s."""
+    directives = [
+        {
+            "t_s": t_s, "drone": 0, "peer": peer, "representation": "features", "rho": rho, "rate_hz": rate_hz,
+            "roi_radius_m": NAN, "reason": "",
+        }
+        for t_s, peer, rho, rate_hz in ((0.5, 1, 0.25, 2.0), (1.5, 2, 0.1, 10.0), (2.5, 2, 0.002, 10.0))
+    ]  # fmt: skip
+    states = [{"t_s": 0.0, "drone": d, "airborne": True} for d in range(3)]
+    lanes = charted({"states": states, "directives": directives}, drones=3).states
+    assert lanes["lanes/drone_0"] == [
+        (0.5, "features ρ=0.25 at 2 Hz"), (1.5, "features ρ=0.1 at 10 Hz"), (2.5, "features ρ=0.25 at 2 Hz"), (4.0, OVER),
+    ]  # fmt: skip
