@@ -73,7 +73,7 @@ def open_viewer(path: Path) -> None:
     if not path.is_file():
         raise RunError(f"{path}: no recording there")
     command = [viewer_binary(), "--bind", "127.0.0.1", str(path)]
-    _need_display(f"open {path} elsewhere, or in a browser: {command[0]} --web-viewer {path}")
+    _need_display(f"open {path} elsewhere, or in a browser: {command[0]} --web-viewer --bind 127.0.0.1 {path}")
     try:
         ended = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False)  # noqa: S603
     except OSError as error:

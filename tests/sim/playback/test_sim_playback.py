@@ -722,7 +722,10 @@ def test_without_a_display_there_is_no_viewer(
     saved: Path, record: SortieRecord, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     no_display(monkeypatch)
-    with pytest.raises(RunError, match=r"^no display to show a viewer on; open .*sortie\.rrd elsewhere"):
+    with pytest.raises(
+        RunError,
+        match=r"^no display to show a viewer on; open .*sortie\.rrd elsewhere, .* --web-viewer --bind 127\.0\.0\.1 ",
+    ):
         open_viewer(saved)
     with pytest.raises(RunError, match=r"^no display to show a viewer on; --live needs one"):
         LiveViewer().begin(record.scenario, scene_of(record))
