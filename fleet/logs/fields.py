@@ -216,5 +216,5 @@ def _from_euler(roll: Column, pitch: Column, yaw: Column, degrees: bool = False)
 
 
 def _sik_dbm(units: Column) -> Array:
-    """SiK telemetry radios give 1.9 units a dB above −127 dBm."""
-    return np.asarray(units, dtype=np.float64) / 1.9 - 127.0
+    """SiK telemetry radios give 1.9 units a dB above −127 dBm; NaN for 255, MAVLink's unknown."""
+    return np.where(np.asarray(units) == 255, np.nan, np.asarray(units, dtype=np.float64) / 1.9 - 127.0)

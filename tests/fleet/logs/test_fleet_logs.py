@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sortie.fleet.logs.dataflash import RawLog, read_dataflash
-from sortie.fleet.logs.fields import from_dataflash, from_ulog
+from sortie.fleet.logs.fields import from_dataflash, from_tlog, from_ulog
 from sortie.fleet.logs.flightlog import FlightLog, LogError, _assemble, local_m, read_log
 from sortie.fleet.logs.geodesy import geodetic
 from sortie.fleet.logs.identify import predicted_voltage
@@ -61,6 +61,24 @@ def test_signal_strength_where_the_log_has_it(tmp_path: Path) -> None:
     assert read_log(written(tmp_path, "tlog", WHOLE["tlog"])).rssi is None
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "field"),
+    [
+        ("DataFlash", "RAD", "RSSI"),
+        ("ULog", "radio_status", "rssi"),
+        ("MAVLink telemetry", "RADIO_STATUS", "rssi"),
+        ("MAVLink telemetry", "RADIO", "rssi"),
+    ],
+)
+def test_a_signal_strength_that_the_radio_does_not_know_is_left_out_and_told(kind: str, name: str, field: str) -> None:
+    """MAVLink's 255 was read as +7.2 dBm."""
+    log = assembled(kind, **{name: {field: [190, 255, 190]}})
+    assert log.rssi is not None
+    np.testing.assert_allclose(log.rssi.values, [[-27.0], [-27.0]])
+    assert log.problems == ("1 rows of rssi are not finite and are left out",)
+    assert assembled(kind, **{name: {field: [255, 255]}}).rssi is None
+
+
 def test_without_an_estimate_the_receivers_positions_are_taken(tmp_path: Path) -> None:
     log = read_log(written(tmp_path, "bin", WHOLE["bin"].replace(b"XKF1", b"ZZZ1")))
     assert log.position is not None
@@ -86,12 +104,16 @@ def test_the_first_battery_is_taken_however_the_version_numbers_them(named: byte
 
 def assembled(kind: str, **tables: dict[str, list[object]]) -> FlightLog:
     """A log of some tables, a row every tenth of a second."""
-    stamp = {"ULog": "timestamp", "DataFlash": "TimeUS"}[kind]
+    stamp, translate = {
+        "ULog": ("timestamp", from_ulog),
+        "DataFlash": ("TimeUS", from_dataflash),
+        "MAVLink telemetry": ("timestamp", from_tlog),
+    }[kind]
     columns = {name: {k: np.array(v) for k, v in table.items()} for name, table in tables.items()}
     for name, table in columns.items():
         if name != "PARM":
             table[stamp] = np.arange(len(next(iter(table.values())))) * 100_000
-    return _assemble(Path("a.log"), kind, RawLog(columns, ()), from_ulog if kind == "ULog" else from_dataflash)
+    return _assemble(Path("a.log"), kind, RawLog(columns, ()), translate)
 
 
 def test_the_first_receiver_is_taken() -> None:
