@@ -135,10 +135,11 @@ class MavlinkEndpoint:
     to one of the wall's, so that a ground station sees the fleet a second late and otherwise as if it flew.
 
     Args:
-        address: `udpout:HOST:PORT` sends there; `udpin:HOST:PORT` waits for a ground station and sends to it.
+        address: `udpout:HOST:PORT` sends there; `udpin:HOST:PORT` waits for a ground station's first message, and
+            sends to the ground station that spoke last.
         pace: 1 is real time, 2 twice as fast; None sends as fast as the sortie is worked out.
         origin: where on the globe ENU (0, 0, 0) lies; None: by `origin_of`.
-        key: 32 B with which frames are signed.
+        key: 32 B with which frames are signed; messages to the endpoint that are not signed with it are ignored.
 
     Raises:
         RunError: an address that is none, or one that is taken.
@@ -151,7 +152,7 @@ class MavlinkEndpoint:
         self._waits, host, port = parse_address(address)
         self._pace, self._origin, self._key, self._clock = pace, origin, key, clock
         self._stream: Stream | None = None
-        self._listener = Listener()
+        self._listener = Listener(key)
         self._begin_s = 0.0
         self._datagram = b""
         self._peer: Any = None
@@ -199,10 +200,11 @@ class MavlinkEndpoint:
             data, sender = self._socket.recvfrom(65_535)
         except OSError:  # nobody listens there yet
             return
-        if self._waits:
+        requests = self._listener.heard(data)
+        if self._waits and requests:
             self._peer = sender
         assert self._stream is not None  # noqa: S101 - set in `begin`
-        for request in self._listener.heard(data):
+        for request in requests:
             for drone in range(len(self._stream.transmitters)):
                 known = self._stream.parameters[drone], self._stream.latest[drone]
                 for message in answers(request, drone, *known):

@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import sysconfig
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -31,7 +32,7 @@ from typer.testing import CliRunner
 
 from sortie.fleet.energy.cell import MEAN_CELL_V
 from sortie.fleet.logs.flightlog import read_logs
-from sortie.fleet.logs.mavlink import Listener, Transmitter
+from sortie.fleet.logs.mavlink import SIGNING_EPOCH_US, Listener, Transmitter
 from sortie.fleet.logs.telemetry import KEY_BYTES
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
@@ -351,6 +352,15 @@ def frames_in(datagram: bytes) -> int:
     return count
 
 
+def ground_station(key: bytes | None) -> mavlink2.MAVLink:
+    """Packs a ground station's messages, signed where it has a key."""
+    station = mavlink2.MAVLink(None, srcSystem=255, srcComponent=190)
+    if key is not None:
+        station.signing.secret_key, station.signing.sign_outgoing = key, True
+        station.signing.timestamp = (time.time_ns() // 1000 - SIGNING_EPOCH_US) // 10
+    return station
+
+
 @pytest.mark.parametrize("key", [None, bytes(range(KEY_BYTES))], ids=["plain", "signed"])
 def test_frames_stay_in_order_while_a_ground_station_asks(
     key: bytes | None, record: SortieRecord, monkeypatch: pytest.MonkeyPatch
@@ -371,7 +381,7 @@ def test_frames_stay_in_order_while_a_ground_station_asks(
     endpoint = MavlinkEndpoint("udpin:127.0.0.1:0", pace=3.0, key=key, clock=clock)
     monkeypatch.undo()
     sent = endpoint._socket.sent = []  # type: ignore[attr-defined]
-    station = mavlink2.MAVLink(None, srcSystem=255, srcComponent=190)
+    station = ground_station(key)
     with closing(endpoint), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         for _ in range(90):
             asking.sendto(mavlink2.MAVLink_param_request_list_message(1, 1).pack(station), endpoint.address)
@@ -408,6 +418,43 @@ def test_a_waiting_endpoint_answers_a_ground_station_and_sends_to_it(record: Sor
         endpoint.second(1.0, slices)
         heard = [m for _ in range(2) for m in mav.parse_buffer(station.recv(65_535)) or []]
         assert {m.get_srcSystem() for m in heard} == {1, 2, 3, 4, 5}
+
+
+@pytest.mark.parametrize(
+    ("key", "said_by_strangers"),
+    [
+        (None, b"?"),
+        (bytes(range(KEY_BYTES)), b"?"),
+        (bytes(range(KEY_BYTES)), mavlink2.MAVLink_param_request_list_message(0, 1).pack(ground_station(None))),
+    ],
+    ids=["noise", "noise to a signed stream", "unsigned message to a signed stream"],
+)
+def test_a_stranger_does_not_take_over_the_stream_of_a_waiting_endpoint(
+    key: bytes | None, said_by_strangers: bytes, record: SortieRecord
+) -> None:
+    """One byte from anybody turned the stream away from the ground station."""
+    with (
+        closing(MavlinkEndpoint("udpin:127.0.0.1:0", pace=None, key=key)) as endpoint,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+    ):
+        station.settimeout(10.0)
+        asked = mavlink2.MAVLink_param_request_list_message(2, 1).pack(ground_station(key))
+        station.sendto(asked, endpoint.address)
+        endpoint.begin(record.scenario, None)  # type: ignore[arg-type]
+        slices = {name: table.slice(0, 0) for name, table in record.tables.items()}
+        endpoint.second(0.0, slices)
+        stranger.sendto(said_by_strangers, endpoint.address)
+        endpoint.second(0.0, slices)
+        slices["states"] = record.tables["states"].slice(0, 5)
+        endpoint.second(1.0, slices)
+        listener = Listener(key)
+        heard = [m.get_type() for _ in range(3) for m in listener.heard(station.recv(65_535))]
+        assert heard[:2] == ["PARAM_VALUE"] * 2
+        assert "HEARTBEAT" in heard
+        stranger.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            stranger.recv(65_535)
 
 
 def test_noise_is_passed_over() -> None:
