@@ -11,11 +11,11 @@
 | `/clock` | `rosgraph_msgs/msg/Clock` | reliable, keep last 10 |
 | `/scene/…`, `/drone_0/boxes` | `visualization_msgs/msg/MarkerArray` (`sortie.sim.export.scene_markers`) | reliable, keep last 10; `/scene/town` stays for late readers |
 
-The frame `world` is ENU in metres, `drone_0` its body in FLU. The plane's topics are the live bus's (`sortie.sim.export.topics`). The
-record holds no estimated pose, so a descriptor's is the true one here. All stamps count from the begin of the bag, also those
-that drones put into descriptors by their own clocks, which may be wrong. Descriptors are in the paper's form (CDR), without the
-code of `context.authentication`; where `context.form` is another one, their values are those that peers read from it. The bag is
-compressed (zstd, in chunks).
+The frame `world` is ENU in metres, `drone_0` its body in FLU. A drone that is not in the air is on the ground. The plane's
+topics are the live bus's (`sortie.sim.export.topics`). The record holds no estimated pose, so a descriptor's is the true one
+here. All stamps count from the begin of the bag, also those that drones put into descriptors by their own clocks, which may be
+wrong. Descriptors are in the paper's form (CDR), without the code of `context.authentication`; where `context.form` is another
+one, their values are those that peers read from it. The bag is compressed (zstd, in chunks).
 """
 
 from __future__ import annotations
@@ -189,14 +189,14 @@ def _flight(record: SortieRecord, make: SimpleNamespace, begin_ns: int, origin: 
             if t_s > last_s:
                 yield Message(t_s, "/clock", CLOCK, make.Clock(_time(t_s)))
                 last_s = t_s
-            x, y, z = row["x_m"], row["y_m"], row["z_m"]
+            x, y, z = state.position_m
             turn = make.Quaternion(*(row[q] for q in ("qx", "qy", "qz", "qw")))
             pose = make.Pose(make.Point(x, y, z), turn)
             yield Message(t_s, f"/{name}/pose", POSE, make.PoseStamped(header(t_s, "world"), pose))
             moved = make.TransformStamped(header(t_s, "world"), name, make.Transform(make.Vector3(x, y, z), turn))
             yield Message(t_s, "/tf", TF, make.TFMessage([moved]))
             fix = make.NavSatFix(
-                header(t_s, name), make.NavSatStatus(0 if state.fixed else -1, 1), *geodetic((x, y, z), origin),
+                header(t_s, name), make.NavSatStatus(0 if state.fixed else -1, 1), *geodetic(state.position_m, origin),
                 np.zeros(9), 0,
             )  # fmt: skip
             yield Message(t_s, f"/{name}/fix", FIX, fix)

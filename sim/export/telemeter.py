@@ -17,7 +17,10 @@ _GNSS = {"gnss_loss": False, "gnss_back": True}
 
 
 class Telemeter:
-    """Turns rows of the record into telemetry; load, home and GNSS are kept from slice to slice."""
+    """Turns rows of the record into telemetry; load, home and GNSS are kept from slice to slice.
+
+    A drone that is not in the air lies on the ground below its recorded position: the record keeps the last height.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self._frame_s = scenario.frame_s
@@ -48,10 +51,10 @@ class Telemeter:
 
     def _telemetry(self, row: dict[str, Any]) -> Telemetry:
         drone, landed = row["drone"], not row["airborne"]
-        still = (0.0, 0.0, 0.0)
+        station, still = drone in self._stations, (0.0, 0.0, 0.0)
         return Telemetry(
             time_s=row["t_s"],
-            position_m=(row["x_m"], row["y_m"], row["z_m"]),
+            position_m=(row["x_m"], row["y_m"], 0.0 if landed and not station else row["z_m"]),
             orientation_xyzw=(row["qx"], row["qy"], row["qz"], row["qw"]),
             velocity_mps=still if landed else (row["vx_mps"], row["vy_mps"], row["vz_mps"]),
             body_rates_radps=still if landed else (row["p_radps"], row["q_radps"], row["r_radps"]),
@@ -61,7 +64,7 @@ class Telemeter:
             energy_used_j=row["spent_j"],
             cpu_load=float(np.clip(self._load[drone], 0.0, 1.0)),
             landed=landed,
-            ground_station=drone in self._stations,
+            ground_station=station,
             home_m=self._home_m.setdefault(drone, (row["x_m"], row["y_m"], 0.0)),
             fixed=self._fixed[drone],
         )

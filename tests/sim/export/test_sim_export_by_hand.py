@@ -105,6 +105,12 @@ def exported() -> SortieRecord:
     return replace(record(), scenario=loads(SCENARIO), tables=tables_of(given))
 
 
+def where(frame: int, drone: int) -> tuple[float, float, float]:
+    """Drone 2 is lost in frame 2: it is on the ground, and the record keeps its last height."""
+    s = state(frame, drone)
+    return s["x_m"], s["y_m"], s["z_m"] if s["airborne"] else 0.0
+
+
 def test_a_directive_has_every_field_of_its_row() -> None:
     assert list(directives(exported())) == [
         (0.5, Directive(1, 2, Representation.FEATURES, 0.25, Disc(3.0, 4.0, 5.0), 7.5, 0.35, 0.6, 80, "first")),
@@ -158,7 +164,7 @@ def test_poses_frames_fixes_and_batteries_are_each_drone_s_own(told: dict[str, l
         for frame in range(3):
             s, t_s = state(frame, drone), float(frame)
             turn = tuple(s[q] for q in ("qx", "qy", "qz", "qw"))
-            at, moved = (s["x_m"], s["y_m"], s["z_m"]), frames[t_s, f"drone_{drone}"]
+            at, moved = where(frame, drone), frames[t_s, f"drone_{drone}"]
             assert moved.header.frame_id == "world"
             assert (moved.transform.translation.x, moved.transform.translation.y, moved.transform.translation.z) == at
             r = moved.transform.rotation
@@ -289,7 +295,7 @@ def test_telemetry_has_every_column_of_its_drone_s_row() -> None:
         s, down = state(k // 3, drone), (drone, k // 3) == (2, 2)
         still = (0.0, 0.0, 0.0)
         assert t.time_s == k // 3
-        assert t.position_m == (s["x_m"], s["y_m"], s["z_m"])
+        assert t.position_m == where(k // 3, drone)
         assert t.orientation_xyzw == (s["qx"], s["qy"], s["qz"], s["qw"])
         assert t.velocity_mps == (still if down else (s["vx_mps"], s["vy_mps"], s["vz_mps"]))
         assert t.body_rates_radps == (still if down else (s["p_radps"], s["q_radps"], s["r_radps"]))
@@ -304,6 +310,14 @@ def test_telemetry_has_every_column_of_its_drone_s_row() -> None:
         assert t.home_m == (10.0 * drone, 10.0 * drone + 1, 0.0)
         assert t.cpu_load == pytest.approx(0.5 - drone / 10)
         assert not t.ground_station
+
+
+def test_a_ground_station_that_is_off_stays_on_its_mast() -> None:
+    settings = SCENARIO.replace("  overrides:", "  ground: [{drone: 2, position_m: [20, 21, 22]}]\n  overrides:")
+    made = list(Telemeter(loads(settings)).add(exported().tables))
+    assert made[-1][1].landed
+    assert made[-1][1].ground_station
+    assert made[-1][1].position_m == (state(2, 2)["x_m"], state(2, 2)["y_m"], state(2, 2)["z_m"])
 
 
 def test_each_vehicle_says_its_own_pack_and_its_own_texts() -> None:
