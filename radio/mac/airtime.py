@@ -17,6 +17,7 @@ from sortie.radio.rates import STANDARDS, Standard
 # Bytes (OMG DDSI-RTPS 2.5; RFC 791, 768; IEEE 802.11)
 RTPS_HEADER, INFO_TS, INFO_DST = 20, 12, 16
 DATA, DATA_FRAG = 24 + 4, 36
+"""DATA includes a CDR header of 4 B. A descriptor in the paper's form has its own, so its frame counts 4 B too many."""
 HEARTBEAT, ACKNACK = 32, 28
 UDP_IP = 28
 MAC_UNICAST, MAC_GROUP = 38, 36

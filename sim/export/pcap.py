@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sortie.fleet.messages.auth import Sealer
+from sortie.fleet.messages.cdr import ENCAPSULATION
 from sortie.fleet.messages.compact import FULL, Form, encode_compact
 from sortie.fleet.messages.wire import encode_descriptor, encode_directive
 from sortie.fleet.tiles import cut
@@ -50,7 +51,6 @@ _FILE = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262_144, 101)  # nanosec
 _PACKET = struct.Struct("<IIII")
 _IP = struct.Struct(">BBHHHBBH4s4s")
 _UDP = struct.Struct(">HHHH")
-_CDR_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 _WRITERS = {kind: bytes((0, 0, number, 0x03)) for number, kind in enumerate(TopicKind, 1)}
 """The writer's entity, one for each kind of topic."""
 
@@ -150,7 +150,7 @@ def _payload_packets(record: SortieRecord, begin_ns: int) -> Iterator[Packet]:
             number = numbers[drone, kind] + (k if tiled else 0) + 1
             head = _header(drone, begin_ns + round(t_s * 1e9), peer)
             if row["fragments"] == 1 or tiled:
-                head += _data(kind, number, part)
+                head += _data(kind, number, len(ENCAPSULATION) + part) + ENCAPSULATION
             else:
                 head += _data_frag(kind, number, k, part, each, size)
             ends = (address(drone), DATA_PORT), (address(peer), DATA_PORT)
@@ -183,6 +183,8 @@ def _whole(
         ends = (address(drone), CONTEXT_PORT), (GROUP, CONTEXT_PORT)
     else:
         ends = (address(drone), POLICY_PORT), (address(receiver), GATE_PORT)
+    if not data.startswith(ENCAPSULATION):  # a smaller `context.form` has no CDR header of its own
+        data = ENCAPSULATION + data
     message = _header(drone, begin_ns + round(t_s * 1e9), receiver) + _data(kind, number, len(data)) + data
     return Packet(t_s, kind, *ends, len(message), message)
 
@@ -213,10 +215,8 @@ def _header(drone: int, t_ns: int, receiver: int | None) -> bytes:
 
 
 def _data(kind: TopicKind, number: int, size: int) -> bytes:
-    """A DATA submessage up to its content of `size` bytes."""
-    return (
-        struct.pack("<BBHHH4s4siI", 0x15, 5, 24 + size, 0, 16, bytes(4), _WRITERS[kind], 0, number) + _CDR_LITTLE_ENDIAN
-    )
+    """A DATA submessage up to its content of `size` bytes, which begins with the CDR header."""
+    return struct.pack("<BBHHH4s4siI", 0x15, 5, 20 + size, 0, 16, bytes(4), _WRITERS[kind], 0, number)
 
 
 def _data_frag(kind: TopicKind, number: int, k: int, size: int, each: int, of: int) -> bytes:

@@ -15,6 +15,8 @@ from typer.testing import CliRunner
 
 import sortie.fleet.agent
 from sortie.fleet.messages.auth import Opened, Sealer, open_datagram
+from sortie.fleet.messages.cdr import ENCAPSULATION
+from sortie.fleet.messages.compact import FULL, Form
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES, decode_directive
 from sortie.fleet.tiles import cut
 from sortie.sim.cli.app import app
@@ -78,14 +80,18 @@ def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 def test_every_descriptor_is_there_with_its_length_and_time(flown: tuple[SortieRecord, Path]) -> None:
     record, path = flown
     heard = [p for p in read(path) if p.ports == (7401, 7401)]
+    form = Form(**record.scenario.context.form.model_dump())
+    header = 0 if form == FULL else 4  # the paper's form has a CDR header of its own
     rows = sorted(record.tables["descriptors"].to_pylist(), key=lambda row: row["t_s"])
     assert [(p.t_ns, p.drone, p.length) for p in heard] == [
-        (round(r["t_s"] * 1e9), r["drone"], 20 + 8 + 20 + 12 + 24 + 4 + r["wire_bytes"]) for r in rows
+        (round(r["t_s"] * 1e9), r["drone"], 20 + 8 + 20 + 12 + 24 + header + r["wire_bytes"]) for r in rows
     ]
     keys = {KEY_ID: group_key(record.seed)} if record.scenario.context.authentication else None
     counters: dict[int, int] = defaultdict(int)
     for packet, row in zip(heard, rows, strict=True):
-        opened = open_datagram(packet.rtps[20 + 12 + 24 + 4 :], keys)
+        assert packet.rtps[56:60] == ENCAPSULATION
+        assert struct.unpack_from("<H", packet.rtps, 34)[0] == len(packet.rtps) - 36
+        opened = open_datagram(packet.rtps[20 + 12 + 24 + header :], keys)
         assert isinstance(opened, Opened)
         assert opened.descriptor.agent_id == row["drone"]
         assert opened.descriptor.stamp_ns == row["stamp_ns"]
@@ -106,7 +112,7 @@ def test_descriptors_are_the_bytes_that_flew(monkeypatch: pytest.MonkeyPatch, tm
         patch.setattr(sortie.fleet.agent.Sealer, "seal", tapped)
         record = run_sortie(example("duration_s=2"))
     write_pcap(record, tmp_path / "a.pcap", BEGIN_NS)
-    written = [p.rtps[60:] for p in read(tmp_path / "a.pcap") if p.ports == (7401, 7401)]
+    written = [p.rtps[56:] for p in read(tmp_path / "a.pcap") if p.ports == (7401, 7401)]
     pose = slice(16, 60)  # after encapsulation, stamp and id; what follows it is as it was
     assert [(w[:13], w[pose.stop : -16]) for w in sorted(written)] == [
         (s[:13], s[pose.stop : -16]) for s in sorted(sent)
@@ -119,7 +125,8 @@ def test_every_directive_is_there(flown: tuple[SortieRecord, Path]) -> None:
     rows = sorted(record.tables["directives"].to_pylist(), key=lambda row: row["t_s"])
     assert len(taken) == len(rows) == record.totals["directives"]
     for packet, row in zip(taken, rows, strict=True):
-        order = decode_directive(packet.rtps[-DIRECTIVE_BYTES:])
+        assert struct.unpack_from("<H", packet.rtps, 50)[0] == len(packet.rtps) - 52 == 20 + DIRECTIVE_BYTES
+        order = decode_directive(packet.rtps[20 + 12 + 16 + 24 :])
         assert (packet.t_ns, order.source, order.destination) == (round(row["t_s"] * 1e9), row["drone"], row["peer"])
         assert order.rate_hz == pytest.approx(row["rate_hz"], rel=1e-6)
 
