@@ -127,7 +127,7 @@ def _may_begin(data: bytes, at: int) -> bool:
     """Whether a time that could be one and a frame's first byte stand here, or the file ends before."""
     if len(data) - at <= _STAMP_BYTES:
         return True
-    return data[at + _STAMP_BYTES] in _MARKS and _YEARS_US[0] < LOG_STAMP.unpack_from(data, at)[0] < _YEARS_US[1]
+    return data[at + _STAMP_BYTES] in _MARKS and _YEARS_US[0] <= LOG_STAMP.unpack_from(data, at)[0] < _YEARS_US[1]
 
 
 def _frame_bytes(data: bytes, at: int) -> int:

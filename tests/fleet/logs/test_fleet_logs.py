@@ -17,6 +17,7 @@ from sortie.fleet.logs.fields import from_dataflash, from_tlog, from_ulog
 from sortie.fleet.logs.flightlog import FlightLog, LogError, _assemble, local_m, read_log
 from sortie.fleet.logs.geodesy import geodetic
 from sortie.fleet.logs.identify import predicted_voltage
+from sortie.fleet.logs.mavlink import Transmitter, messages
 from sortie.fleet.logs.tlog import read_tlog
 from sortie.fleet.logs.ulog import read_ulog
 from sortie.scenarios.schema import Battery
@@ -50,6 +51,21 @@ def test_the_same_flight_whatever_wrote_it(kind: str, tmp_path: Path) -> None:
     assert log.attitude is not None
     # yaw 0 in NED is north: FLU turned by 90° in ENU
     np.testing.assert_allclose(np.abs(log.attitude.values @ [0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4)]), 1, atol=1e-6)
+
+
+def test_a_telemetry_log_that_begins_in_1970_is_read(tmp_path: Path) -> None:
+    """`sortie export --tlog --begin 1970-01-01` wrote a first stamp of 0, which was no time to the reader."""
+    transmitter = Transmitter(0)
+    data = b"".join(
+        struct.pack(">Q", k * 100_000) + transmitter.pack(message)
+        for k in range(20)
+        for message in messages(examples.state(k), examples.ORIGIN)
+    )
+    log = read_log(written(tmp_path, "tlog", data))
+    assert log.problems == ()
+    assert log.position is not None
+    assert len(log.position.time_s) == 20
+    assert log.utc_s == 0.0
 
 
 def test_signal_strength_where_the_log_has_it(tmp_path: Path) -> None:
