@@ -128,7 +128,7 @@ class LiveNode:
         self._sent = dict.fromkeys((TopicKind.DIRECTIVE, *PAYLOADS), Count())
         self._received = dict.fromkeys(PAYLOADS, Count())
         self._new = SinceLastReport()
-        self._began_cpu_s = 0.0
+        self._began_s = self._began_cpu_s = 0.0
         self.own: Descriptor | None = None
         """The drone's latest descriptor, if another of its nodes publishes."""
         self._own_counter = 0
@@ -149,7 +149,7 @@ class LiveNode:
         """Begin the flight: what comes in goes to `memory`, and processor time counts from here."""
         self._clock, self._memory, self._rules = clock, memory, rules
         self.goodput_mbps = goodput_mbps
-        self._began_cpu_s = time.process_time()
+        self._began_s, self._began_cpu_s = clock.now, time.process_time()
 
     def decided(self, decision: Decision) -> None:
         """Keep a decision's processor time and events for the next report."""
@@ -188,7 +188,7 @@ class LiveNode:
         """The counts, and what happened since the last report."""
         new, self._new = self._new, SinceLastReport()
         return Report(
-            self.drone, t_s, time.process_time() - self._began_cpu_s, self._published, self._heard, self._lost,
+            self.drone, self._began_s, t_s, time.process_time() - self._began_cpu_s, self._published, self._heard, self._lost,
             dict(self._refused), self._late_s, dict(self._sent), dict(self._received), new,
         )  # fmt: skip
 

@@ -68,9 +68,11 @@ class Report:
     """One drone's counts since the begin, and what happened since its last report."""
 
     drone: int
+    begin_s: float
+    """When the process began to fly."""
     t_s: float
     cpu_s: float
-    """Processor time of all threads of the process, and of its policy's process."""
+    """Since then: processor time of all threads of the process, and of its policy's process."""
     published: int
     heard: int
     """Valid descriptors of other drones."""

@@ -34,7 +34,7 @@ class DroneResult(NamedTuple):
 
     drone: int
     cpu_percent: float
-    """Of one core, all threads, from the begin to its last report."""
+    """Of one core, all threads, from the process's begin to its last report."""
     published: int
     heard: int
     dropped_by_loss: int
@@ -101,7 +101,7 @@ class LiveResult:
     data_age_ms_p50: float | None
     """From a capture to its payload's arrival, compute delay included."""
     drones_cpu_percent: float
-    """All drones' processes together, of one core."""
+    """All drones' processes together, of one core, over the whole flight."""
     bench_cpu_percent: float
     each: list[DroneResult]
     lost: list[Lost]
@@ -140,7 +140,7 @@ def summarise(
     context_bytes = context.bytes + directives.bytes
     each = [
         DroneResult(
-            r.drone, 100 * r.cpu_s / max(r.t_s - begin_s, 1e-9), r.published, r.heard, r.lost, r.refused,
+            r.drone, 100 * r.cpu_s / max(r.t_s - r.begin_s, 1e-9), r.published, r.heard, r.lost, r.refused,
             sum(r.received[kind].samples for kind in PAYLOADS), r.fallbacks, r.policy_restarts, r.late_s,
         )
         for r in fleet.last.values()
@@ -164,7 +164,7 @@ def summarise(
         decide_ms_p99=_percentile(decide_ms, 99),
         decisions=len(decide_ms),
         data_age_ms_p50=_percentile(data_age_ms, 50),
-        drones_cpu_percent=sum(d.cpu_percent for d in each),
+        drones_cpu_percent=100 * sum(r.cpu_s for r in fleet.last.values()) / flown_s,
         bench_cpu_percent=100 * bench.cpu_s / flown_s,
         each=sorted(each),
         lost=list(lost),

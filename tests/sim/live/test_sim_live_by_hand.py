@@ -39,18 +39,20 @@ FRESH, DEGRADED, DETACHED = LinkHealth.FRESH, LinkHealth.DEGRADED, LinkHealth.DE
 ORDER, FEATURES, COMPACT = TopicKind.DIRECTIVE, TopicKind.FEATURES, TopicKind.COMPACT
 
 
-def report(drone: int, t_s: float, k: int, new: SinceLastReport, **more: Any) -> Report:
+def report(drone: int, t_s: float, k: int, new: SinceLastReport, begin_s: float = 50.0, **more: Any) -> Report:
     """Counts that differ from one another and, by `k`, from those of other reports."""
     return Report(
-        drone=drone, t_s=t_s, cpu_s=0.5 * k, published=20 * k, heard=30 * k, lost=4 * k, refused={"descriptor late": k},
+        drone=drone, begin_s=begin_s, t_s=t_s, cpu_s=0.5 * k, published=20 * k, heard=30 * k, lost=4 * k, refused={"descriptor late": k},
         late_s=0.01 * k, sent={ORDER: Count(100 * k, 3600 * k), FEATURES: Count(40 * k, 9000 * k), COMPACT: Count(10 * k, 700 * k)},
         received={FEATURES: Count(30 * k, 8000 * k), COMPACT: Count(5 * k, 300 * k)}, new=new, **more,
     )  # fmt: skip
 
 
-def summary(**changes: Any) -> LiveResult:
+def summary(*late: Report, **changes: Any) -> LiveResult:
     """Three drones, ten seconds from 50 s on: drone 0 in two reports, drone 1 in one, drone 2 ends at 55 s."""
     fleet = FleetReports()
+    for each in late:
+        fleet.add(each, late=True)
     fleet.add(
         report(0, 52.0, 1, SinceLastReport([1_000_000], [0.1], [HealthChange(51.0, 0, 1, FRESH, 0.1)])), late=False
     )
@@ -106,6 +108,13 @@ def test_every_figure_of_a_live_flight_by_hand() -> None:
     assert [h.t_s for h in found.health] == sorted(h.t_s for h in found.health)
     assert [o.t_s for o in found.orders] == [51.0, 51.5, 53.0, 58.0]
     assert found.notices == [Notice(54.0, 1, "noticed")]
+
+
+def test_processor_time_counts_from_the_begin_of_each_process() -> None:
+    """Drone 2 starts late and flies two seconds; its percentage is of these, and the total is of the whole flight."""
+    found = summary(report(2, 60.0, 1, SinceLastReport(), begin_s=58.0))
+    assert [(d.drone, d.cpu_percent) for d in found.each] == [(0, 10.0), (1, 15.0), (2, 25.0)]
+    assert found.drones_cpu_percent == pytest.approx(30.0)
 
 
 def test_each_kind_of_topic_has_its_rates_and_shares() -> None:
@@ -354,7 +363,7 @@ def test_a_node_counts_what_it_sends_by_kind_and_receives_from_its_own_links_alo
     for each in (first, second, third):
         each.take()
     told = [each.report(2.0) for each in (first, second, third)]
-    assert [(r.drone, r.t_s) for r in told] == [(0, 2.0), (1, 2.0), (2, 2.0)]
+    assert [(r.drone, r.begin_s, r.t_s) for r in told] == [(0, 1.0, 2.0), (1, 1.0, 2.0), (2, 1.0, 2.0)]
     assert told[0].sent == {ORDER: Count(2, 72), FEATURES: Count(2, 54), COMPACT: Count()}
     assert [r.received[FEATURES] for r in told] == [Count(), Count(2, 54), Count()]
     assert [r.received[COMPACT] for r in told] == [Count()] * 3
