@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.pilot import named_policy
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.bench import Bench, FleetReports
-from sortie.sim.live.reports import HealthChange, NewDirective, Notice
+from sortie.sim.live.reports import HealthChange, NewDirective, Notice, Report
 from sortie.sim.studies.plane_cost import machine
 
 PAPER = {claim.id: claim.paper.value for claim in OVERHEAD}
@@ -168,7 +169,7 @@ def summarise(
         bench_cpu_percent=100 * bench.cpu_s / flown_s,
         each=sorted(each),
         lost=list(lost),
-        noticed=[_time_to_notice(gone, health) for gone in lost],
+        noticed=[_time_to_notice(gone, health, fleet.last.values()) for gone in lost],
         health=health,
         orders=sorted(o for new in fleet.news for o in new.orders),
         notices=sorted(n for new in fleet.news for n in new.notices),
@@ -228,9 +229,10 @@ def _topics(bench: Bench, fleet: FleetReports, flown_s: float) -> Iterator[Topic
         )
 
 
-def _time_to_notice(gone: Lost, health: Sequence[HealthChange]) -> Noticed:
-    """When the others degraded and detached the context of a lost drone."""
-    after = [c for c in health if c.peer == gone.drone and c.t_s > gone.t_s - 1.0]
+def _time_to_notice(gone: Lost, health: Sequence[HealthChange], reports: Iterable[Report]) -> Noticed:
+    """When the others degraded and detached the context of a lost drone, up to its return."""
+    back_s = min((r.begin_s for r in reports if r.drone == gone.drone and r.begin_s > gone.t_s), default=math.inf)
+    after = [c for c in health if c.peer == gone.drone and gone.t_s - 1.0 < c.t_s < back_s]
     # the last change of each of the others is the one that lasts
     last: dict[int, dict[LinkHealth, float]] = {}
     for c in after:

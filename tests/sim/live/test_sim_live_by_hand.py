@@ -153,6 +153,16 @@ def test_who_is_lost_is_noticed_by_each_of_the_others() -> None:
     assert (unseen.degraded_s, unseen.detached_s, unseen.by) == (None, None, 0)
 
 
+def test_the_time_to_notice_a_lost_drone_ends_at_its_return() -> None:
+    """Drone 2 is back from 57 s on, and its context degrades and detaches once more."""
+    again = SinceLastReport(
+        health=[HealthChange(t_s, 0, 2, to, 0.1) for t_s, to in ((57.2, FRESH), (58.0, DEGRADED), (59.0, DETACHED))]
+    )
+    (noticed,) = summary(report(2, 60.0, 1, again, begin_s=57.0)).noticed
+    assert noticed.degraded_s == pytest.approx((0.3, 0.4))
+    assert noticed.detached_s == pytest.approx((1.0, 1.5))
+
+
 def test_without_traffic_there_are_no_ratios() -> None:
     silent = SimpleNamespace(cpu_s=0.0, of=lambda kind: Count())
     found = summarise(
