@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import simpy
 
 from sortie.fleet.agent import Guard
@@ -25,7 +27,7 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
     """The plane's rules on the bus: samples go whole, descriptors in full."""
     return PlaneRules(
         period_s=scenario.frame_s,
-        frames=round((end_s - begin_s) / scenario.frame_s),
+        frames=math.ceil(round((end_s - begin_s) * scenario.context.rate_hz, 9)),  # as Scenario.frames
         degraded_after_periods=scenario.context.degraded_after_periods,
         detached_after_periods=scenario.context.detached_after_periods,
         dwell_s=scenario.policy.dwell_s,

@@ -270,6 +270,8 @@ def test_the_rules_on_the_bus_are_the_scenario_s_own() -> None:
         compute_delay_s=0.06, code_bytes=3, publish_every=2, trust=False, roster=True, makes=rules.makes, people=True, classes=True,
     )  # fmt: skip
     assert [rules.equipment(d).compute_delay_s for d in (0, 1)] == [0.06, 0.5]
+    odd = example("duration_s=5.04")
+    assert rules_of(odd, 0.0, odd.duration_s).frames == odd.frames == 51  # the last frame begins before the end
     plain = rules_of(example(), 0.0, 6.0)
     assert (plain.people, plain.classes, plain.frames) == (False, False, 60)
 
