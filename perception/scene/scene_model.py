@@ -55,7 +55,7 @@ class SceneModel:
         """Scenes that are made of the same are the same."""
         self.town = Town(config)
         self.rect = (bounds[0] - MARGIN_M, bounds[1] - MARGIN_M, bounds[2] + MARGIN_M, bounds[3] + MARGIN_M)
-        self._parked_pose, self._parked_size, self._parked_colour = parked(self.town, self.rect)
+        self._parked_pose, self._parked_size, self._parked_colour, self._parked_spots = parked(self.town, self.rect)
         self._lanes = lanes(config, self.rect)
         self.targets = [TargetPath.of(t) for t in (target, *more_targets) if t is not None]
         n, m, first = len(self._parked_pose), len(self._lanes.s0_m), max(1, len(self.targets))

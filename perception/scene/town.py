@@ -122,7 +122,8 @@ class Block:
     """What stands in one block, world coordinates, metres.
 
     `lots` [n, 5]: x0, y0, x1, y1, tone 0…1; `buildings` [n, 6]: x0, y0, x1, y1, height, tone;
-    `trees` [n, 5]: x, y, radius, height, tone; `parked` [n, 3]: x, y, yaw; `bodies`: their shapes.
+    `trees` [n, 5]: x, y, radius, height, tone; `parked` [n, 3]: x, y, yaw; `bodies`: their shapes;
+    `spots` [n, 3]: which car of the town each of them is: i, j and its kerb spot in the block.
     """
 
     lots: Floats
@@ -130,6 +131,7 @@ class Block:
     trees: Floats
     parked: Floats
     bodies: Bodies
+    spots: NDArray[np.int64]
 
 
 @lru_cache(maxsize=1024)  # sorties that are compared fly over the same town
@@ -168,7 +170,7 @@ def block(scene: Scene, i: int, j: int) -> Block:
     ]
     tree_s = np.arange(12.0, size - 11.0, 10.0)
     spot_s = np.arange(13.0, size - 12.0, 7.0)
-    trees, parked, bodies = [], [], []
+    trees, parked, bodies, taken = [], [], [], []
     for (sx, sy), along, inward, yaw in sides:
         u = rng.random((len(tree_s), 5))
         s, off = tree_s + 3.0 * (u[:, 1] - 0.5), TREE_LINE_M + 0.5 * (u[:, 4] - 0.5)
@@ -195,6 +197,7 @@ def block(scene: Scene, i: int, j: int) -> Block:
             axis=1,
         )
         stands = (u[:, 0] < scene.parked_density) & may_park
+        taken.append(stands)
         parked.append(row[stands])
         bodies.append(u[stands][:, 4:7])
 
@@ -211,7 +214,10 @@ def block(scene: Scene, i: int, j: int) -> Block:
             axis=1,
         )
         trees.append(gardens[(u[:, 0] < scene.tree_density) & (style.green | ~built)])
-    return Block(lots, buildings, np.concatenate(trees), np.concatenate(parked), draw_bodies(np.concatenate(bodies)))
+    shapes = draw_bodies(np.concatenate(bodies))
+    spot = np.flatnonzero(np.concatenate(taken))
+    spots = np.column_stack([np.full(len(spot), i), np.full(len(spot), j), spot])
+    return Block(lots, buildings, np.concatenate(trees), np.concatenate(parked), shapes, spots)
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,7 +60,9 @@ class Lanes:
     """All moving cars over a rectangle, one row a car.
 
     `s0_m` at t = 0 along the lane, `speed_mps` signed, `low_m` and `period_m` of the wrap, `limit_m` where
-    the rectangle ends, `lateral_m` the fixed coordinate, `east` whether it drives along x.
+    the rectangle ends, `lateral_m` the fixed coordinate, `east` whether it drives along x. `slot` [n, 4] is which
+    car of the town it is: axis (0 along x, 1 along y), road, direction (1 or −1) and slot of the pattern. It does not depend
+    on the rectangle.
     """
 
     s0_m: Floats
@@ -73,6 +75,7 @@ class Lanes:
     yaw_rad: Floats
     size_m: Floats
     colour: Bytes
+    slot: NDArray[np.int64]
 
     def position_m(self, t_s: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """x, y and whether the car is inside the rectangle at `t_s`."""
@@ -106,12 +109,13 @@ def lanes(scene: Scene, rect: tuple[float, float, float, float]) -> Lanes:
                     off = 0.0 if u[k, 2] > 1.0 - scene.trucks else 0.4 * (u[k, 1] - 0.5)  # a truck fills its slot
                     for copy in range(copies):
                         s0 = (k + 0.5 + off) * SLOT_M + copy * PATTERN_M
-                        rows.append((s0, speed, low, high, copies * PATTERN_M, lateral, axis == 0, yaw))
+                        rows.append((s0, speed, low, high, copies * PATTERN_M, lateral, yaw, axis, road, sense, k))
                         shapes.append(u[k, 2:5])
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 11)
     bodies = draw_bodies(np.array(shapes, dtype=np.float64).reshape(-1, 3), scene.trucks)
-    s0, speed_, low_, limit_, period_, lateral_, east_, yaw_ = table.T
-    return Lanes(s0, speed_, low_, limit_, period_, lateral_, east_ > 0, yaw_, bodies.size_m, bodies.colour)
+    (s0, speed_, low_, limit_, period_, lateral_, yaw_), slot = table[:, :7].T, table[:, 7:].astype(np.int64)
+    east = slot[:, 0] == 0
+    return Lanes(s0, speed_, low_, limit_, period_, lateral_, east, yaw_, bodies.size_m, bodies.colour, slot)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,12 +149,13 @@ class TargetPath:
         return ax + part * (bx - ax), ay + part * (by - ay), self.yaw_rad[leg - 1]
 
 
-def parked(town: Town, rect: tuple[float, float, float, float]) -> tuple[Floats, Floats, Bytes]:
-    """Parked cars in the rectangle: pose [n, 3] (x, y, yaw), size [n, 3], colour [n, 3]."""
+def parked(town: Town, rect: tuple[float, float, float, float]) -> tuple[Floats, Floats, Bytes, NDArray[np.int64]]:
+    """Parked cars in the rectangle: pose [n, 3] (x, y, yaw), size [n, 3], colour [n, 3], and `Block.spots` [n, 3]."""
     found = town.blocks(*rect)
     pose = np.concatenate([b.parked for b in found])
     size = np.concatenate([b.bodies.size_m for b in found])
     colour = np.concatenate([b.bodies.colour for b in found])
+    spots = np.concatenate([b.spots for b in found])
     x0, y0, x1, y1 = rect
     inside = (pose[:, 0] >= x0) & (pose[:, 0] <= x1) & (pose[:, 1] >= y0) & (pose[:, 1] <= y1)
-    return pose[inside], size[inside], colour[inside]
+    return pose[inside], size[inside], colour[inside], spots[inside]

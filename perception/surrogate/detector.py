@@ -121,7 +121,7 @@ class SurrogateDetector:
         self.parameters, self.calibration, self._path = parameters, parameters.id, path
         self._scene, self._config = scene, config
         self._eyes = eyes or Eyes(scene)
-        self._draw_source = DrawSource(seed, replication, town, self._eyes.traffic.count, parameters.alike)
+        self._draw_source = DrawSource(seed, replication, town, self._eyes.traffic.identity, parameters.alike)
         self._shared = SharedFalsePositives(town)
         threshold, found, false_positives = parameters.boxes
         at = max(config.score_threshold, float(threshold[0]))

@@ -1,7 +1,8 @@
 """The surrogate's random draws for each drone, moment and car. They do not depend on what was sent. Free of torch.
 
-Each drone and each car has one number from a random stream. The draw for a drone, a millisecond and a car is a hash of
-those numbers. A stream for every look would cost more than the rest of the surrogate.
+Each drone has one number from a random stream. Each car has a number that follows from the town's seed and from which car of
+the town it is. The draw for a drone, a millisecond and a car is a hash of those numbers. A stream for every look would cost
+more than the rest of the surrogate.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from sortie.perception.surrogate.features import Looks
-from sortie.perception.surrogate.hashing import GAMMA, Hashes, mixed, uniform
+from sortie.perception.surrogate.hashing import GAMMA, Hashes, keyed, mixed, uniform
 from sortie.perception.types import Capture
 from sortie.scenarios.streams import stream
 
@@ -49,12 +50,14 @@ class DrawSource:
     """The draws of one sortie over a town.
 
     A share of the cars (`Parameters.alike`) has one draw for all drones and moments. It belongs to the town: another sortie
-    over it finds the same cars hard.
+    over it finds the same cars hard, whatever area it covers. `identity` [cars, 4] is `Traffic.identity`.
     """
 
-    def __init__(self, seed: int, replication: int, town: int, cars: int, alike: NDArray[np.float32]) -> None:
+    def __init__(
+        self, seed: int, replication: int, town: int, identity: NDArray[np.int64], alike: NDArray[np.float32]
+    ) -> None:
         self._key, self._drones = (seed, replication), dict[int, int]()
-        self._car: Hashes = stream(town, 0, (), "surrogate.car").integers(2**64, size=cars, dtype=np.uint64)
+        self._car = keyed(stream(town, 0, (), "surrogate.car").integers(2**64, dtype=np.uint64), identity)
         own = [uniform(self._car, k + 3) < part for k, part in enumerate(alike[:3])]
         sides = [np.where(uniform(self._car, k) < 0.5, -1.0, 1.0) for k in (7, 8, 9)]
         self._offset_draw = np.stack([uniform(self._car, 6), *sides], axis=1).astype(np.float32)

@@ -106,6 +106,11 @@ class Traffic:
         ids = scene._parked_ids, scene._moving_ids, np.arange(extra)
         self.ids: NDArray[np.int32] = np.concatenate(ids).astype(np.int32)
         """[cars] as `Cars.ids`."""
+        targets = np.array([(3, k, 0, 0) for k in range(extra)], np.int64).reshape(-1, 4)
+        spots = np.insert(scene._parked_spots, 0, 2, axis=1)
+        self.identity: NDArray[np.int64] = np.concatenate([spots, lanes.slot, targets])
+        """[cars, 4] which car of the town each is; it does not depend on the scene's bounds. A moving car has its `Lanes.slot`,
+        so it is the same car when the pattern repeats. A parked one has 2 and its `Block.spots`, a target 3, its number and 0."""
         size = [
             np.stack([parked.length_m, parked.width_m], 1),
             lanes.size_m[:, :2],

@@ -23,6 +23,14 @@ def mixed(x: Hashes) -> Hashes:
     return x
 
 
+def keyed(key: np.uint64, rows: NDArray[np.int64]) -> Hashes:
+    """A number for each row [n, k] of integers: other rows, or another key, give other numbers."""
+    out = np.full(len(rows), key)
+    for column in rows.T:
+        out = mixed(out ^ column.astype(np.uint64))
+    return out
+
+
 def uniform(x: Hashes, purpose: int) -> NDArray[np.float64]:
     """Numbers in (0, 1); each purpose gives different ones."""
     return np.asarray(

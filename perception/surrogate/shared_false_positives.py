@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sortie.perception.geometry import FULL, in_square
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.features import CaptureColumns
-from sortie.perception.surrogate.hashing import GAMMA, Hashes, mixed, uniform
+from sortie.perception.surrogate.hashing import GAMMA, Hashes, keyed, uniform
 from sortie.scenarios.streams import stream
 
 TILE_M = 25.6
@@ -54,8 +54,7 @@ class SharedFalsePositives:
         own = np.unique(np.floor(fleet.position_m[:, :2] / TILE_M).astype(np.int64), axis=0)
         around = np.array(list(itertools.product(_AROUND, _AROUND)))
         tiles = np.unique((own[:, None] + around).reshape(-1, 2), axis=0)
-        tile_keys = mixed(mixed(tiles[:, 0].astype(np.uint64) ^ self._key) ^ tiles[:, 1].astype(np.uint64))
-        key = tile_keys[:, None] + np.arange(1, THINGS + 1, dtype=np.uint64) * np.uint64(GAMMA)
+        key = keyed(self._key, tiles)[:, None] + np.arange(1, THINGS + 1, dtype=np.uint64) * np.uint64(GAMMA)
         rarity = np.cumsum(-np.log(uniform(key, 0)), axis=1) / _A_TILE
         tile, thing = np.nonzero(rarity < most)
         key, rarity = key[tile, thing], rarity[tile, thing]

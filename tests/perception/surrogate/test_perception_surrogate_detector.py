@@ -109,7 +109,7 @@ def test_nothing_sent_is_alone(detector: SurrogateDetector, scene: SceneModel) -
 def test_draws_do_not_depend_on_what_was_sent_nor_on_who_else_flies(
     detector: SurrogateDetector, scene: SceneModel
 ) -> None:
-    eyes, draws = Eyes(scene), DrawSource(3, 0, 7, Eyes(scene).traffic.count, detector.parameters.alike)
+    eyes, draws = Eyes(scene), DrawSource(3, 0, 7, Eyes(scene).traffic.identity, detector.parameters.alike)
     fleet = cross(10.0, 20.0, 0.3)
     every, two = eyes.look(CaptureColumns.of(fleet)), eyes.look(CaptureColumns.of(fleet[1:3]))
     a, b = draws.of(fleet, every), draws.of(fleet[1:3], two)
@@ -122,7 +122,7 @@ def test_draws_do_not_depend_on_what_was_sent_nor_on_who_else_flies(
 @pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
 def test_that_share_of_the_cars_has_one_draw_for_all_drones(scene: SceneModel, part: float) -> None:
     eyes = Eyes(scene)
-    draws = DrawSource(3, 0, 7, eyes.traffic.count, np.full(4, part, np.float32))
+    draws = DrawSource(3, 0, 7, eyes.traffic.identity, np.full(4, part, np.float32))
     fleet = [c for t in TIMES for c in cross(10.0, 20.0, 0.3, t_s=float(t))]
     looks = eyes.look(CaptureColumns.of(fleet))
     drawn = draws.of(fleet, looks)
@@ -137,12 +137,41 @@ def test_which_cars_are_hard_is_the_towns_and_the_rest_the_sorties(scene: SceneM
     eyes, fleet = Eyes(scene), cross(10.0, 20.0, 0.3)
     looks, half = eyes.look(CaptureColumns.of(fleet)), np.full(4, 0.5, np.float32)
     a, b, other = (
-        DrawSource(*key, eyes.traffic.count, half).of(fleet, looks) for key in ((3, 0, 7), (4, 1, 7), (3, 0, 8))
+        DrawSource(*key, eyes.traffic.identity, half).of(fleet, looks) for key in ((3, 0, 7), (4, 1, 7), (3, 0, 8))
     )
     own = a.look == b.look
     assert own.mean() == pytest.approx(0.5, abs=0.15)
     np.testing.assert_array_equal(a.offset_draw, b.offset_draw)
     assert (a.look == other.look).mean() < 0.05
+
+
+@pytest.mark.parametrize(
+    "larger", [(-53.0, -51.0, 50.0, 50.0), (-50.0, -50.0, 90.0, 130.0), (-900.0, -50.0, 900.0, 50.0)]
+)
+def test_a_car_keeps_its_draws_wherever_the_scene_ends(larger: tuple[float, float, float, float]) -> None:
+    """Parked cars, moving ones and the target, at two moments. The longest scene has two patterns of moving cars."""
+    config = Scene(moving_cars_per_km=20)
+    fleet = [*cross(10.0, 20.0, 0.3), *cross(10.0, 20.0, 0.3, t_s=40.0)]
+    kinds, sorties = [], []
+    for bounds, key in ((BOUNDS, (3, 0)), (larger, (3, 0)), (larger, (4, 1))):
+        eyes = Eyes(SceneModel(config, Target(waypoints_m=((15.0, 20.0),)), bounds))
+        looks = eyes.look(CaptureColumns.of(fleet))
+        drawn = DrawSource(*key, 7, eyes.traffic.identity, np.full(4, 0.5, np.float32)).of(fleet, looks)
+        order = np.lexsort([*looks.world_m.T.round(6), looks.capture])
+        kinds.append(eyes.traffic.identity[looks.car[order], 0].tolist())
+        sorties.append([v[order] for v in (drawn.look, drawn.rank, drawn.find, drawn.residual, drawn.offset_draw)])
+    assert kinds[0] == kinds[1] == kinds[2]
+    assert set(kinds[0]) == {0, 1, 2, 3}
+    small, same_sortie, other_sortie = sorties
+    for mine, theirs in zip(small, same_sortie, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    np.testing.assert_array_equal(small[-1], other_sortie[-1])
+    assert (small[0] == other_sortie[0]).mean() == pytest.approx(0.5, abs=0.15)
+
+
+def test_no_two_cars_of_a_pattern_are_one() -> None:
+    traffic = Eyes(SceneModel(Scene(moving_cars_per_km=30, parked_density=0.9), None, (-400, -400, 400, 400))).traffic
+    assert len(np.unique(traffic.identity, axis=0)) == traffic.count > 1000
 
 
 def test_uniform_draws_are_uniform_and_unlike_across_purposes() -> None:

@@ -63,6 +63,18 @@ def test_sharing_pays_and_replications_differ() -> None:
     assert run_sortie(short(), replication=1).fingerprint != run_sortie(short()).fingerprint
 
 
+def test_a_sortie_s_boxes_do_not_depend_on_its_end_nor_on_who_else_flies() -> None:
+    """The area flown is larger then, and has more cars."""
+
+    def boxes(*overrides: str) -> list[dict[str, Any]]:
+        return run_sortie(short("perception.sample_rate_hz=1", *overrides), "silence").tables["detections"].to_pylist()
+
+    plain = boxes()
+    assert len(plain) > 200
+    assert [b for b in boxes("duration_s=6") if b["t_s"] < 4.0] == plain
+    assert [b for b in boxes("fleet.drones=6") if b["drone"] == 0] == [b for b in plain if b["drone"] == 0]
+
+
 def test_it_flies_without_torch() -> None:
     code = (
         "import sys\nfrom sortie.scenarios.reading.load import load\nfrom sortie.sim.engine.sortie import run_sortie\n"
