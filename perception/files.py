@@ -29,7 +29,12 @@ def replacing(path: Path) -> Iterator[Path]:
     """A temporary path to write to; it takes the place of `path` at the end, or is removed after an error.
 
     Folders are made as needed. The name ends in `.part`, so that nobody takes a file that was cut off for a whole one.
+    A link stays: the file that it leads to is replaced. A device or a pipe is written itself.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        yield path
+        return
+    path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:

@@ -55,7 +55,8 @@ def ensure_files(*paths: Path | None) -> None:
     for path in filter(None, paths):
         if path.is_dir():
             raise RunError(f"{path}: is a folder, must be a file")
-        _ensure_place(path)
+        if not _is_device(path):
+            _ensure_place(path)
 
 
 def ensure_between(path: Path | None, begin: str, end: str) -> None:
@@ -136,13 +137,30 @@ def writing_durably(path: Path) -> Iterator[BinaryIO]:
     Raises:
         OSError: the disk refuses.
     """
-    with partial_path(path, Path.touch) as partial:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
+    with partial_file(path) as partial, partial.open("wb") as file:
+        yield file
+        file.flush()
+        if partial.is_file():
             os.fsync(file.fileno())
-        partial.replace(path)
-    sync_folder(path.parent)
+
+
+@contextmanager
+def partial_file(path: Path) -> Iterator[Path]:
+    """A temporary file to write that takes the place of `path` at the end; where the block fails, an older file stays.
+
+    A link stays: the file that it leads to is replaced. A device or a pipe, such as `/dev/stdout`, is written itself.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    if _is_device(path):
+        yield path
+        return
+    place = path.resolve()
+    with partial_path(place, Path.touch) as partial:
+        yield partial
+        partial.replace(place)
+    sync_folder(place.parent)
 
 
 @contextmanager
@@ -199,9 +217,14 @@ def _put_between(path: Path, section: str, begin: str, end: str) -> str:
         raise RunError(f"{path}: {error}") from error
 
 
+def _is_device(path: Path) -> bool:
+    """Whether a path leads to a device or a pipe."""
+    return path.exists() and not (path.is_file() or path.is_dir())
+
+
 def _ensure_place(path: Path) -> None:
     """Refuse a path if its folder cannot be made or written to."""
-    there = next(p for p in path.absolute().parents if p.exists())
+    there = next(p for p in path.resolve().parents if p.exists())
     if not there.is_dir():
         raise RunError(f"{path}: cannot make its folder: {there} is a file")
     if not os.access(there, os.W_OK):

@@ -6,6 +6,7 @@ MAVLink is NED, FRD and w-first quaternions in scaled integers; `sortie.fleet.fl
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import hmac
 import math
@@ -267,13 +268,19 @@ class Listener:
 def write_tlog(path: Path | str, frames: Iterable[tuple[int, bytes]]) -> None:
     """Write a telemetry log: for every frame its time as big-endian u64 µs since 1970, then the frame.
 
-    Written to a temporary name beside `path` and renamed, so that a log is there whole or not at all.
+    Written to a temporary name beside `path` and renamed, so that a log is there whole or not at all. A link stays: the
+    file that it leads to is replaced.
 
     Args:
         path: conventionally *.tlog.
         frames: (µs since 1970, MAVLink frame), in order of time.
+
+    Raises:
+        OSError: the disk refuses, or `path` is a folder, a device or a pipe.
     """
-    path = Path(path)
+    path = Path(path).resolve()
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from sortie.sim.cli.console import out, stages
-from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing
+from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing, writing_durably
 from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
@@ -175,6 +175,5 @@ def _write_table(table: object, path: Path) -> None:
     import pyarrow.parquet as pq
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    pq.write_table(table, part)
-    part.replace(path)
+    with writing_durably(path) as file:
+        pq.write_table(table, file)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -12,8 +13,10 @@ from pathlib import Path
 import pytest
 from sim_examples import BASE, example
 
+from sortie.fleet.logs.mavlink import write_tlog
+from sortie.perception.files import replacing as replacing_file
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.folders import RunError, replacing, write_durably
+from sortie.sim.folders import RunError, ensure_files, replacing, write_durably
 from sortie.sim.results import run_folder
 
 FLY = "from sortie.sim.cli.app import main; main()"
@@ -127,3 +130,46 @@ def test_a_folder_that_had_stepped_aside_for_a_killed_writer_comes_back(tmp_path
         fails()
     assert (tmp_path / "made" / "a").read_text() == "a day's work"
     assert list(tmp_path.iterdir()) == [tmp_path / "made"]
+
+
+def part_then_rename(path: Path, data: bytes) -> None:
+    with replacing_file(path) as part:
+        part.write_bytes(data)
+
+
+WRITERS = {
+    "durably": write_durably,
+    "by the perception room": part_then_rename,
+    "as a telemetry log": lambda path, data: write_tlog(path, [(0, data)]),
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_link_stays_and_the_file_that_it_leads_to_is_written(kind: str, tmp_path: Path) -> None:
+    real, link = tmp_path / "elsewhere" / "real", tmp_path / "link"
+    real.parent.mkdir()
+    link.symlink_to(real)
+    for data in (b"new", b"newer"):  # a link to nothing, and to a file
+        WRITERS[kind](link, data)
+        assert link.is_symlink()
+        assert real.read_bytes().endswith(data)
+    assert list(real.parent.iterdir()) == [real]
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_pipe_or_a_device_is_not_replaced_by_a_file(kind: str, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    ensure_files(pipe)
+    end = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        if kind == "as a telemetry log":  # written at once or not at all
+            with pytest.raises(OSError, match="is not a regular file"):
+                WRITERS[kind](pipe, b"new")
+        else:
+            WRITERS[kind](pipe, b"new")
+            assert os.read(end, 10) == b"new"
+    finally:
+        os.close(end)
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
