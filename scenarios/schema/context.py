@@ -36,7 +36,7 @@ class DescriptorForm(PresetSection):
 class Context(Section):
     rate_hz: float = Field(
         10.0,
-        gt=0,
+        ge=1e-3,
         le=10,
         description="Descriptors a second and drone, at most 10 (the plane's bound); also the frame rate.",
     )

@@ -124,7 +124,7 @@ class Spoof(BaseEvent):
     attack: Literal["forged", "replayed", "malformed", "oversized"] = Field(
         "forged", description="What is put on the air."
     )
-    rate_hz: float = Field(10.0, gt=0, le=1000, description="Datagrams a second.")
+    rate_hz: float = Field(10.0, ge=1e-3, le=1000, description="Datagrams a second.")
 
 
 class Lie(BaseEvent):

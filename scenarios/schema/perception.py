@@ -98,13 +98,13 @@ class Perception(Section):
     )
     sample_rate_hz: float = Field(
         2.0,
-        gt=0,
+        ge=1e-3,
         le=10,
         description="How often accuracy is scored, at times that keep time with no rate; traffic runs at context.rate_hz.",
     )
     tracking_rate_hz: float = Field(
         2.0,
-        gt=0,
+        ge=1e-3,
         le=10,
         description="How often a drone's tracker takes in the drone's own detections; at scored frames, where there are enough.",
     )

@@ -35,7 +35,7 @@ class Scenario(Section):
     name: str = Field(pattern=r"^[a-z0-9_]+$", max_length=64, description="Short name, as in the file's name.")
     description: str = Field("", max_length=2000, description="One paragraph for people.")
     seed: int = Field(1, ge=0, lt=2**63, description="Every random draw follows from it.")
-    duration_s: float = Field(120.0, gt=0, le=7200, description="Length of the sortie; the end is exclusive.")
+    duration_s: float = Field(120.0, ge=1e-3, le=7200, description="Length of the sortie; the end is exclusive.")
     fleet: Fleet = Fleet()
     mission: Mission = Mission()
     radio: Radio = Radio()

@@ -199,7 +199,7 @@ def test_anchors_within_bounds_may_be_used() -> None:
 def test_a_byte_order_mark_and_windows_line_ends_do_no_harm(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_bytes(b"\xef\xbb\xbfname: a\r\nduration_s: 0\r\n")
-    with pytest.raises(ScenarioError, match=r"a\.yaml:2: duration_s: 0, must be > 0$"):
+    with pytest.raises(ScenarioError, match=r"a\.yaml:2: duration_s: 0, must be ≥ 0\.001$"):
         load(path)
 
 
@@ -234,6 +234,16 @@ def test_overrides_replace_and_add() -> None:
     assert scenario.policy.params == {"rho": 0.25, "k": 2}
     assert scenario.fleet.route.waypoints_m == ((0, 0), (80, 0))
     assert scenario.seed == 3, "the last one wins"
+
+
+@pytest.mark.parametrize(
+    "field",
+    ["duration_s", "context.rate_hz", "perception.sample_rate_hz", "perception.tracking_rate_hz", "events.0.rate_hz"],
+)
+def test_durations_and_rates_are_no_smaller_than_a_flight_can_count(field: str) -> None:
+    text = "name: a\nevents: [{kind: spoof, at_s: 0, drone: 0, rate_hz: 1}]"
+    with pytest.raises(ScenarioError, match=f"{field}: 0.00099, must be ≥ 0.001"):
+        loads(text, overrides=[f"{field}=0.00099"])
 
 
 @pytest.mark.parametrize("written", ["", "fleet:\n", "fleet: {}\n", "fleet: {drones: 4}\n"])

@@ -69,7 +69,7 @@ def test_everything_that_is_wrong_is_said_at_once(here: Path) -> None:
     lines = text.splitlines()
     assert code == 1
     assert lines[:3] == [
-        "broken.yaml:2: duration_s: -1, must be > 0",
+        "broken.yaml:2: duration_s: -1, must be ≥ 0.001",
         'broken.yaml:3: fleet.drones: "many", must be a whole number',
         "broken.yaml:3: fleet.formatoin: unknown key, did you mean formation?",
     ]
@@ -115,7 +115,7 @@ def test_a_campaign_and_a_set_of_conditions_are_read_as_what_they_are(here: Path
 
 
 def test_the_first_issue_alone_is_the_error_of_a_flight() -> None:
-    with pytest.raises(ScenarioError, match=r"duration_s: -1, must be > 0 \(and 3 more\)$") as caught:
+    with pytest.raises(ScenarioError, match=r"duration_s: -1, must be ≥ 0.001 \(and 3 more\)$") as caught:
         loads(BROKEN)
     assert len(caught.value.issues) == 4
 
