@@ -289,13 +289,12 @@ def compare(
     for name, value in (("pilot", pilot), ("most_seeds", most_seeds), ("kept", kept or None)):
         if value is not None:
             raise RunError(f"{name}: goes with half_width, which is missing")
-    if (
-        not isinstance(seeds, int | Iterable | None)
-        or isinstance(seeds, bool)
-        or (isinstance(seeds, int) and seeds < 1)
-    ):
+    if isinstance(seeds, Iterable):
+        listed = [*seeds]
+    elif seeds is None or (hasattr(seeds, "__index__") and not isinstance(seeds, bool) and operator.index(seeds) > 0):
+        listed = chosen_seeds(base, count=None if seeds is None else operator.index(seeds))
+    else:
         raise ScenarioError(f"seeds: {seeds!r}, must be a list of seeds or how many, 1 or more")
-    listed = seeds if isinstance(seeds, Iterable) else chosen_seeds(base, count=seeds)
     chosen = [_whole("seeds", seed) or 0 for seed in listed]
     _ensure_callable("progress", progress)
     if not chosen or len(set(chosen)) < len(chosen):
@@ -429,11 +428,13 @@ def campaign(
     from sortie.sim.campaign.plan import make_plan
     from sortie.sim.campaign.store import ensure_usable
 
+    if scheduler is not None and not isinstance(scheduler, str):
+        raise RunError(f"scheduler: {scheduler!r}, must be an address: 'tcp://host:8786'")
     if scheduler is not None and workers:
         raise RunError("workers and scheduler: name one of them")
     if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 0):
         raise RunError(f"workers: {workers!r}, must be a whole number from 0 on, or None")
-    if worker_memory_gb is not None and not 0 < worker_memory_gb < math.inf:
+    if worker_memory_gb is not None and not (_is_number(worker_memory_gb) and 0 < worker_memory_gb < math.inf):
         raise RunError(f"worker_memory_gb: {worker_memory_gb!r}, must be above 0, or None")
     _ensure_callable("progress", progress)
     _ensure_callable("notice", notice)
@@ -487,7 +488,7 @@ def open_campaign(folder: str | Path) -> CampaignResult:
 
 
 def _certificates(security: Sequence[str | Path]) -> tuple[Path, Path, Path]:
-    if isinstance(security, str) or len(security) != 3:
+    if isinstance(security, str) or not isinstance(security, Sequence) or len(security) != 3:
         raise RunError(f"security: {security!r}, must be three paths: CA, certificate, key")
     ca, cert, key = (as_path("security", file) for file in security)
     return ca, cert, key
@@ -534,6 +535,7 @@ def check(
     from sortie.sim.check.checking import check_scenario
     from sortie.sim.check.discovery import scenario_files
 
+    _ensure_callable("progress", progress)
     chosen = scenarios if isinstance(scenarios, Sequence) and not isinstance(scenarios, str) else [scenarios]
     names = [name for one in chosen for name in scenario_files(as_path("scenarios", one))]
     for name in names:
@@ -601,7 +603,7 @@ def _precision_settings(half_width: Any, seeds: object, metric: Any, pilot: Any,
 
     if seeds is not None:
         raise RunError("seeds and half_width: name one of them; a half-width chooses its number of seeds")
-    if isinstance(half_width, bool) or not isinstance(half_width, int | float):
+    if not _is_number(half_width):
         raise RunError(f"half_width: {half_width!r}, must be a number above 0 and below 1; 0.01 is one AP point")
     first, most = _whole("pilot", pilot), _whole("most_seeds", most_seeds)
     most = MOST if most is None else most
@@ -615,6 +617,10 @@ def _whole(name: str, value: Any) -> int | None:
     if isinstance(value, bool) or not hasattr(value, "__index__") or not 0 <= operator.index(value) <= MAX_SEED:
         raise ScenarioError(f"{name}: {value!r}, must be a whole number from 0 to 2^63 - 1")
     return operator.index(value)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _ensure_callable(name: str, value: object) -> None:

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ValidationError
 from sortie.scenarios.reading.explain import explain
 from sortie.scenarios.reading.files import found_beside, without_brackets
 from sortie.scenarios.reading.nodes import (
+    MAX_DEPTH,
     Issue,
     Node,
     ScenarioError,
@@ -28,7 +29,7 @@ from sortie.scenarios.reading.nodes import (
     plain,
     problems,
 )
-from sortie.scenarios.reading.strict_yaml import MAX_DEPTH, read_yaml, write_yaml
+from sortie.scenarios.reading.strict_yaml import read_yaml, write_yaml
 from sortie.scenarios.schema import Airframe, DescriptorForm, Scenario
 from sortie.scenarios.schema.conditions import ConditionSet
 

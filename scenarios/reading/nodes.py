@@ -12,6 +12,8 @@ from sortie.scenarios.errors import SortieError, one_line
 Scalar = str | int | float | bool | None
 Path = tuple[str | int, ...]
 """Where a value stands in a scenario: ("events", 0, "at_s"), written events.0.at_s."""
+MAX_DEPTH = 20
+"""Of sections and lists within each other."""
 
 
 class ScenarioError(SortieError):
@@ -91,16 +93,18 @@ def plain(node: Node) -> object:
     return node.value
 
 
-def as_node(value: object, source: str = "vary", line: int = 0) -> Node:
+def as_node(value: object, source: str = "vary", line: int = 0, depth: int = 1) -> Node:
     """A plain value as nodes that all say they stand at one place; what is not plain has a problem that says so."""
     if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:
         value = value.item()  # a number of numpy's
+    if depth > MAX_DEPTH:
+        return Node(None, source, line, problem=f"{depth} levels deep, must be at most {MAX_DEPTH}")
     if isinstance(value, Mapping):
         if odd := [key for key in value if not isinstance(key, str)]:
             return Node(None, source, line, problem=f"the key {odd[0]!r} is no text")
-        return Node({key: as_node(v, source, line) for key, v in value.items()}, source, line)
+        return Node({key: as_node(v, source, line, depth + 1) for key, v in value.items()}, source, line)
     if isinstance(value, list | tuple):
-        return Node([as_node(v, source, line) for v in value], source, line)
+        return Node([as_node(v, source, line, depth + 1) for v in value], source, line)
     if isinstance(value, float) and not math.isfinite(value):
         return Node(None, source, line, problem=f"{value}, must be a finite number")
     if value is None or isinstance(value, str | int | float):

@@ -17,11 +17,10 @@ from typing import Any
 
 import yaml
 
-from sortie.scenarios.reading.nodes import Node, Scalar, ScenarioError
+from sortie.scenarios.reading.nodes import MAX_DEPTH, Node, Scalar, ScenarioError
 
 MAX_WEIGHT = 50_000
 """Values after alias expansion; long text counts once a hundred characters."""
-MAX_DEPTH = 20
 _Parser: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # only its event stream is used
 
 _INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")

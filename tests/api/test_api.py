@@ -166,6 +166,11 @@ def test_a_seed_may_be_numpys() -> None:
     )  # type: ignore[arg-type]
 
 
+def test_a_number_of_seeds_may_be_numpys() -> None:
+    compared = sortie.compare("track_target", ["silence"], SHORT, seeds=np.int64(1))  # type: ignore[arg-type]
+    assert [s.seed for s in compared.sorties] == [sortie.load("track_target").seed]
+
+
 def test_a_policy_flies_from_a_file(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
         "import sortie\n\ndef decide(view):\n"
@@ -371,6 +376,9 @@ def test_the_environment_steps() -> None:
 # --- wrong arguments -----------------------------------------------------------------------------
 
 
+HOLDS_ITSELF: dict[str, object] = {"name": "a"}
+HOLDS_ITSELF["fleet"] = HOLDS_ITSELF
+SHORT_TEXTS = ["duration_s=1", "perception.detector=none", "expect=[]"]
 WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "unknown scenario": (lambda: sortie.fly("nonsense"), sortie.ScenarioError, "nonsense: no such file, the library has "),
     "near miss": (lambda: sortie.load("track_targt"), sortie.ScenarioError, "did you mean track_target?"),
@@ -413,6 +421,14 @@ WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "unknown metric": (lambda: sortie.fly("track_target", SHORT).metrics["bytes.data_snt"], sortie.SortieError, "bytes.data_snt: this run has no such metric, did you mean bytes.data_sent?"),
     "a metric like no other": (lambda: sortie.fly("track_target", SHORT).metrics["§"], KeyError, "§: this run has no such metric, `sorted(run.metrics)` lists the names"),
     "negative workers": (lambda: sortie.campaign("link_battery", workers=-1), sortie.RunError, "workers: -1, must be a whole number from 0 on, or None"),
+    "a dict that holds itself": (lambda: sortie.load(HOLDS_ITSELF), sortie.ScenarioError, "21 levels deep, must be at most 20"),
+    "a deep override": (lambda: sortie.load("track_target", {"fleet": HOLDS_ITSELF}), sortie.ScenarioError, "21 levels deep, must be at most 20"),
+    "memory as text": (lambda: sortie.campaign("link_battery", worker_memory_gb="x"), sortie.RunError, "worker_memory_gb: 'x', must be above 0, or None"),  # type: ignore[arg-type]
+    "a number for a scheduler": (lambda: sortie.campaign("link_battery", scheduler=5), sortie.RunError, "scheduler: 5, must be an address: 'tcp://host:8786'"),  # type: ignore[arg-type]
+    "a number for certificates": (lambda: sortie.campaign("link_battery", security=5), sortie.RunError, "security: 5, must be three paths: CA, certificate, key"),  # type: ignore[arg-type]
+    "a progress of a check that is no function": (lambda: sortie.check("track_target", SHORT_TEXTS, progress=5), sortie.ScenarioError, "progress: 5, must be a function, or None"),  # type: ignore[arg-type]
+    "a negative seed of an episode": (lambda: sortie.env("track_target", SURROGATE).reset(seed=-1), sortie.ScenarioError, "seed: -1, must be a whole number from 0 to 2^63 - 1"),
+    "a negative seed of a team's episode": (lambda: sortie.env("track_target", SURROGATE, team=True).reset(seed=-1), sortie.ScenarioError, "seed: -1, must be a whole number from 0 to 2^63 - 1"),
     "nothing to check": (lambda: sortie.check("nope"), sortie.ScenarioError, "nope: no such file"),
     "a lone drone": (lambda: sortie.env({"name": "a", "fleet": {"drones": 1}}), sortie.RunError, "fleet.drones is 1, must be at least 2 to share"),
 }  # fmt: skip

@@ -25,8 +25,8 @@ from sortie.scenarios.reading.files import (
     without_brackets,
 )
 from sortie.scenarios.reading.load import ScenarioError, build, load, loads
-from sortie.scenarios.reading.nodes import as_node, assign, child, nearest, plain
-from sortie.scenarios.reading.strict_yaml import MAX_DEPTH, MAX_WEIGHT, read_yaml
+from sortie.scenarios.reading.nodes import MAX_DEPTH, as_node, assign, child, nearest, plain
+from sortie.scenarios.reading.strict_yaml import MAX_WEIGHT, read_yaml
 from sortie.scenarios.reading.top_keys import top_keys
 from sortie.scenarios.schema.campaign import Linspace, Normal
 
