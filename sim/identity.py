@@ -16,7 +16,7 @@ from typing import Any
 from sortie.scenarios.code_digest import contents, digest_of, installed
 from sortie.scenarios.plugins.reference import file_of, is_file, package_of
 from sortie.scenarios.plugins.user_code import imported_files
-from sortie.scenarios.reading.files import named_files, named_models
+from sortie.scenarios.reading.files import ensure_files, named_files, named_models
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.traces import located
 
@@ -184,6 +184,7 @@ def own_files(
 
     Raises:
         PluginError: a file of a model is not there.
+        ScenarioError: another file that the scenario names is not there.
         OSError: a file cannot be read.
     """
     sections = scenario.model_dump(mode="json")
@@ -192,6 +193,7 @@ def own_files(
     for kind, name in named_models(sections):
         if is_file(name):
             file_of(kind, name)  # its errors: a model that does not fly may be missing
+    ensure_files(sections)
     named = {name: located(Path(name)) for name in named_files(sections)}
     found = {name: _digest(path) for name, path in named.items() if path.suffix != ".py"}
     code = [path for path in named.values() if path.suffix == ".py"]

@@ -168,11 +168,29 @@ def models_with_params(sections: dict[str, Any]) -> Iterator[tuple[str, str, dic
         yield kind, holder[key], holder.get(params_of(key)) or {}
 
 
+def ensure_files(sections: dict[str, Any]) -> None:
+    """Refuse a scenario whose fields name files that are not there.
+
+    Raises:
+        ScenarioError: naming the field and the file.
+    """
+    for field, holder, key in _files(sections):
+        if not os.path.exists(located(Path(holder[key]))):
+            raise ScenarioError(f"{field}: {holder[key]}: no such file")
+
+
+def _files(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Where fields that are for files name one: the field, the section and its key."""
+    for field in FIELDS:
+        yield from ((field, *at) for at in _given(sections, (field,)))
+    for i, make in enumerate(sections.get("fleet", {}).get("makes", ())):
+        for key in ("weights", "codebook"):
+            yield from ((f"fleet.makes.{i}.{key}", *at) for at in _given(make, (key,)))
+
+
 def _places(sections: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
     """Where files are named: the section and its key."""
-    yield from _given(sections, FIELDS)
-    for make in sections.get("fleet", {}).get("makes", ()):
-        yield from _given(make, ("weights", "codebook"))
+    yield from ((holder, key) for _, holder, key in _files(sections))
     for _, holder, key in _models(sections):
         if is_file(holder[key]):
             yield holder, key

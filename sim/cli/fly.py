@@ -166,7 +166,7 @@ def _own_files(scenario: Scenario) -> dict[str, str]:
     """Digests of the scenario's own files; none where one cannot be read, as the flight then says which."""
     try:
         return own_files(scenario)
-    except OSError:
+    except (OSError, ScenarioError):
         return {}
 
 
