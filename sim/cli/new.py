@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -30,7 +31,22 @@ def new(
         raise SortieError(f"{path}: is there already, choose another name or delete it")
     text = files("sortie.scenarios").joinpath("starter.yaml").read_text("utf-8").replace("NAME", name)
     loads(text, str(path))
+    schema = files("sortie.scenarios").joinpath("schema.json").read_text("utf-8")
+    _ensure_ours(Path(SCHEMA))
     write_text(path, text)
-    write_text(Path(SCHEMA), files("sortie.scenarios").joinpath("schema.json").read_text("utf-8"))
+    write_text(Path(SCHEMA), schema)
     out.print(f"{path} written; {SCHEMA} beside it completes and checks it in editors with a YAML language server")
     out.print(f"fly it with: sortie fly {path}", soft_wrap=True, markup=False)
+
+
+def _ensure_ours(path: Path) -> None:
+    """Refuse a file that is not the JSON Schema of any version of Sortie, before it is replaced."""
+    try:
+        there = json.loads(path.read_bytes())
+        ours = there["title"] == "Scenario" and "fleet" in there["properties"]
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, TypeError, LookupError):
+        ours = False
+    if not ours:
+        raise SortieError(f"{path}: is there already and is no JSON Schema of Sortie; move it")
