@@ -90,7 +90,7 @@ def main(folder: Path = PAPER_120S) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name in FILES:
         new = folder / f".{name}.new"
-        new.write_text(text(name))
+        new.write_text(text(name), "utf-8")
         new.replace(folder / name)
 
 

@@ -97,7 +97,7 @@ def calibrate(
     parameters = replace(parameters, card={**facts, **verdict.facts()})
     save(out, parameters)
     with replacing(out.with_suffix(".md")) as part:
-        part.write_text(card(parameters, verdict))
+        part.write_text(card(parameters, verdict), "utf-8")
     return parameters, verdict
 
 

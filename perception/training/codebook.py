@@ -112,7 +112,7 @@ def make_codebook(
     }  # fmt: skip
     save_codebook(codebook, path, facts)
     with replacing(path.with_suffix(".md")) as part:
-        part.write_text(card(path.name, facts))
+        part.write_text(card(path.name, facts), "utf-8")
     return facts
 
 

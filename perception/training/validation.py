@@ -84,7 +84,7 @@ def publish(
     facts = {"runs": runs, "benchmark": of_benchmark(bench), "validation": [asdict(level) for level in levels]}
     save_weights(net, path, facts)
     with replacing(path.with_suffix(".md")) as part:
-        part.write_text(card(path.name, asdict(net.config), facts))
+        part.write_text(card(path.name, asdict(net.config), facts), "utf-8")
 
 
 def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:

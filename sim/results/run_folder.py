@@ -101,7 +101,7 @@ def ensure_same(path: Path, scenario: Scenario, seed: int, replication: int, fil
         if not (path / OUTCOME).is_file():
             return
         try:
-            about = json.loads((path / RECORD).read_text())
+            about = json.loads((path / RECORD).read_text("utf-8"))
             old = {name: about[name] for name in new}
             there = _scenario_of(path).model_dump(mode="json")
         except (OSError, ValueError, TypeError, LookupError) as error:
@@ -137,8 +137,8 @@ def save(
         check()
     result = outcome(record)
     with replacing(path, check) as partial:
-        (partial / OUTCOME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
-        (partial / SCENARIO).write_text(dump(record.scenario))
+        (partial / OUTCOME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", "utf-8")
+        (partial / SCENARIO).write_text(dump(record.scenario), "utf-8")
         about = {
             "policy": record.policy,
             "seed": record.seed,
@@ -151,7 +151,7 @@ def save(
             "totals": dict(record.totals),
             "wall": dict(record.wall),
         }
-        (partial / RECORD).write_text(json.dumps(about, indent=2) + "\n")
+        (partial / RECORD).write_text(json.dumps(about, indent=2) + "\n", "utf-8")
         for name in record.tables:
             _write_table(record.tables, name, partial / f"{name}.parquet")
         if also is not None:
@@ -176,7 +176,8 @@ def _write_table(tables: Mapping[str, pa.Table], name: str, path: Path) -> None:
 
 def beside(path: Path, fingerprint: str) -> Path:
     """The folder for a run that found another one in its place."""
-    return path.with_name(f"{path.name}-{fingerprint[:8]}")
+    place = path if path.name.strip(".") else path.resolve()  # `.` has no name of its own
+    return place.with_name(f"{place.name}-{fingerprint[:8]}")
 
 
 def in_place_of(path: Path, fingerprint: str) -> str:
@@ -184,7 +185,7 @@ def in_place_of(path: Path, fingerprint: str) -> str:
     if not (path / OUTCOME).is_file():
         return ""
     try:
-        old = json.loads((path / OUTCOME).read_text())
+        old = json.loads((path / OUTCOME).read_text("utf-8"))
         there = f"a run of {old['scenario']} under {old['policy']}, seed {old['seed']}"
         return "" if old["fingerprint"] == fingerprint else there
     except (OSError, ValueError, TypeError, LookupError):
@@ -206,7 +207,7 @@ def _difference(old: Mapping[str, Any], new: Mapping[str, Any], within: str = ""
 def _is_of_the_run(page: Path) -> bool:
     """Whether a page belongs to the run in its folder, by that run's fingerprint."""
     try:
-        fingerprint = json.loads((page.parent / OUTCOME).read_text())["fingerprint"]
+        fingerprint = json.loads((page.parent / OUTCOME).read_text("utf-8"))["fingerprint"]
         return str(fingerprint) in page.read_text(encoding="utf-8")
     except (OSError, ValueError, TypeError, LookupError):
         return False
@@ -215,7 +216,7 @@ def _is_of_the_run(page: Path) -> bool:
 def _scenario_of(path: Path) -> Scenario:
     """The scenario of a run. Packages that offered its models need not be installed."""
     with models_of_the_past():
-        return loads((path / SCENARIO).read_text(), source=str(path / SCENARIO))
+        return loads((path / SCENARIO).read_text("utf-8"), source=str(path / SCENARIO))
 
 
 def load(path: Path) -> SortieRecord:
@@ -227,7 +228,7 @@ def load(path: Path) -> SortieRecord:
     if not (path / OUTCOME).is_file():
         raise RunError(f"{path}: no run there ({OUTCOME} is missing)")
     try:
-        about = json.loads((path / RECORD).read_text())
+        about = json.loads((path / RECORD).read_text("utf-8"))
         scenario = _scenario_of(path)
         expected = dict(TABLES)
         if scenario.record.views:
