@@ -16,6 +16,8 @@ from sortie.scenarios.errors import SortieError
 from sortie.scenarios.report_text import replace_section
 
 _PARTIAL, _ASIDE = ".partial", ".old"
+_NAME_BYTES = 228
+"""A name may have so many bytes: file systems allow 255, and `run_folder.beside` and `partial_path` add some."""
 
 
 class RunError(SortieError):
@@ -33,8 +35,12 @@ def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = 
             replaced; left out, anything.
 
     Raises:
-        RunError: it holds something else, or cannot be made.
+        RunError: it holds something else, cannot be made, or holds the working folder and would be replaced.
     """
+    place = path.resolve()
+    if Path.cwd().is_relative_to(place) and (written or not place.name):
+        raise RunError(f"{path}: is the working folder or holds it, a {what} would replace it; name another folder")
+    _ensure_place(path)
     with settled(path):
         if path.exists() and not path.is_dir():
             raise RunError(f"{path}: is a file, a {what} needs a folder")
@@ -43,7 +49,6 @@ def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = 
         if written and path.is_dir() and (others := _others(path, written)):
             more = f" and {len(others) - 1} more" if len(others) > 1 else ""
             raise RunError(f"{path}: holds {others[0]}{more}, which no {what} wrote; choose another folder or move it")
-    _ensure_place(path)
 
 
 def ensure_files(*paths: Path | None) -> None:
@@ -223,8 +228,11 @@ def _is_device(path: Path) -> bool:
 
 
 def _ensure_place(path: Path) -> None:
-    """Refuse a path if its folder cannot be made or written to."""
-    there = next(p for p in path.resolve().parents if p.exists())
+    """Refuse a path if its name is too long, or its folder cannot be made or written to."""
+    place = path.resolve()
+    if (length := len(os.fsencode(place.name))) > _NAME_BYTES:
+        raise RunError(f"{path}: a name of {length} bytes, must have at most {_NAME_BYTES}")
+    there = next(p for p in place.parents if p.exists())
     if not there.is_dir():
         raise RunError(f"{path}: cannot make its folder: {there} is a file")
     if not os.access(there, os.W_OK):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +21,25 @@ def missing(error: ImportError) -> Exception:
     if name == "cyclonedds" and sys.version_info >= (3, 14):
         return RunError("cyclonedds is missing: it has no wheels for Python 3.14; use Python 3.11 to 3.13")
     return RunError(f"{name} is missing: pip install 'sortie-sim[{EXTRAS[name]}]'") if name in EXTRAS else error
+
+
+@contextmanager
+def path_errors() -> Iterator[None]:
+    """A path that cannot be used, or a working folder that was deleted, is one line; other errors of the system stay.
+
+    Raises:
+        RunError: naming the path.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise RunError(f"{error.filename}: {error.strerror or error}") from error
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            raise RunError("the working folder was deleted; change to another folder") from error
+        raise
 
 
 @contextmanager

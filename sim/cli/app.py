@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import sys
 from collections.abc import Callable, Iterator
@@ -42,7 +43,7 @@ from sortie.sim.cli import (
 from sortie.sim.cli.console import err, out
 from sortie.sim.identity import code_version
 from sortie.sim.process import own_process
-from sortie.sim.user_errors import missing
+from sortie.sim.user_errors import missing, path_errors
 
 
 class _Commands(TyperGroup):
@@ -101,9 +102,12 @@ for name, command in COMMANDS.items():
 def main() -> None:
     """The `sortie` command, once it is imported (sortie.__main__)."""
     own_process()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # what a terminal cannot show stops no command
     try:
         try:
-            app()
+            with path_errors():
+                app()
         except SortieError as error:
             err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
             sys.exit(2)

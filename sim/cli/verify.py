@@ -34,7 +34,7 @@ from sortie.sim.check.kits import verify as verify_model
 from sortie.sim.check.over_time import COURSES, Subject, TimeVerdict, judge_over_time
 from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import refuse, split_policies
-from sortie.sim.folders import RunError, write_text
+from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.policy_text import name_and_params
 from sortie.sim.studies.overhead import SCENARIO, SECONDS, host_s, measure
 from sortie.sim.studies.plane_cost import machine
@@ -142,7 +142,9 @@ def overhead(
         str, typer.Option(help="Policies, separated by commas: worked,best-2(received_budget=0.1).")
     ] = "worked",
     drones: Annotated[str, typer.Option(help="Fleet sizes, separated by commas.")] = "5,25,100",
-    seconds: Annotated[float, typer.Option(help="Length of each flight, s, without a detector.", min=1)] = SECONDS,
+    seconds: Annotated[
+        float, typer.Option(help="Length of each flight, s, without a detector.", min=1, max=7200)
+    ] = SECONDS,
 ) -> None:
     """Measure the cost of the context plane by fleet size: context and data bytes, and CPU time of a decision."""
     try:
@@ -261,7 +263,8 @@ def _counterexamples(
 
 
 def _ensure_own(folder: Path) -> None:
-    """Refuse a folder that holds something else than counterexamples, before they are replaced by new ones."""
+    """Refuse a folder that cannot be made, or holds something else than counterexamples, which new ones replace."""
+    ensure_files(folder / "counterexample.json")
     for file in sorted(folder.iterdir()) if folder.is_dir() else ():
         begin = file.read_text("utf-8", "replace")[:100] if file.suffix in (".json", ".yaml") else ""
         if not (begin.startswith(WRITTEN) if file.suffix == ".yaml" else '"ego": ' in begin[:20]):
