@@ -35,11 +35,10 @@ def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = 
             replaced; left out, anything.
 
     Raises:
-        RunError: it holds something else, cannot be made, or holds the working folder and would be replaced.
+        RunError: it holds something else, or cannot be made.
     """
-    place = path.resolve()
-    if Path.cwd().is_relative_to(place) and (written or not place.name):
-        raise RunError(f"{path}: is the working folder or holds it, a {what} would replace it; name another folder")
+    if not path.resolve().name:
+        raise RunError(f"{path}: is the root of the file system, a {what} needs a folder below it")
     _ensure_place(path)
     with settled(path):
         if path.exists() and not path.is_dir():

@@ -82,8 +82,11 @@ def ensure_writable(path: Path) -> None:
     """Refuse a path that `save` could not use, before the sortie is flown.
 
     Raises:
-        RunError: it holds something that is no run, or besides a run what is not of it; or it cannot be made.
+        RunError: it holds something that is no run, or besides a run what is not of it; it holds the working folder; or
+            it cannot be made.
     """
+    if Path.cwd().is_relative_to(path.resolve()):
+        raise RunError(f"{path}: is the working folder or holds it, a run would replace it; name another folder")
     ensure_folder(path, OUTCOME, "run", WRITTEN)
     with settled(path):
         if (path / PAGE).is_file() and not _is_of_the_run(path / PAGE):
