@@ -290,7 +290,7 @@ def compare(
         if value is not None:
             raise RunError(f"{name}: goes with half_width, which is missing")
     if isinstance(seeds, Iterable):
-        listed = [*seeds]
+        listed: Sequence[int] = [*seeds]
     elif seeds is None or (hasattr(seeds, "__index__") and not isinstance(seeds, bool) and operator.index(seeds) > 0):
         listed = chosen_seeds(base, count=None if seeds is None else operator.index(seeds))
     else:

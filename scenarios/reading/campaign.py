@@ -24,8 +24,8 @@ from sortie.scenarios.reading.load import (
     tree,
     validated,
 )
-from sortie.scenarios.reading.nodes import Node, ScenarioError, as_node, assign, child, dotted, plain
-from sortie.scenarios.reading.strict_yaml import MAX_DEPTH, read_scalar
+from sortie.scenarios.reading.nodes import MAX_DEPTH, Node, ScenarioError, as_node, assign, child, dotted, plain
+from sortie.scenarios.reading.strict_yaml import read_scalar
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.campaign import (
     Campaign,

@@ -19,7 +19,6 @@ import yaml
 
 from sortie.scenarios.reading.nodes import MAX_DEPTH, Node, Scalar, ScenarioError
 
-__all__ = ["MAX_DEPTH", "MAX_WEIGHT", "read_yaml", "write_yaml"]
 MAX_WEIGHT = 50_000
 """Values after alias expansion; long text counts once a hundred characters."""
 _Parser: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # only its event stream is used
