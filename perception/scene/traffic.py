@@ -105,7 +105,7 @@ def lanes(scene: Scene, rect: tuple[float, float, float, float]) -> Lanes:
                 side = -sense if axis == 0 else sense  # keep right: eastbound south of the line, northbound east of it
                 lateral = road * scene.block_m + side * LANE_CENTRE_M
                 yaw = (0.0 if sense > 0 else np.pi) if axis == 0 else sense * np.pi / 2
-                for k in np.flatnonzero(u[:, 0] < scene.moving_cars_per_km / 100.0):
+                for k in np.flatnonzero(u[:, 0] < scene.moving_cars_per_km / 100.0).tolist():
                     off = 0.0 if u[k, 2] > 1.0 - scene.trucks else 0.4 * (u[k, 1] - 0.5)  # a truck fills its slot
                     for copy in range(copies):
                         s0 = (k + 0.5 + off) * SLOT_M + copy * PATTERN_M
