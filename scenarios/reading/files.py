@@ -41,6 +41,7 @@ MODELS = {
 changes of policy policies, events of kind `own` events, and `metrics` metrics."""
 
 
+HERE = Path()
 _FUNCTION = re.compile(r"(.+)(:[^\W\d]\w*)")
 _PARAMETER = re.compile(r"([^\W\d]\w*)\s*=\s*(.+)", re.DOTALL)
 _POLICIES = {"policy": {"name"}, "changes": {"name"}, "makes": {"policy"}}
@@ -113,22 +114,36 @@ def named_files(sections: dict[str, Any]) -> list[str]:
     return [_split(holder[key])[0] for holder, key in _places(sections)]
 
 
-def with_files(sections: dict[str, Any], place: Callable[[str], str]) -> dict[str, Any]:
-    """The sections with every file's name replaced by what `place` makes of it."""
+def with_files(sections: dict[str, Any], place: Callable[[str], str], folder: Path = HERE) -> dict[str, Any]:
+    """The sections with every file's name replaced by what `place` makes of it.
+
+    Args: `folder`: where files that parameters name may lie too; `place` must find them there.
+    """
     changed = copy.deepcopy(sections)
-    for holder, key in _places(changed):
+    for holder, key in _places(changed, folder):
         file, function = _split(holder[key])
         holder[key] = place(file) + function
+    for _, holder, key in _models(changed):
+        if is_file(holder[key]):
+            holder[key] = _brackets_with_files(holder[key], place, folder)
     return changed
+
+
+def _brackets_with_files(text: str, place: Callable[[str], str], folder: Path) -> str:
+    """`file.py:Name(table=a.csv)` with the files of its parameters replaced."""
+    model, parts = read_call(text) or (text, [])
+    changed = list(parts)
+    for i, pair in enumerate(map(_PARAMETER.fullmatch, parts)):
+        value = None if pair is None else _value(f"{model}({pair[1]})", pair[2])
+        if pair is not None and _names_a_file(value, folder):
+            changed[i] = f"{pair[1]}={json.dumps(place(str(value)), ensure_ascii=False)}"
+    return text if changed == parts else f"{model}({', '.join(changed)})"
 
 
 def found_beside(scenario: Scenario, folder: Path) -> Scenario:
     """The scenario with files that are not where they are named, but lie so beside `folder`, named there."""
     sections = scenario.model_dump(mode="json", exclude_none=True)
-    changed = with_files(sections, lambda name: placed(name, folder))
-    for _, holder, key in _models(changed):
-        params = holder.get(params_of(key)) or {}
-        params |= {k: placed(v, folder) for k, v in params.items() if isinstance(v, str) and Path(v).suffix}
+    changed = with_files(sections, lambda name: placed(name, folder), folder)
     return scenario if changed == sections else Scenario.model_validate_json(json.dumps(changed), strict=True)
 
 
@@ -138,22 +153,15 @@ def placed(name: str, folder: Path) -> str:
     return name if os.path.exists(here) or not os.path.exists(folder / name) else str(folder / name)
 
 
-def assigned(field: str, value: Any) -> Any:
-    """Plain sections in which a field alone is given; a place in a list stands first there.
+def value_at(field: str, sections: Any) -> Any:
+    """The value of a dotted field in plain sections.
 
     Example:
-        >>> assigned("events.2.model", "rain.py:Front")
-        {'events': [{'model': 'rain.py:Front'}]}
+        >>> value_at("events.0.model", {"events": [{"model": "rain.py:Front"}]})
+        'rain.py:Front'
     """
-    for name in reversed(field.split(".")):
-        value = [value] if name.isdecimal() else {name: value}
-    return value
-
-
-def value_at(field: str, sections: Any) -> Any:
-    """The field's value in what `assigned` made."""
     for name in field.split("."):
-        sections = sections[0 if name.isdecimal() else name]
+        sections = sections[int(name) if isinstance(sections, list) else name]
     return sections
 
 
@@ -188,19 +196,19 @@ def _files(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]
             yield from ((f"fleet.makes.{i}.{key}", *at) for at in _given(make, (key,)))
 
 
-def _places(sections: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
-    """Where files are named: the section and its key."""
+def _places(sections: dict[str, Any], folder: Path = HERE) -> Iterator[tuple[dict[str, Any], str]]:
+    """Where files are named: the section and its key. Files of parameters may also lie beside `folder`."""
     yield from ((holder, key) for _, holder, key in _files(sections))
     for _, holder, key in _models(sections):
         if is_file(holder[key]):
             yield holder, key
             params = holder.get(params_of(key)) or {}
-            yield from ((params, k) for k, v in params.items() if _names_a_file(v))
+            yield from ((params, k) for k, v in params.items() if _names_a_file(v, folder))
 
 
-def _names_a_file(value: object) -> bool:
+def _names_a_file(value: object, folder: Path) -> bool:
     """Whether a parameter of a model is the name of a file, such as a table that the model reads."""
-    return isinstance(value, str) and Path(value).suffix != "" and os.path.isfile(value)
+    return isinstance(value, str) and Path(value).suffix != "" and os.path.isfile(placed(value, folder))
 
 
 def _models(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:

@@ -22,9 +22,9 @@ from sortie.policies.registry import resolve
 from sortie.scenarios.plugins.user_code import imported_files
 from sortie.scenarios.reading.campaign import Study, extremes
 from sortie.scenarios.reading.files import (
-    assigned,
     found_beside,
     named_files,
+    named_models,
     placed,
     value_at,
     with_files,
@@ -213,13 +213,19 @@ def make_plan(study: Study, **more: Any) -> CampaignPlan:
         for i, label in enumerate(campaign.policies)
     ]
     spec, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
-    reading = [sections | {"policy": {}}, *({"policy": section} for _, section in policies)]
-    for field in sorted(campaign.vary):
+    wholes = [sections | {"policy": section} for _, section in policies]
+    files = {file for whole in wholes for file in named_files(whole)}
+    for field in sorted(campaign.vary):  # a model before its parameters, which may name files
         holder, within = (columns, field) if field in columns else (spec["vary"][field], "values")
-        sections_of = [assigned(field, value) for value in holder.get(within) or ()]
-        if any(named_files(each) for each in sections_of):
-            reading += (varied := [with_files(each, place) for each in sections_of])
-            holder[within] = [value_at(field, each) for each in varied]
+        for k, value in enumerate(holder.get(within) or ()):
+            if isinstance(value, int | float):
+                continue
+            varied = [with_files(_with(whole, field, value), place, study.folder) for whole in wholes]
+            holder[within][k] = next((v for each in varied if (v := value_at(field, each)) != value), value)
+            flown = [without_brackets(each) for each in varied]
+            files.update(file for each in flown for file in named_files(each))
+            if named_models(flown[0]) != named_models(wholes[0]):
+                wholes += flown[: len(policies)]
     _check_metrics(study, [section for _, section in policies])
     return CampaignPlan(
         {
@@ -228,11 +234,16 @@ def make_plan(study: Study, **more: Any) -> CampaignPlan:
             "base": sections,
             "columns": columns,
             "policies": [[label, section] for label, section in policies],
-            "files": file_digests([file for some in reading for file in named_files(some)]),
+            "files": file_digests(sorted(files)),
             "code": flight_code([sections, columns, spec]),
             **more,
         }
     )
+
+
+def _with(sections: dict[str, Any], field: str, value: Any) -> Any:
+    """The plain sections in which a dotted field has this value."""
+    return plain(assign(as_node(sections), field.split("."), as_node(value)))
 
 
 def _policy(study: Study, number: int) -> dict[str, Any]:

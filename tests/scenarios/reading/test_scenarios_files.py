@@ -8,11 +8,9 @@ from pathlib import Path
 import pytest
 
 from sortie.scenarios.reading.files import (
-    assigned,
     found_beside,
     named_files,
     placed,
-    value_at,
     with_files,
     without_brackets,
 )
@@ -131,18 +129,15 @@ def test_a_scenario_without_files_is_left_alone(tmp_path: Path) -> None:
     assert found_beside(plain, tmp_path) is plain
 
 
-def test_a_field_alone_names_its_files_and_a_preset_names_none() -> None:
-    for field, value, files in (
-        ("fleet.airframe", "solo", []),
-        ("fleet.airframe.power_model", "watts.py:table", ["watts.py"]),
-        ("fleet.makes.1.airframe.power_model", "watts.py:table", ["watts.py"]),
-        ("radio.path_loss", "two_ray", []),
-        ("events", [{"kind": "own", "model": "rain.py:Front"}], ["rain.py"]),
-        ("radio.link_params.loss_db", 3.0, []),
+def test_a_presets_name_is_no_file_and_a_model_within_a_part_is() -> None:
+    for sections, files in (
+        ({"fleet": {"airframe": "solo"}}, []),
+        ({"fleet": {"airframe": {"power_model": "watts.py:table"}}}, ["watts.py"]),
+        ({"fleet": {"makes": [{"airframe": {"power_model": "watts.py:table"}}]}}, ["watts.py"]),
+        ({"radio": {"path_loss": "two_ray", "link_params": {"loss_db": 3.0}}}, []),
+        ({"events": [{"kind": "own", "model": "rain.py:Front"}]}, ["rain.py"]),
     ):
-        sections = assigned(field, value)
-        assert named_files(sections) == files
-        assert value_at(field, sections) == value
+        assert named_files(sections) == files  # type: ignore[arg-type]
 
 
 def test_parameters_in_brackets_stand_where_they_belong() -> None:

@@ -380,6 +380,35 @@ def test_every_varied_model_is_in_the_key_wherever_it_is_named(tmp_path: Path) -
         before = after
 
 
+def test_a_file_that_a_varied_parameter_names_is_in_the_key_and_found_beside_the_campaign(tmp_path: Path) -> None:
+    """Also where the parameter's model is varied too, and where model and parameter stand in one text."""
+    for name in "abcdef":
+        (tmp_path / f"{name}.txt").write_text("1\n")
+    (tmp_path / "mine.py").write_text(
+        "def decide(view, *, table=''):\n    return []\n\ndef figure(record, *, table='', k=1):\n    return 1.0\n"
+    )
+    (tmp_path / "other.py").write_text((tmp_path / "mine.py").read_text())
+    vary = """policy.params.table: {kind: grid, values: [a.txt, b.txt, plain]}
+  metrics.m.model: {kind: choice, values: ['mine.py:figure', 'other.py:figure']}
+  metrics.m.params.table: {kind: choice, values: [c.txt, d.txt]}
+  perception.fusion: {kind: choice, values: ["mine.py:figure(table=e.txt, k=2)", "mine.py:figure(table='f.txt')"]}"""
+    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", vary)
+    text = text.replace('[worked, "best-2(received_budget=0.1)"]', "['mine.py:decide']")
+    base = BASE + "metrics: {m: {model: 'mine.py:figure'}}\n"
+    before = plan(tmp_path, text, base)
+    assert set(before.spec["files"]) == {str(tmp_path / f) for f in ("mine.py", "other.py", *(f"{name}.txt" for name in "abcdef"))}
+    flown = [json.loads(before.task(run))["scenario"] for run in range(before.runs)]
+    tables = {s["policy"]["params"]["table"] for s in flown}
+    assert tables == {str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), "plain"}
+    assert {s["metrics"]["m"]["params"]["table"] for s in flown} == {str(tmp_path / f"{name}.txt") for name in "cd"}
+    assert {s["perception"]["fusion_params"]["table"] for s in flown} == {str(tmp_path / f"{name}.txt") for name in "ef"}
+    for name in "abcdef":
+        (tmp_path / f"{name}.txt").write_text("2\n")
+        after = plan(tmp_path, text, base)
+        assert after.key(0) != before.key(0), name
+        before = after
+
+
 def test_another_policy_than_the_bases_own_flies_to_the_end(tmp_path: Path) -> None:
     """As in `sortie compare`: the base's changes and commands are its own policy's."""
     base = BASE + "policy: {name: worked, changes: [{at_s: 0.2, name: silence}]}\n"
