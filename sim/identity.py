@@ -7,7 +7,7 @@ import hashlib
 import inspect
 import numbers
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import requires, version
 from importlib.resources import files
 from pathlib import Path
@@ -211,10 +211,14 @@ def own_files(
             code.append(file)
         else:
             found[name_of(thing)] = hashlib.sha256(source.encode()).hexdigest()[:16]
-    offered = (package_of(kind, name) for kind, name in named_models(sections))
-    found |= dict(package for package in offered if package is not None)
+    found |= packages(named_models(sections))
     modules = {file for path in code for file in imported_files(path)}
     return found | {_shown(path): _digest(path) for path in sorted(modules)}
+
+
+def packages(models: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """The installed packages that offer some of these models: by `name version`, a digest of the package's Python files."""
+    return dict(package for kind, name in models if (package := package_of(kind, name)) is not None)
 
 
 def _digest(path: Path) -> str:

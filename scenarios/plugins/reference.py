@@ -13,7 +13,7 @@ import inspect
 import re
 import traceback
 from collections.abc import Callable, Mapping
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -274,11 +274,13 @@ def package_of(kind: str, reference: str) -> tuple[str, str] | None:
     None where the name means a built-in model or a user's file.
     """
     entry = None if is_file(reference) else installed(kind).get(reference)
-    if entry is None or entry.dist is None:
-        return None
-    sources = sorted(str(file) for file in entry.dist.files or () if file.suffix == ".py")
+    return None if entry is None or entry.dist is None else package(entry.dist)
+
+
+def package(found: Distribution) -> tuple[str, str]:
+    """An installed package as `name version`, and a digest of its Python files."""
     digest = hashlib.sha256()
-    for name in sources:
-        path = Path(str(entry.dist.locate_file(name)))
+    for name in sorted(str(file) for file in found.files or () if file.suffix == ".py"):
+        path = Path(str(found.locate_file(name)))
         digest.update(name.encode() + b"\0" + (path.read_bytes() if path.is_file() else b"") + b"\0")
-    return f"{entry.dist.name} {entry.dist.version}", digest.hexdigest()[:16]
+    return f"{found.name} {found.version}", digest.hexdigest()[:16]

@@ -40,7 +40,7 @@ from sortie.sim.campaign.work import task_key
 from sortie.sim.engine.pilot import named_policy
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.identity import file_digest, flight_code
+from sortie.sim.identity import file_digest, flight_code, packages
 from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results.outcome_fields import check_number, open_keys
 
@@ -183,6 +183,7 @@ class CampaignPlan:
             "replication": at.replication,
             "metrics": self.spec["campaign"]["metrics"],
             "files": self.spec["files"],
+            "packages": self.spec.get("packages", {}),
         }
         return json.dumps(task, sort_keys=True)
 
@@ -215,6 +216,7 @@ def make_plan(study: Study, **more: Any) -> CampaignPlan:
     spec, columns = campaign.model_dump(mode="json"), {k: list(values) for k, values in study.columns.items()}
     wholes = [sections | {"policy": section} for _, section in policies]
     files = {file for whole in wholes for file in named_files(whole)}
+    models = {model for whole in wholes for model in named_models(whole)}
     for field in sorted(campaign.vary):  # a model before its parameters, which may name files
         holder, within = (columns, field) if field in columns else (spec["vary"][field], "values")
         for k, value in enumerate(holder.get(within) or ()):
@@ -224,6 +226,7 @@ def make_plan(study: Study, **more: Any) -> CampaignPlan:
             holder[within][k] = next((v for each in varied if (v := value_at(field, each)) != value), value)
             flown = [without_brackets(each) for each in varied]
             files.update(file for each in flown for file in named_files(each))
+            models.update(model for each in flown for model in named_models(each))
             if named_models(flown[0]) != named_models(wholes[0]):
                 wholes += flown[: len(policies)]
     _check_metrics(study, [section for _, section in policies])
@@ -235,6 +238,7 @@ def make_plan(study: Study, **more: Any) -> CampaignPlan:
             "columns": columns,
             "policies": [[label, section] for label, section in policies],
             "files": file_digests(sorted(files)),
+            "packages": packages(models),
             "code": flight_code([sections, columns, spec]),
             **more,
         }

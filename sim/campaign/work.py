@@ -1,16 +1,18 @@
 """A worker flies runs from their tasks alone, with the same function on every engine.
 
-A task is the JSON text of {scenario, seed, replication, metrics, files}; nothing else reaches a run, so that its key,
+A task is the JSON text of {scenario, seed, replication, metrics, files, packages}; nothing else reaches a run, so that its key,
 a hash over the task and the code, says everything that its row depends on.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
 import time
 from collections.abc import Callable, Sequence
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +20,7 @@ from pydantic import ValidationError
 
 from sortie.perception.network.memory import keep_freed
 from sortie.policies.contract import Policy
+from sortie.scenarios.plugins.reference import package
 from sortie.scenarios.schema import Scenario
 from sortie.sim.campaign.memory import limited
 from sortie.sim.check.expectations import metric
@@ -106,6 +109,8 @@ def _fly(run: int, task: str, code: str, memory_b: int | None) -> RunResult:
     fields, key = json.loads(task), task_key(task, code)
     for path, digest in fields["files"].items():
         _check_file(path, digest)
+    for named, digest in fields["packages"].items():
+        _check_package(named, digest)
     return _result(run, key, lambda: fly_task(task), fields["metrics"], memory_b)
 
 
@@ -177,3 +182,21 @@ def _check_file(path: str, digest: str) -> None:
         raise OtherCodeError(f"{path}: cannot be read by this worker: {error.strerror}") from None
     if not same:
         raise OtherCodeError(f"{path}: is not the file that the campaign was begun with")
+
+
+def _check_package(named: str, digest: str) -> None:
+    """Args: `named` is the package's name and version."""
+    version, files = _package_here(named.rpartition(" ")[0])
+    if version != named:
+        raise OtherCodeError(f"this worker has {version or 'no such package'}, the campaign was begun with {named}")
+    if files != digest:
+        raise OtherCodeError(f"{named}: this worker has other files of it than the campaign was begun with")
+
+
+@functools.cache
+def _package_here(name: str) -> tuple[str, str]:
+    """A package as it was when this process first flew with it: its modules stay loaded."""
+    try:
+        return package(distribution(name))
+    except PackageNotFoundError:
+        return "", ""

@@ -12,14 +12,14 @@ from pathlib import Path
 
 from sortie.policies.contract import Policy
 from sortie.policies.registry import within_budget
-from sortie.scenarios.reading.files import named_files, placed, with_files
+from sortie.scenarios.reading.files import named_files, named_models, placed, with_files
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.scenarios.traces import located
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import file_digests
 from sortie.sim.campaign.work import RunResult, fly_function, task_key
 from sortie.sim.folders import RunError
-from sortie.sim.identity import flight_code
+from sortie.sim.identity import flight_code, packages
 from sortie.sim.studies.conditions import scenario_of
 
 METRICS = (
@@ -120,7 +120,7 @@ def _task(suite: ConditionSet, condition: Condition, policy: str) -> str:
     sections = with_files(scenario.model_dump(mode="json", exclude_none=True), place)
     task = {
         "scenario": sections, "seed": scenario.seed, "replication": 0, "metrics": METRICS,
-        "files": file_digests(named_files(sections)),
+        "files": file_digests(named_files(sections)), "packages": packages(named_models(sections)),
     }  # fmt: skip
     return json.dumps(task, sort_keys=True)
 

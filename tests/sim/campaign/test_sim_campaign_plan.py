@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from campaign_examples import BASE, CAMPAIGN, plan, write
+from installed_package import installed_package
 
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.reading.campaign import load_campaign
@@ -15,7 +16,7 @@ from sortie.scenarios.reading.load import ScenarioError
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import CampaignPlan
-from sortie.sim.campaign.work import number, unpack
+from sortie.sim.campaign.work import OtherCodeError, fly_batch, number, unpack
 from sortie.sim.folders import RunError
 
 
@@ -396,17 +397,41 @@ def test_a_file_that_a_varied_parameter_names_is_in_the_key_and_found_beside_the
     text = text.replace('[worked, "best-2(received_budget=0.1)"]', "['mine.py:decide']")
     base = BASE + "metrics: {m: {model: 'mine.py:figure'}}\n"
     before = plan(tmp_path, text, base)
-    assert set(before.spec["files"]) == {str(tmp_path / f) for f in ("mine.py", "other.py", *(f"{name}.txt" for name in "abcdef"))}
+    assert set(before.spec["files"]) == {
+        str(tmp_path / f) for f in ("mine.py", "other.py", *(f"{name}.txt" for name in "abcdef"))
+    }
     flown = [json.loads(before.task(run))["scenario"] for run in range(before.runs)]
     tables = {s["policy"]["params"]["table"] for s in flown}
     assert tables == {str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), "plain"}
     assert {s["metrics"]["m"]["params"]["table"] for s in flown} == {str(tmp_path / f"{name}.txt") for name in "cd"}
-    assert {s["perception"]["fusion_params"]["table"] for s in flown} == {str(tmp_path / f"{name}.txt") for name in "ef"}
+    assert {s["perception"]["fusion_params"]["table"] for s in flown} == {
+        str(tmp_path / f"{name}.txt") for name in "ef"
+    }
     for name in "abcdef":
         (tmp_path / f"{name}.txt").write_text("2\n")
         after = plan(tmp_path, text, base)
         assert after.key(0) != before.key(0), name
         before = after
+
+
+def test_an_installed_model_s_package_is_in_the_key_and_a_worker_with_another_one_flies_nothing(tmp_path: Path) -> None:
+    source = "def figure(record):\n    return 1.0\n"
+    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}",
+        "metrics.m.model: {kind: choice, values: ['mine.py:figure', installed_figure]}")  # fmt: skip
+    (tmp_path / "mine.py").write_text(source)
+    with installed_package(tmp_path, "figures", source, {"metric": {"installed_figure": "figures:figure"}}):
+        base = BASE + "metrics: {m: {model: 'mine.py:figure'}}\n"
+        before = plan(tmp_path, text, base)
+        assert list(before.spec["packages"]) == ["figures 1.2"]
+        (tmp_path / "figures.py").write_text(source + "# otherwise\n")
+        after = plan(tmp_path, text, base)
+        assert (after.digest, after.key(0)) != (before.digest, before.key(0))
+        assert fly_batch(after.code, [(0, after.task(0))])[0][0].status == "done"
+        with pytest.raises(OtherCodeError, match=r"^figures 1\.2: this worker has other files of it than the campaign"):
+            fly_batch(before.code, [(0, before.task(0))])
+        newer = CampaignPlan({**after.spec, "packages": {"figures 1.3": ""}})
+        with pytest.raises(OtherCodeError, match=r"^this worker has figures 1\.2, the campaign was begun with figures"):
+            fly_batch(newer.code, [(0, newer.task(0))])
 
 
 def test_another_policy_than_the_bases_own_flies_to_the_end(tmp_path: Path) -> None:
