@@ -26,6 +26,8 @@ LEARNED = ("torch", "surrogate")
 """Detectors with weights, which makes may name."""
 OF_A_DRONE = DroneLeaves, BatteryFault, CellFailure
 """Events that a ground station on mains power cannot have."""
+NO_NETWORK = "none"
+"""The feature space of drones without a network: makes without a detector, ground stations without cameras."""
 GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -122,12 +124,15 @@ class Scenario(Section):
                     raise inconsistent((*at, name), shown, bound)
         first: dict[str, int] = {}
         networks, spaces = self.networks, self.feature_spaces
-        for drone, (network, space) in enumerate(zip(networks, spaces, strict=True)):
-            other = first.setdefault(space, drone)
-            if not network.maps_like(networks[other]):
+        for drone, (network, space, blind) in enumerate(zip(networks, spaces, self.context_only, strict=True)):
+            if blind:
+                continue
+            other, reserved = first.setdefault(space, drone), space == NO_NETWORK
+            if reserved or not network.maps_like(networks[other]):
                 which = next(d for d in (drone, other) if self.fleet.make_of(d) is not None)
                 i = next(k for k, make in enumerate(self.fleet.makes) if which in make.drones)
-                bound = f"another name than that of drone {drone + other - which}, which has another network"
+                named = "drones without a network" if reserved else f"drone {drone + other - which}"
+                bound = f"another name than that of {named}" + ("" if reserved else ", which has another network")
                 raise inconsistent(("fleet", "makes", i, "feature_space"), repr(space), bound)
         for drone, (network, camera) in enumerate(zip(networks, self.fleet.cameras, strict=True)):
             if network.detector == "surrogate" and camera.width_px != Camera().width_px:
@@ -151,17 +156,19 @@ class Scenario(Section):
 
     @property
     def feature_spaces(self) -> tuple[str, ...]:
-        """Each drone's feature space; empty is the fleet's common one."""
+        """Each drone's feature space; empty is the fleet's common one, and `NO_NETWORK` that of drones without a network."""
         common = Network(self.perception.detector, self.perception.weights)
 
-        def space(make: Make | None) -> str:
+        def space(make: Make | None, blind: bool) -> str:
+            if blind:
+                return NO_NETWORK
             if make is None:
                 return ""
             if make.feature_space is not None:
                 return make.feature_space
             return "" if self._network(make).maps_like(common) else make.name
 
-        return tuple(space(make) for make in self.fleet.make_of_each)
+        return tuple(map(space, self.fleet.make_of_each, self.context_only))
 
     @property
     def context_only(self) -> tuple[bool, ...]:

@@ -203,6 +203,10 @@ def test_a_station_without_cameras_sends_context_alone_and_one_with_cameras_look
         "fleet: {drones: 4, ground: [{drone: 1}, {drone: 2, camera: true}], makes: [{name: blind, drones: [3], detector: none}]}"
     )
     assert made.context_only == (False, True, False, True)
+    assert made.feature_spaces == ("", "none", "", "none"), "so that policies send them no maps"
+    make = "fleet: {makes: [{name: %s, drones: [1], detector: torch}]}\nperception: {detector: surrogate}"
+    bound = "must be another name than that of drones without a network"
+    refused(make % "none", f"fleet.makes.0.feature_space: 'none', {bound}")
 
 
 def test_a_codebook_is_no_part_of_a_feature_space() -> None:

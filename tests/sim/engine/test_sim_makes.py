@@ -253,6 +253,14 @@ def test_a_drone_without_a_detector_sends_context_alone_and_uses_boxes() -> None
     assert record.tables["trust"].num_rows == 0
 
 
+def test_a_ground_station_without_a_camera_is_sent_boxes_and_no_maps() -> None:
+    station = ("fleet.ground=[{drone: 2}]", "perception.detector=none", "duration_s=2")
+    record = run_sortie(fleet("", *station, "policy={name: all-4, params: {received_budget: 0.05}}"))
+    kinds = {(j, what) for _, j, what, *_ in sent(record)}
+    assert {(0, "features"), (2, "detections")} <= kinds
+    assert (2, "features") not in kinds
+
+
 def test_maps_and_raw_images_are_of_no_use_to_it() -> None:
     def all_kinds(view: FleetView) -> list[Directive]:
         rung = {0: Representation.FEATURES, 1: Representation.RAW}.get(view.ego, Representation.NONE)
