@@ -106,6 +106,18 @@ def test_vantage_brings_the_fleets_middle_over_the_region_and_nobody_past_anothe
     assert math.dist(far[:2], me.position_m[:2]) == pytest.approx(MOST_M)
 
 
+def test_vantage_leaves_ground_stations_and_other_mission_groups_out_of_the_fleets_middle() -> None:
+    """A peer's descriptor is older, so that its region may lie a little behind."""
+    view = tracking(fleet_of(5), Disc(10.0, 50.0, 32.0))
+    known = dict(view.descriptors)
+    known[1] = known[1]._replace(region=Disc(7.0, 50.0, 32.0))
+    alone = over_region(view._replace(descriptors={i: known[i] for i in (0, 1, 2)}, age_s=dict.fromkeys((0, 1, 2), 0.0)))
+    known[3] = known[3]._replace(footprint_radius_m=0.0, position_m=(-300.0, 0.0, 1.5))
+    known[4] = known[4]._replace(region=Disc(400.0, 50.0, 32.0), position_m=(400.0, 50.0, 60.0))
+    assert alone is not None
+    assert over_region(view._replace(descriptors=known)) == alone
+
+
 def test_vantage_stays_in_its_slot_unless_it_tracks_a_region() -> None:
     view = tracking(fleet_of(5), Disc(10.0, 50.0, 32.0))
     searching = {i: d._replace(task_phase=TaskPhase.SEARCH) for i, d in view.descriptors.items()}
