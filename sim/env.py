@@ -16,6 +16,7 @@ again before its next one, and goes on from there.
 
 from __future__ import annotations
 
+import math
 import operator
 import threading
 from collections.abc import Mapping
@@ -86,7 +87,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     metadata = {"name": "sortie_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012 - the library's own way
 
     def __init__(self, scenario: Scenario) -> None:
-        """Args: `scenario` with at least two drones; its policy is not used.
+        """Args: `scenario` with at least two drones; its policy and its `limits.run_s` are not used.
 
         Raises:
             ValueError: a lone drone, which has nothing to decide.
@@ -261,7 +262,9 @@ class _Flight:
 
     def _fly(self, seed: int | None, replication: int) -> None:
         try:
-            run_sortie(self._scenario, self.decide, seed, replication=replication, observer=self)
+            unlimited = self._scenario.limits.model_copy(update={"run_s": math.inf})  # it waits for the learner
+            scenario = self._scenario.model_copy(update={"limits": unlimited})
+            run_sortie(scenario, self.decide, seed, replication=replication, observer=self)
         except _Closed:
             pass
         except Exception as error:

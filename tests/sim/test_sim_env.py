@@ -212,6 +212,13 @@ def test_what_went_wrong_in_the_sortie_is_said_each_time(monkeypatch: pytest.Mon
     e.close()
 
 
+def test_the_time_that_the_learner_takes_is_no_part_of_the_flight_s() -> None:
+    e = env("limits.run_s=1e-6")
+    e.reset(seed=1)
+    assert e.step({})[0]
+    e.close()
+
+
 def test_spaces_and_a_lone_drone() -> None:
     e = env()
     assert e.action_space("drone_0") is e.action_space("drone_0")
