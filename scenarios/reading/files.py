@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from sortie.scenarios.plugins.reference import is_file
+from sortie.scenarios.plugins.reference import installed, is_file
 from sortie.scenarios.reading.call_text import read_call
 from sortie.scenarios.reading.explain import sections_of
 from sortie.scenarios.reading.nodes import Node, ScenarioError, problems
@@ -123,8 +123,8 @@ def with_files(sections: dict[str, Any], place: Callable[[str], str], folder: Pa
     for holder, key in _places(changed, folder):
         file, function = _split(holder[key])
         holder[key] = place(file) + function
-    for _, holder, key in _models(changed):
-        if is_file(holder[key]):
+    for kind, holder, key in _models(changed):
+        if is_file(name := (read_call(holder[key]) or (holder[key],))[0]) or name in installed(kind):
             holder[key] = _brackets_with_files(holder[key], place, folder)
     return changed
 
@@ -199,16 +199,23 @@ def _files(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]
 def _places(sections: dict[str, Any], folder: Path = HERE) -> Iterator[tuple[dict[str, Any], str]]:
     """Where files are named: the section and its key. Files of parameters may also lie beside `folder`."""
     yield from ((holder, key) for _, holder, key in _files(sections))
-    for _, holder, key in _models(sections):
+    for kind, holder, key in _models(sections):
         if is_file(holder[key]):
             yield holder, key
+        if is_file(holder[key]) or holder[key] in installed(kind):
             params = holder.get(params_of(key)) or {}
             yield from ((params, k) for k, v in params.items() if _names_a_file(v, folder))
 
 
 def _names_a_file(value: object, folder: Path) -> bool:
-    """Whether a parameter of a model is the name of a file, such as a table that the model reads."""
-    return isinstance(value, str) and Path(value).suffix != "" and os.path.isfile(placed(value, folder))
+    """Whether a parameter of a model is the name of a file, such as a table that the model reads, or of a folder.
+
+    A folder counts where its name has a slash. Otherwise a word such as `train` would mean a folder that lies there by chance.
+    """
+    if not isinstance(value, str):
+        return False
+    there = placed(value, folder)
+    return os.path.isfile(there) or ("/" in value and os.path.isdir(there))
 
 
 def _models(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:

@@ -111,7 +111,9 @@ def test_vantage_leaves_ground_stations_and_other_mission_groups_out_of_the_flee
     view = tracking(fleet_of(5), Disc(10.0, 50.0, 32.0))
     known = dict(view.descriptors)
     known[1] = known[1]._replace(region=Disc(7.0, 50.0, 32.0))
-    alone = over_region(view._replace(descriptors={i: known[i] for i in (0, 1, 2)}, age_s=dict.fromkeys((0, 1, 2), 0.0)))
+    alone = over_region(
+        view._replace(descriptors={i: known[i] for i in (0, 1, 2)}, age_s=dict.fromkeys((0, 1, 2), 0.0))
+    )
     known[3] = known[3]._replace(footprint_radius_m=0.0, position_m=(-300.0, 0.0, 1.5))
     known[4] = known[4]._replace(region=Disc(400.0, 50.0, 32.0), position_m=(400.0, 50.0, 60.0))
     assert alone is not None

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from installed_package import installed_package
 
 from sortie.scenarios.reading.files import (
     found_beside,
@@ -210,6 +211,22 @@ def test_a_parameter_that_names_a_file_is_found_beside_the_scenario(
     sections = load("s.yaml").model_dump(mode="json", exclude_none=True)
     assert sections["fleet"]["sensor_params"] == {"heights": "heights.csv", "kind": "wide.v2"}
     assert named_files(sections) == ["own.py", "heights.csv"]
+
+
+def test_a_parameter_may_name_a_file_without_a_suffix_or_a_folder_with_a_slash(tmp_path: Path) -> None:
+    """Also of an installed model. A word is no folder that has its name by chance."""
+    for name in ("maps", "train"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "heights").write_text("1\n")
+    params = {"a": "heights", "b": "maps/", "c": "train", "d": "missing/", "e": ""}
+    source = "def f(pose):\n    return 0\n"
+    with installed_package(tmp_path, "sensors", source, {"sensor": {"wobbly": "sensors:f"}}):
+        for model in ("own.py:f", "wobbly"):
+            sensor = {"name": "a", "fleet": {"sensor": model, "sensor_params": params}}
+            fleet = found_beside(build(sensor), tmp_path).fleet
+            here = {"a": str(tmp_path / "heights"), "b": str(tmp_path / "maps")}
+            assert fleet.sensor_params == {**params, **here}
+            assert set(here.values()) <= set(named_files({"fleet": fleet.model_dump(mode="json", exclude_none=True)}))
 
 
 @pytest.mark.parametrize(
