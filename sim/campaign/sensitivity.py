@@ -10,6 +10,7 @@ import numpy as np
 from sortie.scenarios.intervals import Floats
 from sortie.sim.campaign.rows import CampaignRows
 from sortie.sim.campaign.spread import MORRIS_LEVELS, drawn_fields, unit_problem
+from sortie.sim.campaign.table import stored
 from sortie.sim.folders import RunError
 
 COLUMNS = {
@@ -85,9 +86,9 @@ def _by_draw(rows: CampaignRows, metric: str, policy: int) -> Floats:
     unit = rows.unit[mine]
     distinct, first = np.unique(unit, return_index=True)
     for field in drawn_fields(plan.campaign):
-        column = rows.table[field].to_pylist()
+        kind, column = rows.table.schema.field(field).type, rows.table[field].to_pylist()
         for k in (0, len(distinct) // 2, len(distinct) - 1):
-            if plan.varied(int(distinct[k]))[field] != column[int(mine[first[k]])]:
+            if stored(plan.varied(int(distinct[k]))[field], kind) != column[int(mine[first[k]])]:
                 raise RunError(f"sensitivity: {field} of draw {distinct[k]} is not the design's")
     values = rows.values(metric)[mine]
     known = ~np.isnan(values)

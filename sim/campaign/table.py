@@ -53,13 +53,15 @@ def columns(plan: CampaignPlan) -> dict[str, pa.DataType]:
     return types
 
 
+def stored(value: Any, kind: pa.DataType) -> Any:
+    """A varied field's value as its column has it: what is no number and no text is JSON."""
+    return json.dumps(value) if kind == pa.string() and not isinstance(value, str) else value
+
+
 def row_of(plan: CampaignPlan, schema: pa.Schema, result: RunResult) -> dict[str, Any]:
     """A result's row of the table, its columns in the schema's order."""
     at = plan.at(result.run)
-    varied = {
-        name: json.dumps(value) if schema.field(name).type == pa.string() and not isinstance(value, str) else value
-        for name, value in plan.varied(at.cell).items()
-    }
+    varied = {name: stored(value, schema.field(name).type) for name, value in plan.varied(at.cell).items()}
     return {
         **at._asdict(),
         "policy": plan.policies[at.policy],

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +128,19 @@ def test_where_a_later_part_finished_first_sensitivity_is_of_the_complete_blocks
     whole = sensitivity(rows, "bytes.data_sent", 1)
     assert whole is not None
     assert not np.array_equal(found.figures, whole.figures)
+
+
+def test_a_field_of_other_values_than_numbers_and_texts_has_its_effect(tmp_path: Path) -> None:
+    text = TWO.replace("{count: 6}", "{count: 8, method: morris}")
+    text = text.replace("vary:\n", "vary:\n  context.trust: {kind: choice, values: [true, false]}\n")
+    rows = rows_of(tmp_path, text, lambda f, p: 3.0 * f["context.trust"])
+    written = pa.array([json.dumps(value) for value in rows.table["context.trust"].to_pylist()])
+    table = rows.table.drop_columns("context.trust").append_column("context.trust", written)
+    found = sensitivity(replace(rows, table=table), "bytes.data_sent", 0)
+    assert found is not None
+    assert dict(zip(found.fields, found.figures[:, 0] > 0, strict=True)) == {
+        "context.trust": True, "fleet.battery.initial_soc": False,
+    }  # fmt: skip
 
 
 def test_a_failed_run_takes_its_whole_block_with_it(tmp_path: Path) -> None:
