@@ -83,18 +83,25 @@ def spend(view: FleetView, arm: Arm, sent_budget: float, why: str) -> list[Direc
         return []
     ego, peers = view.ego, view.peers
     chosen = peers if arm.peers >= len(peers) else peers_by_overlap(view)[: arm.peers]
-    per_link = min(1.0, sent_budget * view.full_sharing_maps / len(chosen), carried(me, chosen)) if chosen else 0.0
+    rho = per_link(view, me, chosen, sent_budget)
     roi = me.region if arm.region and me.task_phase == TaskPhase.TRACK else None
     reason = f"{why}: {arm.text}"
     directives = []
     for peer in peers:
         if peer in chosen:
-            directives.append(Directive(ego, peer, Representation.FEATURES, per_link, roi, RATE_HZ, reason=reason))
+            directives.append(Directive(ego, peer, Representation.FEATURES, rho, roi, RATE_HZ, reason=reason))
         elif arm.boxes:
             directives.append(Directive(ego, peer, Representation.DETECTIONS, 0.0, None, RATE_HZ, reason=reason))
         else:
             directives.append(nothing(ego, peer, reason))
     return directives
+
+
+def per_link(view: FleetView, me: Descriptor, chosen: Sequence[int], sent_budget: float) -> float:
+    """The share of a map that each of these peers is sent: they share the budget evenly, as far as the air carries it."""
+    if not chosen:
+        return 0.0
+    return min(1.0, sent_budget * view.full_sharing_maps / len(chosen), carried(me, chosen))
 
 
 def carried(me: Descriptor, peers: Sequence[int]) -> float:
@@ -154,9 +161,9 @@ def adaptive(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
         return spend(view, BOXES, sent_budget, "no region")
     if not sees(me, me.region):
         return spend(view, BOXES, sent_budget, "a region out of sight")
-    through = min(sent_budget, carried(me, view.peers))
-    if through < FEW:
-        return spend(view, BOXES, sent_budget, f"a region, budget and links {through:.2g} < {FEW:.2g}")
+    rho = per_link(view, me, view.peers, sent_budget)
+    if rho < FEW:
+        return spend(view, BOXES, sent_budget, f"a region, budget and links {rho:.2g} < {FEW:.2g}")
     return spend(view, MAPS, sent_budget, "a region")
 
 

@@ -71,6 +71,16 @@ def seeing(view: FleetView, state: Coverage = Coverage.WELL) -> FleetView:
     return view._replace(descriptors={i: d._replace(coverage_grid=grid) for i, d in view.descriptors.items()})
 
 
+def test_a_small_budget_is_enough_for_the_few_peers_that_are_attached() -> None:
+    """What a link would get is compared, not the budget: one peer of four gets all of it."""
+    view = seeing(fleet_of(5, phase=TaskPhase.TRACK))
+    few = view._replace(age_s={**view.age_s, 2: 1e3, 3: 1e3, 4: 1e3})
+    assert rungs(a.adaptive(view, sent_budget=a.FEW / 2)) == [BOXES] * 4
+    first, *others = a.adaptive(few, sent_budget=a.FEW / 2)
+    assert (first.representation, first.rho) == (FEATURES, pytest.approx(2 * a.FEW))
+    assert rungs(others) == [NONE] * 3
+
+
 @pytest.mark.parametrize("budget", [0.004, 0.05, 1.0])
 def test_a_region_is_worth_its_cells_and_the_rest_boxes(budget: float) -> None:
     searching = a.adaptive(fleet_of(5, phase=TaskPhase.SEARCH, goodput=1000.0), sent_budget=budget)
