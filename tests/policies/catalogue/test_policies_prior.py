@@ -253,5 +253,11 @@ def test_deputies_are_who_adds_most() -> None:
 
 
 def test_freshness_falls_with_age() -> None:
-    ages = [0.0, 0.3, 0.31, 1.0, 1.01, 50.0]
-    assert [freshness(a, 0.1) for a in ages] == [1.0, 1.0, 0.5, 0.5, 0.0, 0.0]
+    ages = [0.0, 0.3, 0.31, 1.0]
+    assert [freshness(a, 0.1) for a in ages] == [1.0, 1.0, 0.5, 0.5]
+
+
+def test_deputies_give_weight_to_every_peer_that_is_attached() -> None:
+    """The scenario may say after how many periods a peer is detached."""
+    view = fleet_of(3)._replace(detached_after_periods=30.0, age_s={0: 0.0, 1: 2.0, 2: 3.0 + 1e-9})
+    assert [d.fusion_weight for d in deputies(view)] == [0.5, 0.5]
