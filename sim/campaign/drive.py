@@ -114,7 +114,9 @@ def _drive(
         store.add(results)
         flown += len(results)
         if enough():
-            return state(store.runs_of(frontier - 1).stop)
+            end = store.runs_of(frontier - 1).stop
+            flown = max(0, flown - (store.finished - end))  # runs beyond the end are dropped
+            return state(end)
         progress(state(runs))
     return state(runs)
 

@@ -178,7 +178,7 @@ def test_a_driver_tells_all_that_it_flew_and_no_more_than_it_keeps(at_least: int
         campaign=SimpleNamespace(stop_when=asked), policies=["a", "b"], runs=8, code="", task=lambda run: ""
     )
     store, told = Store(), list[Progress]()
-    last = _drive(of, store, Engine(), told.append)  # type: ignore[arg-type]
+    last = _drive(of, store, Engine(), 8, told.append)  # type: ignore[arg-type]
     known = [(p.finished, p.of, p.flown) for p in told]
     if at_least == 2:
         assert (known, store.dropped) == ([(2, 8, 0), (4, 8, 2)], [2])
@@ -194,8 +194,8 @@ def test_what_was_flown_beyond_the_end_is_not_among_what_is_finished() -> None:
         campaign=SimpleNamespace(stop_when=asked), policies=["a", "b"], runs=8, code="", task=lambda run: ""
     )
     store = Store()
-    last = _drive(of, store, Engine(6), lambda p: None)  # type: ignore[arg-type]
-    assert (last.finished, last.of, last.flown, store.dropped) == (6, 6, 6, [2])
+    last = _drive(of, store, Engine(6), 8, lambda p: None)  # type: ignore[arg-type]
+    assert (last.finished, last.of, last.flown, store.dropped) == (6, 6, 4, [2])
 
 
 def test_failed_runs_that_are_dropped_are_counted_no_more(tmp_path: Path) -> None:
