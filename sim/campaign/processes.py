@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 
 from sortie.scenarios.plugins.user_calls import STUCK
@@ -29,15 +29,39 @@ ATTEMPTS = 4
 _BEGIN = "from sortie.sim.campaign.processes import serve; serve({})"
 
 
+class Turns:
+    """Runs fly side by side, and a run that may not have company flies alone."""
+
+    def __init__(self) -> None:
+        self._moved = threading.Condition()
+        self._flying, self._alone = 0, False
+
+    @contextmanager
+    def turn(self, *, alone: bool) -> Iterator[None]:
+        """Wait for a turn, and have it for the length of the block."""
+        with self._moved:
+            self._moved.wait_for(lambda: not self._alone)
+            self._alone = alone
+            self._moved.wait_for(lambda: not (alone and self._flying))
+            self._flying += 1
+        try:
+            yield
+        finally:
+            with self._moved:
+                self._flying -= 1
+                self._alone = self._alone and not alone
+                self._moved.notify_all()
+
+
 class OneProcess:
     """Flies one run after the other in a process of its own.
 
     It is started by `-P`, so that no module of the working folder takes the place of an installed one.
     """
 
-    def __init__(self, memory_b: int | None = None) -> None:
-        """Args: `memory_b` is what it may take."""
-        self.memory_b = memory_b
+    def __init__(self, memory_b: int | None = None, turns: Turns | None = None) -> None:
+        """Args: `memory_b` is what it may take; `turns` are those of all processes on this machine."""
+        self.memory_b, self._turns = memory_b, turns or Turns()
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
         self._ended = False
@@ -60,8 +84,9 @@ class OneProcess:
 
     def fly(self, code: str, task: Task) -> RunResult:
         """One run's row. Raises what the worker raises: RunError for other code or files; EOFError after `end`."""
-        for _ in range(ATTEMPTS):
-            answer = self._answer(code, task)
+        for attempt in range(1, ATTEMPTS + 1):
+            with self._turns.turn(alone=attempt == ATTEMPTS):  # others may have filled the memory
+                answer = self._answer(code, task)
             if isinstance(answer, Exception):
                 raise answer
             if isinstance(answer, RunResult):
@@ -104,7 +129,8 @@ class Processes:
         self.memory_b = memory_b
         self._todo: queue.SimpleQueue[tuple[str, Task] | None] = queue.SimpleQueue()
         self._landed: queue.SimpleQueue[RunResult | Exception] = queue.SimpleQueue()
-        self._processes = [OneProcess(memory_b) for _ in range(workers)]
+        turns = Turns()
+        self._processes = [OneProcess(memory_b, turns) for _ in range(workers)]
         self._threads = [threading.Thread(target=self._hand_out, args=(one,), daemon=True) for one in self._processes]
         with undisturbed():  # what these threads begin never gets Ctrl-C
             for thread in self._threads:

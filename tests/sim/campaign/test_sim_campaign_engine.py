@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from sortie.sim.campaign.cluster import Dask
 from sortie.sim.campaign.drive import Progress, run_campaign
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import CampaignPlan
-from sortie.sim.campaign.processes import AHEAD, Processes
+from sortie.sim.campaign.processes import AHEAD, OneProcess, Processes, Turns
 from sortie.sim.campaign.rows import find_row
 from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import Task, fly_batch
@@ -100,6 +102,51 @@ def test_processes_that_are_killed_cost_nothing(tmp_path: Path) -> None:
     assert len(killed) == 5
     assert (done.finished, done.failed) == (48, 0)
     assert table_bytes(tmp_path / "a") == table_bytes(tmp_path / "alone")
+
+
+def test_a_run_that_flies_alone_waits_for_the_others_and_they_wait_for_it() -> None:
+    turns, order, first_flies = Turns(), list[str](), threading.Event()
+    first_may_land, alone_waits = threading.Event(), threading.Event()
+
+    def first() -> None:
+        with turns.turn(alone=False):
+            first_flies.set()
+            first_may_land.wait(60)
+            order.append("first lands")
+
+    def alone() -> None:
+        alone_waits.set()
+        with turns.turn(alone=True):
+            order.append("alone begins")
+            second.start()
+            second.join(0.05)  # it would fly now, if it did not wait
+            order.append("alone lands")
+
+    def fly_second() -> None:
+        with turns.turn(alone=False):
+            order.append("second flies")
+
+    second, threads = threading.Thread(target=fly_second), [threading.Thread(target=each) for each in (first, alone)]
+    for thread, begun in zip(threads, (first_flies, alone_waits), strict=True):
+        thread.start()
+        assert begun.wait(60)
+    first_may_land.set()
+    for thread in (*threads, second):
+        thread.join(60)
+    assert order == ["first lands", "alone begins", "alone lands", "second flies"]
+
+
+def test_the_last_attempt_of_a_run_that_kills_its_process_is_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Noting(Turns):
+        def turn(self, *, alone: bool) -> AbstractContextManager[None]:
+            asked.append(alone)
+            return super().turn(alone=alone)
+
+    asked = list[bool]()
+    one = OneProcess(turns=Noting())
+    monkeypatch.setattr(one, "_answer", lambda code, task: -signal.SIGKILL)
+    assert one.fly("", (0, '{"metrics": []}')).error == "WorkerDied: on every attempt"
+    assert asked == [False, False, False, True]
 
 
 def test_rows_that_came_are_kept_when_another_run_cannot_fly(tmp_path: Path) -> None:
