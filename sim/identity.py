@@ -15,7 +15,7 @@ from typing import Any
 
 from sortie.scenarios.code_digest import contents, digest_of, installed
 from sortie.scenarios.plugins.reference import file_of, is_file, package_of
-from sortie.scenarios.plugins.user_code import imported_files
+from sortie.scenarios.plugins.user_code import imported_files, imported_packages
 from sortie.scenarios.reading.files import ensure_files, named_files, named_models
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.traces import located
@@ -216,9 +216,19 @@ def own_files(
     return found | {_shown(path): _digest(path) for path in sorted(modules)}
 
 
-def packages(models: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """The installed packages that offer some of these models: by `name version`, a digest of the package's Python files."""
-    return dict(package for kind, name in models if (package := package_of(kind, name)) is not None)
+def packages(models: Iterable[tuple[str, str]], code: Iterable[str] = ()) -> dict[str, str]:
+    """The installed packages on which models depend.
+
+    Args:
+        models: kinds and names.
+        code: files; of those in Python, the packages that they import count too.
+
+    Returns:
+        By `name version` the digest of the Python files of a package that offers a model; no digest for an imported one.
+    """
+    imported = {name for path in code if path.endswith(".py") for name in imported_packages(Path(path))}
+    offered = dict(package for kind, name in models if (package := package_of(kind, name)) is not None)
+    return {f"{name} {installed(name)}": "" for name in sorted(imported)} | offered
 
 
 def _digest(path: Path) -> str:

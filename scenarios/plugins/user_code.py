@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import functools
 import hashlib
 import importlib
 import importlib.util
@@ -22,6 +23,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, SourceFileLoader
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any, NamedTuple
@@ -65,13 +67,14 @@ def imported_files(path: Path) -> tuple[Path, ...]:
     functions count, and so do `importlib.import_module` and `__import__` with a constant name. Three things are not
     seen: an import that is not found, a name that is worked out while the program runs, and a file read as data.
     """
-    waiting, found = [_Source(path.resolve(), path.resolve().parent)], set()
-    while waiting:
-        source = waiting.pop()
-        if source not in found:
-            found.add(source)
-            waiting += _imports(source)
-    return tuple(sorted({source.path for source in found}))
+    return tuple(sorted({source.path for source in _sources(path)}))
+
+
+def imported_packages(path: Path) -> set[str]:
+    """The installed packages of which a file and the modules beside it import something, by their names on the index."""
+    names = {name.partition(".")[0] for source in _sources(path) for name, _, level in _named(source) if not level}
+    names = {name for name in names if not _is_pythons(name)}
+    return {package for name in names for package in _offered_by().get(name, ())}
 
 
 # --- running ---------------------------------------------------------------------------------------
@@ -209,6 +212,12 @@ def _on_path(top: str) -> ModuleSpec | None:
         return None
 
 
+@functools.cache
+def _offered_by() -> Mapping[str, list[str]]:
+    """The installed packages by the modules that they offer."""
+    return packages_distributions()
+
+
 # --- reading ---------------------------------------------------------------------------------------
 
 
@@ -220,8 +229,20 @@ class _Source(NamedTuple):
     """The user's folder, in which its imports look first; None for a module that Python found on `sys.path`."""
 
 
-def _imports(source: _Source) -> Iterator[_Source]:
-    """The modules that a source imports."""
+def _sources(path: Path) -> set[_Source]:
+    """A file and every module that it imports, directly or through others."""
+    waiting, found = [_Source(path.resolve(), path.resolve().parent)], set[_Source]()
+    while waiting:
+        source = waiting.pop()
+        if source not in found:
+            found.add(source)
+            for name, item, level in _named(source):
+                waiting += _chain(source, name, item, level)
+    return found
+
+
+def _named(source: _Source) -> Iterator[tuple[str, str, int]]:
+    """What a source imports: the module, the name within it, and the number of dots before it."""
     try:
         tree = ast.parse(source.path.read_bytes())
     except (SyntaxError, ValueError):  # a compiled module, or a source that fails with this error when it is run
@@ -229,17 +250,17 @@ def _imports(source: _Source) -> Iterator[_Source]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
-                yield from _chain(source, alias.name)
+                yield alias.name, "", 0
         elif isinstance(node, ast.ImportFrom):
             for alias in node.names:
-                yield from _chain(source, node.module or "", alias.name, node.level)
+                yield node.module or "", alias.name, node.level
         elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
             called, name = getattr(node.func, "attr", getattr(node.func, "id", "")), node.args[0].value
             if called in ("import_module", "__import__") and isinstance(name, str) and name.strip("."):
-                yield from _chain(source, name.lstrip("."), level=len(name) - len(name.lstrip(".")))
+                yield name.lstrip("."), "", len(name) - len(name.lstrip("."))
 
 
-def _chain(source: _Source, name: str, item: str = "", level: int = 0) -> Iterator[_Source]:
+def _chain(source: _Source, name: str, item: str, level: int) -> Iterator[_Source]:
     """The packages on the way to a module, the module, and its submodule `item` (all of them for `*`)."""
     folder = source.folder
     folders: Sequence[str | Path]

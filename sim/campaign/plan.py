@@ -238,7 +238,7 @@ def make_plan(study: Study, **more: Any) -> CampaignPlan:
             "columns": columns,
             "policies": [[label, section] for label, section in policies],
             "files": file_digests(sorted(files)),
-            "packages": packages(models),
+            "packages": packages(models, files),
             "code": flight_code([sections, columns, spec]),
             **more,
         }

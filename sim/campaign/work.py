@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from sortie.perception.network.memory import keep_freed
 from sortie.policies.contract import Policy
+from sortie.scenarios.code_digest import installed
 from sortie.scenarios.plugins.reference import package
 from sortie.scenarios.schema import Scenario
 from sortie.sim.campaign.memory import limited
@@ -186,17 +187,20 @@ def _check_file(path: str, digest: str) -> None:
 
 def _check_package(named: str, digest: str) -> None:
     """Args: `named` is the package's name and version."""
-    version, files = _package_here(named.rpartition(" ")[0])
-    if version != named:
-        raise OtherCodeError(f"this worker has {version or 'no such package'}, the campaign was begun with {named}")
-    if files != digest:
+    name, _, version = named.rpartition(" ")
+    if (here := _version_here(name)) != version:
+        raise OtherCodeError(f"this worker has {name} {here}, the campaign was begun with {version}")
+    if digest and _digest_here(name) != digest:
         raise OtherCodeError(f"{named}: this worker has other files of it than the campaign was begun with")
 
 
 @functools.cache
-def _package_here(name: str) -> tuple[str, str]:
-    """A package as it was when this process first flew with it: its modules stay loaded."""
-    try:
-        return package(distribution(name))
-    except PackageNotFoundError:
-        return "", ""
+def _version_here(name: str) -> str:
+    """A package's version as it was when this process first flew with it: its modules stay loaded."""
+    return installed(name)
+
+
+@functools.cache
+def _digest_here(name: str) -> str:
+    """The same of its files."""
+    return package(distribution(name))[1]

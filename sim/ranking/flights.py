@@ -120,7 +120,7 @@ def _task(suite: ConditionSet, condition: Condition, policy: str) -> str:
     sections = with_files(scenario.model_dump(mode="json", exclude_none=True), place)
     task = {
         "scenario": sections, "seed": scenario.seed, "replication": 0, "metrics": METRICS,
-        "files": file_digests(named_files(sections)), "packages": packages(named_models(sections)),
+        "files": file_digests(named_files(sections)), "packages": packages(named_models(sections), named_files(sections)),
     }  # fmt: skip
     return json.dumps(task, sort_keys=True)
 
