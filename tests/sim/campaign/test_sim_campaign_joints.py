@@ -175,7 +175,12 @@ def test_a_driver_tells_all_that_it_flew_and_no_more_than_it_keeps(at_least: int
     """Of two units it is known with the third part, in which the third unit begins."""
     asked = StopWhen(metric=AP, half_width=0.2, at_least=at_least)
     of = SimpleNamespace(
-        campaign=SimpleNamespace(stop_when=asked), policies=["a", "b"], runs=8, code="", task=lambda run: ""
+        campaign=SimpleNamespace(stop_when=asked),
+        policies=["a", "b"],
+        runs=8,
+        code="",
+        task=lambda run: "",
+        by_torch=False,
     )
     store, told = Store(), list[Progress]()
     last = _drive(of, store, Engine(), 8, told.append)  # type: ignore[arg-type]
@@ -191,7 +196,12 @@ def test_a_driver_tells_all_that_it_flew_and_no_more_than_it_keeps(at_least: int
 def test_what_was_flown_beyond_the_end_is_not_among_what_is_finished() -> None:
     asked = StopWhen(metric=AP, half_width=0.2, at_least=2)
     of = SimpleNamespace(
-        campaign=SimpleNamespace(stop_when=asked), policies=["a", "b"], runs=8, code="", task=lambda run: ""
+        campaign=SimpleNamespace(stop_when=asked),
+        policies=["a", "b"],
+        runs=8,
+        code="",
+        task=lambda run: "",
+        by_torch=False,
     )
     store = Store()
     last = _drive(of, store, Engine(6), 8, lambda p: None)  # type: ignore[arg-type]
