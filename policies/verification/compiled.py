@@ -90,6 +90,8 @@ class Rule(NamedTuple):
     when_of_peer: bool
     parts: tuple[Part, ...]
     of_link: bool
+    of_links: bool
+    """Whether one link alone does not decide it."""
 
     def holds(self, context: Context, link: Directive) -> bool:
         """Whether the line holds for a link, or for all of them if it is about all."""
@@ -105,12 +107,14 @@ def compiled(invariant: Invariant) -> Rule:
     conditions = () if invariant.when is None else _conjuncts(invariant.when)
     apart = tuple(node for node in conditions if not _depends(node))
     within = tuple(node for node in conditions if _depends(node))
+    found = tuple(_part(node, within) for node in parts)
     return Rule(
         invariant,
         _ask(Logic("and", apart)) if apart else None,
         any(_is_of_peer(node) for node in apart),
-        tuple(_part(node, within) for node in parts),
+        found,
         invariant.of_link,
+        not invariant.of_link or any(part.of_links for part in found),
     )
 
 

@@ -13,8 +13,9 @@ left of it (`policies.verification.enforced`). There a limit keeps it from givin
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, FleetView, Policy, Representation
@@ -25,6 +26,8 @@ from sortie.policies.verification.words import CHANGES
 from sortie.scenarios.representation import LEVELS, NAME_OF
 
 MARK = "shield: "
+MOST_CHANGES = 128
+"""How many changes of links are tried for lines about several links; all links are tried once in any case."""
 Cap = Callable[[Directive], Directive]
 """A directive as far as something allows it, such as the age of its peer's descriptor."""
 _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
@@ -33,8 +36,8 @@ _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
 def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
     """A policy that decides as the given one but keeps the invariants. It is as pure; shielding it again changes nothing.
 
-    An invariant may contradict another one, or depend on the view alone. If no change of one link keeps it, the
-    directives stay as decided, and each one's reason states it.
+    An invariant may contradict another one, depend on the view alone, or need a change of two links for itself. Then it
+    is not kept, and the reasons of the directives that break it state it.
 
     Raises:
         InvariantError: an invariant uses `sum_links` or `count_links`, so it does not determine the link to change;
@@ -112,7 +115,24 @@ def enforce(
     context = Context(view, me, directives, {d.destination: d for d in fresh})
     lines = [compiled(rule) for rule in rules]
     boxes = _Boxes([line for line in lines if line.of_link], context, directives[0], cap)
+    several = [line for line in lines if line.of_links]
+    failed = False
+    for _ in lines:  # a line that cannot be kept at first may be kept after other links have changed
+        before = tuple(directives)
+        failed = not _keep_alone(context, directives, boxes)
+        failed = not _keep_together(context, directives, several, boxes) or failed
+        if not failed or all(now is then for now, then in zip(directives, before, strict=True)):
+            break
+    for k, directive in enumerate(directives) if failed else ():
+        lost = [line.invariant for line in lines if not line.holds(context, directive)]
+        directives[k] = _not_replaced(directive, lost) if lost else directive
+    return directives
+
+
+def _keep_alone(context: Context, directives: list[Directive], boxes: _Boxes) -> bool:
+    """Change each link that breaks a line about one link; False if a link has no directive that keeps all of them."""
     solved: dict[Any, Directive | None] = {}
+    all_kept = True
     for k, directive in enumerate(directives):
         box = boxes.of(directive)
         broken = box.broken(context, directive)
@@ -126,12 +146,11 @@ def enforce(
                 solved[key] = after
         else:
             after = solved[key]
-        lost = [box.rules[i].invariant for i in sorted(set(broken))]
-        directives[k] = _not_replaced(directive, lost) if after is None else _replaced(directive, after, lost)
-    for line in lines:
-        if not line.of_link and not line.holds(context, directives[0]):
-            _replace_one_link(context, directives, line, boxes)
-    return directives
+        if after is None:
+            all_kept = False
+        else:
+            directives[k] = _replaced(directive, after, [box.rules[i].invariant for i in sorted(set(broken))])
+    return all_kept
 
 
 def _key(directive: Directive, box: Box) -> Any:
@@ -186,36 +205,110 @@ class _Boxes:
 _FULLEST = Directive(-1, -1, Representation.RAW, rho=1.0, rate_hz=DIRECTIVE_BOUNDS["rate_hz"].high)
 
 
-def _replace_one_link(context: Context, directives: list[Directive], rule: Rule, boxes: _Boxes) -> None:
-    """Change one link, by the smallest change of any, so that a rule about all links holds.
+_Asked = tuple[Rule, int | None]
+"""A line about several links, and the link that must keep it; None for all links together."""
+
+
+class _Plan(NamedTuple):
+    """Changed links."""
+
+    far: Far
+    """How many fields change, and by how much in all."""
+    number: int
+    links: tuple[Directive, ...]
+    keeps: dict[int, tuple[Rule, ...]]
+    """The lines for which a link is changed."""
+    broken: _Asked | None
+    """A line that is still broken."""
+
+
+def _keep_together(context: Context, directives: list[Directive], lines: Sequence[Rule], boxes: _Boxes) -> bool:
+    """Change links so that lines about several links hold too; False if one of them cannot be kept.
 
     Args:
         context: has these same directives.
-        rule: the rule, which is broken.
-        boxes: what the rules about links allow.
+        directives: keep the lines about one link each, where they can.
+        lines: those about several links.
+        boxes: what the lines about one link each allow.
     """
-    best: tuple[Far, int, Directive] | None = None
-    alike, seen = not any(part.of_peer for part in rule.parts), set()
-    for k, before in enumerate(directives):
-        box = boxes.capped(before, boxes.of(before))
-        key = _key(before, box) if alike else None
-        if key is not None and key in seen:
-            continue  # another link would change by as much
-        seen.add(key)
-        nearer = None if best is None else best[0]
-        after = nearest(before, box, rule.parts, context, boxes.allowed, nearer)
-        if after is None:
-            continue
-        changed, far = distance(before, after)
-        if (
-            nearer is None or (changed, round(far, 2)) < nearer
-        ):  # a hundredth of the bounds is no reason for another link
-            best = (changed, round(far, 2)), k, after
-    if best is None:
-        directives[:] = [_not_replaced(d, [rule.invariant]) for d in directives]
-    else:
-        _, k, after = best
-        directives[k] = _replaced(directives[k], after, [rule.invariant])
+    kept: list[_Asked] = []
+    broken: list[_Asked] = []
+    for line in lines:
+        for k in range(len(directives)) if line.of_link else (None,):
+            (kept if line.holds(context, directives[k or 0]) else broken).append((line, k))
+    if not broken:
+        return True
+    before, count = tuple(directives), len(kept) + len(broken)
+    links, keeps = before, dict[int, tuple[Rule, ...]]()
+    for asked in broken:
+        if links is before or not _holds(asked, links, context):
+            plan = _plan(context, before, [asked, *kept], boxes)
+            if plan is None:
+                continue
+            links, keeps = plan.links, plan.keeps
+        kept.append(asked)
+    context.directives = directives
+    for k, rules in keeps.items():
+        if links[k] is not before[k]:
+            directives[k] = _replaced(before[k], links[k], [rule.invariant for rule in rules])
+    return len(kept) == count
+
+
+def _holds(asked: _Asked, links: Sequence[Directive], context: Context) -> bool:
+    rule, k = asked
+    context.directives = links
+    return rule.holds(context, links[k or 0])
+
+
+def _plan(context: Context, before: tuple[Directive, ...], asked: Sequence[_Asked], boxes: _Boxes) -> _Plan | None:
+    """The nearest change of links that keeps all lines that are asked for; None if none was found.
+
+    A broken line is kept by a change of one link. If that breaks another line, one more link changes, or the same one
+    changes so that it keeps both.
+
+    Args:
+        context: what the lines are judged on; its directives are replaced.
+        before: the links.
+        asked: the lines, the first of them broken.
+        boxes: what the lines about one link each allow.
+    """
+    queue, count = [_Plan((0, 0.0), 0, before, {}, asked[0])], 0
+    best: _Plan | None = None
+    while queue and count < MOST_CHANGES:
+        this = heapq.heappop(queue)
+        if best is not None and this.far >= best.far:
+            break
+        rule, only = cast(_Asked, this.broken)
+        alike, seen = not any(part.of_peer for part in rule.parts), set()
+        for k in range(len(before)) if only is None else (only,):
+            box = boxes.capped(before[k], boxes.of(before[k]))
+            key = _key(before[k], box) if alike and k not in this.keeps else None
+            if key is not None and key in seen:
+                continue  # another link would change by as much
+            seen.add(key)
+            count += 1
+            now = this.links[k]
+            changed, far = distance(before[k], now) if k in this.keeps else (0, 0.0)
+            others = this.far[0] - changed, this.far[1] - far
+            nearer: Far | None = None if best is None else (best.far[0] - others[0], best.far[1] - others[1])
+            rules = tuple(dict.fromkeys((*this.keeps.get(k, ()), rule)))
+            parts = [part for each in rules for part in each.parts]
+            context.directives = this.links
+            after = nearest(before[k], box, parts, context, boxes.allowed, nearer)
+            if after is None or (k in this.keeps and after == now):
+                continue
+            changed, far = distance(before[k], after)
+            # A hundredth of the bounds is no reason for another link.
+            at, links = (others[0] + changed, round(others[1] + far, 2)), (*this.links[:k], after, *this.links[k + 1 :])
+            if best is not None and at >= best.far:
+                continue
+            still = next((a for a in asked if not _holds(a, links, context)), None)
+            plan = _Plan(at, count, links, {**this.keeps, k: rules}, still)
+            if still is None:
+                best = plan
+            else:
+                heapq.heappush(queue, plan)
+    return best
 
 
 def _replaced(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
