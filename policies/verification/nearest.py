@@ -300,13 +300,16 @@ def _solved(claim: Claim, word: str, limits: Sequence[Limit], context: Context, 
 
 
 def _helping(claim: Claim, word: str, limits: Sequence[Limit], context: Context, after: Directive) -> Iterator[float]:
-    """The ends of what a field may be that bring the two sides of a comparison nearer to each other."""
+    """The ends of what a field may be that bring the sides of a comparison no further apart; another field may follow.
+
+    In `rate_hz * rho > 1` neither field changes anything while the other one is 0.
+    """
     if claim.gap is None:
         return
     values, gap = _allowed_any(word, tuple(limits)), abs(claim.gap(context, after))
     for value in dict.fromkeys((*values[:1], *values[-1:])):
         found = _changed(after, {word: value}, context.me.region)
-        if found is not None and abs(claim.gap(context, found)) < gap:
+        if found is not None and value != _READ[word](after) and abs(claim.gap(context, found)) <= gap:
             yield value
 
 

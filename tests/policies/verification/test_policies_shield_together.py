@@ -122,3 +122,12 @@ def test_lines_that_cannot_be_kept_are_named_together() -> None:
         f"{CANNOT}battery > 2; rate_hz <= 2; rate_hz >= 5 (decided)",
         f"{CANNOT}battery > 2; rate_hz <= 2 (decided)",
     ]
+
+
+def test_a_product_of_two_fields_that_are_both_zero_can_rise() -> None:
+    lines = ["rate_hz * rho > 1 and rho + fusion_weight >= 1"]
+    (after,) = shielded(lines, [link(1, 5, 0.0, 0.3)])
+    assert keeps_all(lines, [after]), after
+    assert after.rate_hz * after.rho < 1.1
+    (plain,) = shielded(["rate_hz * rho > 1"], [link(1, 5, 0.0)])
+    assert plain.rate_hz * plain.rho > 1
