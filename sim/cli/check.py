@@ -15,11 +15,12 @@ from sortie.scenarios.reading.load import ScenarioError, campaigns, condition_se
 from sortie.sim.check.junit import Suite, junit
 from sortie.sim.cli import tables
 from sortie.sim.cli.console import bars, err, out
-from sortie.sim.cli.options import SetOption
+from sortie.sim.cli.options import SetOption, refuse
 from sortie.sim.folders import ensure_files, write_text
 
 
 def check(
+    context: typer.Context,
     scenarios: Annotated[list[str], typer.Argument(help="Scenario files, names or folders; all: the whole library.")],
     set_: SetOption = None,
     syntax: Annotated[
@@ -41,6 +42,7 @@ def check(
     from sortie.sim.check.discovery import scenario_files
 
     if syntax:
+        refuse(context, ("update", "junit_file"), "flights, not with --syntax")
         return _check_syntax([*library(), *campaigns(), *condition_sets()] if scenarios == ["all"] else scenarios, set_)
 
     names = list(library()) if scenarios == ["all"] else [file for name in scenarios for file in scenario_files(name)]

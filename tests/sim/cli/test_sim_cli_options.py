@@ -21,6 +21,8 @@ def scenario(tmp_path: Path) -> Path:
     ("arguments", "message"),
     [
         (("view", ".", "--at", "3"), "--at goes with --picture"),
+        (("check", "example.yaml", "--syntax", "--update"), "--update goes with flights, not with --syntax"),
+        (("check", "example.yaml", "--syntax", "--junit", "o.xml"), "--junit goes with flights, not with --syntax"),
         (
             ("compare", "example.yaml", "--policies", "silence", "--by-torch"),
             "--by-torch goes with a set of conditions",
