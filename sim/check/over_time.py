@@ -82,14 +82,14 @@ def judge_over_time(
     Args:
         subject: the policy.
         rules: lines about time.
-        drones: the largest fleet of courses and proofs.
+        drones: the largest fleet of courses and proofs; two at least, because one drone has no link.
         budget_s: wall-clock time for the proofs of all lines together, and again for all courses and flights.
         scenario: whose dwell time, staleness rules and shield apply, and which is flown too; None takes the defaults.
         courses: how many for each line.
         flights: how many of the scenario.
         seed: of the courses.
     """
-    base = loads("name: verify") if scenario is None else scenario
+    base, drones = loads("name: verify") if scenario is None else scenario, max(2, drones)
     times, spent, proving = PlaneTimes.of(base), Budget(budget_s), Budget(budget_s)
     verdicts = []
     for rule in rules:
@@ -132,7 +132,7 @@ def _search(
         if best and rng.random() < _FROM_BEST:
             course = changed_course(best[int(rng.integers(len(best)))][2], seed, number, values)
         else:
-            size, limit = int(rng.integers(2, max(3, drones + 1))), times.detached_after_periods
+            size, limit = int(rng.integers(2, drones + 1)), times.detached_after_periods
             still = Course(size, decisions, times.frame_s, times.period_s, limit, {}, {})
             course = draw_course(seed, number, still, values)
         pressure, view = _run(subject.policy, rule, times, course)

@@ -96,6 +96,12 @@ def test_the_verdict_of_a_line_about_time(name: str, line: str, outcome: str, fi
         assert ("all sequences of views of up to 2 drones" in verdict.what) == (outcome == "proved")
 
 
+def test_a_largest_fleet_of_one_drone_counts_as_two_because_one_has_no_link(file: Path) -> None:
+    subject = Subject(resolve(f"{file}:by_charge"), f"{file}:by_charge", {})
+    (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=1, budget_s=60, courses=3)
+    assert verdict.what.startswith("3 courses of up to 2 drones keep it")
+
+
 @pytest.mark.parametrize(
     ("name", "line", "why"),
     [
