@@ -62,6 +62,7 @@ TRIED_LARGE = 2
 
 Outcome = Literal["proved", "proved over the reals", "refuted", "searched", "drawn"]
 PROVED = ("proved", "proved over the reals")
+_NOT_REPEATED = "not the same for the same view: it fails on this view only sometimes"
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,12 +207,14 @@ def prove(
     verdicts = []
     for found, prop in zip(searched, properties, strict=True):
         if found.fault is not None:
-            said = check_property(prop, policy, found.fault.view, found.fault.raised_age_s) or ""
+            said = check_property(prop, policy, found.fault.view, found.fault.raised_age_s) or _NOT_REPEATED
             verdicts.append(ProofVerdict(prop.name, "refuted", said, found.fault.view, found.fault.raised_age_s))
             continue
         view = tried.first_fault(prop)
         if view is not None:
-            verdicts.append(ProofVerdict(prop.name, "refuted", check_property(prop, policy, view) or "", view))
+            verdicts.append(
+                ProofVerdict(prop.name, "refuted", check_property(prop, policy, view) or _NOT_REPEATED, view)
+            )
             continue
         outcome, text = coverage.verdict(found)
         verdicts.append(ProofVerdict(prop.name, outcome, f"{text}; {tried.text}"))
