@@ -13,7 +13,7 @@ _ADVICE = (
     ("keeps results", "leave the cache away"),
     ("for more than arithmetic", "use comparisons, + - * / with constants, min, max, int, floor, ceil or sqrt"),
     ("not in its view", "decide from the view alone"),
-    ("calls ", "use Python's own functions on the numbers of the view"),
+    ("calls ", "leave this call away, wherever it is in the file; Python's own functions and math can be followed"),
     ("cannot be searched", "decide by the fields that a proof covers"),
 )  # fmt: skip
 

@@ -22,9 +22,9 @@ from sortie.scenarios.plugins.user_code import is_users
 Decides = TypeVar("Decides", bound=Callable[..., Any])
 
 ALLOWED = frozenset({
-    "__future__", "_bisect", "_collections", "_functools", "_heapq", "_operator", "_random", "abc", "bisect", "builtins",
-    "cmath", "collections", "copy", "dataclasses", "decimal", "enum", "fractions", "functools", "heapq", "itertools",
-    "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "types", "typing",
+    "__future__", "_bisect", "_collections", "_functools", "_heapq", "_json", "_operator", "_random", "abc", "bisect",
+    "builtins", "cmath", "collections", "contextlib", "copy", "dataclasses", "decimal", "enum", "fractions", "functools",
+    "heapq", "itertools", "json", "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "types", "typing",
 })  # fmt: skip
 """Packages that only use their arguments; a policy may use them."""
 SHARED = frozenset(
@@ -43,6 +43,7 @@ FORBIDDEN = frozenset({
 _ONLY = {"random": {"Random"}}
 """Modules of which a policy may use these names only, such as a random generator with a seed of its own."""
 _EXCEPT = {
+    "contextlib": {"chdir", "redirect_stderr", "redirect_stdout"},
     "numpy": {"DataSource", "ctypeslib", "fromfile", "genfromtxt", "load", "loadtxt", "memmap", "random", "save", "savez"}
 }  # fmt: skip
 _NO_BUILTINS = {"breakpoint", "compile", "eval", "exec", "exit", "globals", "help", "input", "open", "print", "quit"}

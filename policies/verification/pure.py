@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import bisect
 import builtins
 import collections
@@ -21,14 +22,15 @@ from typing import Any
 from sortie.scenarios.plugins.user_code import PREFIX, is_users
 
 PURE_MODULES = frozenset({
-    "__future__", "abc", "bisect", "cmath", "collections", "copy", "dataclasses", "decimal", "enum", "fractions",
-    "functools", "hashlib", "heapq", "itertools", "math", "numbers", "numpy", "operator", "re", "statistics", "string",
+    "__future__", "abc", "bisect", "cmath", "collections", "contextlib", "copy", "dataclasses", "decimal", "enum",
+    "fractions", "functools", "hashlib", "heapq", "itertools", "json", "math", "numbers", "numpy", "operator", "re", "statistics", "string",
     "types", "typing", "zlib",
 })  # fmt: skip
 """Modules that may be imported. What is called is judged one by one."""
 IMPURE = frozenset({
     "numpy.random", "numpy.datetime64", "numpy.load", "numpy.fromfile", "numpy.loadtxt", "numpy.genfromtxt",
-    "numpy.memmap", "numpy.save", "numpy.empty", "statistics.random",
+    "numpy.memmap", "numpy.save", "numpy.empty", "statistics.random", "contextlib.chdir", "contextlib.os", "contextlib.sys",
+    "contextlib.redirect_stdout", "contextlib.redirect_stderr",
 })  # fmt: skip
 _TRUSTED = (
     "sortie.policies.contract", "sortie.policies.geometry", "sortie.policies.catalogue", "sortie.scenarios.disc",
@@ -252,7 +254,7 @@ def cannot_call(function: Any) -> str | None:
 
 def _python_function(function: Any) -> str | None:
     home = str(function.__module__)
-    if is_users(home) or is_trusted(home):
+    if is_users(home) or is_trusted(home) or function is abc.abstractmethod:
         return None
     if function in _NOT:
         return f"calls {_NOT[function]}"

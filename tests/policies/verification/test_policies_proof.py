@@ -5,13 +5,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
 import pytest
 from policies_examples import planted
 
 from sortie.policies.catalogue.baselines import everyone, random_k
 from sortie.policies.catalogue.worked import worked
-from sortie.policies.contract import Directive, FleetView
+from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.policies.registry import resolve
+from sortie.policies.verification.advice import advise
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import BUDGET_S, ProofVerdict, check_property, property_of, prove
 from sortie.policies.verification.properties import PROMISES
@@ -178,4 +181,37 @@ def test_without_the_solver_the_verdict_names_the_extra(monkeypatch: pytest.Monk
     assert verdict.what.startswith(
         "Cannot analyse: it combines goodput of drone 0 to drone 2 and goodput of drone 0 to drone 1, and z3 is not "
         "installed (pip install sortie-sim[verify])"
+    )
+
+
+def test_a_refutation_of_a_policy_that_fails_only_sometimes_says_so() -> None:
+    calls = []
+
+    def decide(view: FleetView) -> list[Directive]:
+        calls.append(view)
+        rate_hz = 20.0 if len(calls) % 7 == 0 else 2.0
+        return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=rate_hz) for p in view.peers]
+
+    verdicts = prove(decide, parse("rate_hz <= 2"), max_drones=1, views=20, budget_s=0.0)
+    assert all(v.what for v in verdicts)
+    assert any(v.what.startswith("not the same for the same view") for v in verdicts), verdicts
+
+
+def test_an_abstract_method_anywhere_in_its_file_is_no_obstacle(tmp_path: Path) -> None:
+    file = tmp_path / "rules.py"
+    file.write_text(
+        "from abc import ABC, abstractmethod\n"
+        "from sortie import Directive, Representation\n\n"
+        "class Rule(ABC):\n    @abstractmethod\n    def rate_hz(self): ...\n\n"
+        "class Slow(Rule):\n    def rate_hz(self): return 2.0\n\n"
+        "def decide(view):\n"
+        "    return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=Slow().rate_hz()) for p in view.peers]\n"
+    )
+    verdicts = prove(resolve(f"{file}:decide", {}), parse("rate_hz <= 5"), max_drones=2, views=20)
+    assert [v.outcome for v in verdicts] == ["proved"] * 3
+
+
+def test_a_call_that_no_search_follows_has_a_hint_of_its_own() -> None:
+    assert advise("calls json.loads").endswith(
+        "To make it provable: leave this call away, wherever it is in the file; Python's own functions and math can be followed"
     )

@@ -433,3 +433,17 @@ def test_what_is_not_the_fleets_is_dropped(spoil: Callable[[bytes], bytes], reas
 
 def test_a_policy_may_use_the_types_of_the_public_api() -> None:
     assert confined(uses_the_api)(FLEET) == uses_the_api(FLEET)
+
+
+def test_pure_parts_of_json_and_contextlib_may_be_used_and_no_others(tmp_path: Path) -> None:
+    file = tmp_path / "pure_parts.py"
+    file.write_text(
+        "import contextlib, json\nfrom sortie import Directive, Representation\n\n"
+        "@contextlib.contextmanager\ndef rate():\n    yield json.loads('2.0')\n\n"
+        "def decide(view):\n    with rate() as hz:\n"
+        "        return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=hz) for p in view.peers]\n\n"
+        "def moves(view):\n    with contextlib.chdir('.'):\n        return decide(view)\n"
+    )
+    reads_only = RULES["reads only its view"]
+    assert reads_only(resolve(f"{file}:decide"), FLEET) is None
+    assert reads_only(resolve(f"{file}:moves"), FLEET) == "uses contextlib.chdir, which is not in its view"
