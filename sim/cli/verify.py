@@ -67,7 +67,10 @@ def verify(
     drones: Annotated[int, typer.Option(help="Largest fleet that proofs search.", min=1, max=8)] = DRONES,
     budget: Annotated[
         float,
-        typer.Option(help="Time for the search of all properties together, s; what it covered is printed.", min=0),
+        typer.Option(
+            help="Time for the proofs of all properties together, s. Lines about time get as much again for their proofs, and as much for courses and flights.",
+            min=0,
+        ),
     ] = BUDGET_S,
     views: Annotated[int, typer.Option(help="Number of random views that the kit tries.", min=10)] = VIEWS,
     scenario: Annotated[
