@@ -43,13 +43,14 @@ def people_outcome(record: SortieRecord) -> dict[str, float | None]:
     present = (away_m <= discs[:, :, None, 2]).any(axis=-1) & flying
     known = _known(record.tables["alerts"], t_s, n, frame_s) & flying
     without = flying & ~np.isnan(discs[..., 2]) & ~present
+    width_s = np.diff(t_s, append=record.scenario.duration_s)
     return {
         "ap_2m": None if perception.thermal is None else _average_precision(record, t_s, flying, people_m),
         **dict(zip(("located_share", "located_alone_share"), _located(record), strict=True)),
-        "in_region_drone_s": float(present.sum()) * frame_s,
-        "unknown_share": _share(present & ~known, present),
-        "unknown_longest_s": _longest(present & ~known) * frame_s if present.any() else None,
-        "false_alert_share": _share(without & known, without),
+        "in_region_drone_s": _drone_s(present, width_s),
+        "unknown_share": _share(present & ~known, present, width_s),
+        "unknown_longest_s": _longest_s(present & ~known, width_s) if present.any() else None,
+        "false_alert_share": _share(without & known, without, width_s),
     }
 
 
@@ -91,17 +92,22 @@ def _near(here_m: Floats, places: Sequence[list[tuple[float, float]] | None]) ->
     return float(np.mean(found))
 
 
-def _share(part: Bools, whole: Bools) -> float | None:
-    return float(part.sum() / whole.sum()) if whole.any() else None
+def _drone_s(what: Bools, width_s: Floats) -> float:
+    """Time in which something is so, summed over drones; `what` [T, N], `width_s` [T]."""
+    return float((width_s * what.sum(axis=1)).sum())
 
 
-def _longest(what: Bools) -> int:
-    """The longest unbroken run of frames of any drone; `what` [T, N]."""
-    run, longest = np.zeros(what.shape[1], np.int64), 0
-    for row in what:
-        run = np.where(row, run + 1, 0)
-        longest = max(longest, int(run.max()))
-    return longest
+def _share(part: Bools, whole: Bools, width_s: Floats) -> float | None:
+    return _drone_s(part, width_s) / _drone_s(whole, width_s) if whole.any() else None
+
+
+def _longest_s(what: Bools, width_s: Floats) -> float:
+    """The longest unbroken time of any drone; `what` [T, N], `width_s` [T]."""
+    run_s, longest_s = np.zeros(what.shape[1]), 0.0
+    for row, lasts_s in zip(what, width_s, strict=True):
+        run_s = np.where(row, run_s + lasts_s, 0.0)
+        longest_s = max(longest_s, float(run_s.max()))
+    return longest_s
 
 
 def _people(table: pa.Table, frames: int, people: int) -> Floats:

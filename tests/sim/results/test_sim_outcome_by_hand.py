@@ -131,9 +131,11 @@ def test_a_target_is_detected_where_it_is_at_the_fusion(places_m: tuple[float, .
     assert mission["target_longest_undetected_s"] == pytest.approx(4 - found)
 
 
+@pytest.mark.parametrize("last_s", [1.0, 0.5])
 @pytest.mark.parametrize("x_m", [2.0, 60.0])
-def test_a_person_in_the_region_is_known_from_the_decision_of_a_frame_on(x_m: float) -> None:
-    """The region is there in the last two frames, and drone 1 flies in the first of them: three drone seconds.
+def test_a_person_in_the_region_is_known_from_the_decision_of_a_frame_on(x_m: float, last_s: float) -> None:
+    """The region is there in the last two frames, and drone 1 flies in the first of them: three drone seconds, less where the
+    sortie ends within the last frame.
 
     Drone 0 knows of somebody from 2.3 s to 3.2 s: from its decision in the first of these frames until that in the second. A
     drone that is gone counts nowhere, though it knew of somebody when it left. With the person 60 m off, what was known was
@@ -146,12 +148,13 @@ def test_a_person_in_the_region_is_known_from_the_decision_of_a_frame_on(x_m: fl
         for t_s, drone, known in ((2.3, 0, True), (2.9, 1, True), (3.2, 0, False))
     ]
     scenario = SCENARIO.replace("sample_rate_hz: 1}", f"sample_rate_hz: 1, people: [{{waypoints_m: [[{x_m}, 0]]}}]}}")
+    scenario = scenario.replace("duration_s: 4", f"duration_s: {3 + last_s}")
     people = outcome(record(scenario=loads(scenario), tables=tables_of(given)))["people"]
     is_there = x_m < 10
-    assert people["in_region_drone_s"] == (3.0 if is_there else 0.0)
-    assert people["unknown_share"] == (pytest.approx(1 / 3) if is_there else None)
-    assert people["unknown_longest_s"] == (1.0 if is_there else None)
-    assert people["false_alert_share"] == (None if is_there else pytest.approx(2 / 3))
+    assert people["in_region_drone_s"] == (2.0 + last_s if is_there else 0.0)
+    assert people["unknown_share"] == (pytest.approx(last_s / (2 + last_s)) if is_there else None)
+    assert people["unknown_longest_s"] == (last_s if is_there else None)
+    assert people["false_alert_share"] == (None if is_there else pytest.approx(2 / (2 + last_s)))
 
 
 def test_counts_and_ratios(result: dict[str, Any]) -> None:
