@@ -62,8 +62,8 @@ def mission_outcome(record: SortieRecord) -> dict[str, float | None]:
 
 def _flown_share(flying: Bools, width_s: Floats) -> float:
     """Share of drone-seconds flown, of [T, n]; 1 where nobody is to fly."""
-    every_s = flying.shape[1] * float(width_s.sum())
-    return 1.0 - float(width_s @ (~flying).sum(axis=1)) / every_s if every_s else 1.0
+    every_s = float((width_s * flying.shape[1]).sum())
+    return float((width_s * flying.sum(axis=1)).sum()) / every_s if every_s else 1.0
 
 
 def _flown(tables: Mapping[str, pa.Table], n: int) -> tuple[Floats, Bools, Bools]:

@@ -26,7 +26,7 @@ from sortie.policies.contract import Directive, FleetView
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.accuracy import both_matched
 from sortie.sim.results.explain import explain_metric
-from sortie.sim.results.mission_outcome import sees_ground
+from sortie.sim.results.mission_outcome import _flown_share, sees_ground
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.outcome_fields import check_number, open_keys
 from sortie.sim.results.record import SortieRecord
@@ -67,6 +67,12 @@ def region(x_m: float, y_m: float, radius_m: float) -> str:
 def test_drone_seconds_flown(overrides: Sequence[str], share: float) -> None:
     """At 7.5 Hz the loss at 3 s is in the frame that begins at 3.07 s."""
     assert mission(*overrides)["flown_share"] == pytest.approx(share, abs=1e-9)
+
+
+def test_a_fleet_that_is_lost_at_once_flew_no_share_at_all() -> None:
+    """Exactly 0, and exactly 1 where all fly: rounding must not lead past either."""
+    flying, width_s = np.zeros((120, 5), bool), np.diff(0.1 * np.arange(120), append=12.0)
+    assert (_flown_share(flying, width_s), _flown_share(~flying, width_s)) == (0.0, 1.0)
 
 
 # --- the cameras ---------------------------------------------------------------------------------
