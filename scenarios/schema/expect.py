@@ -34,6 +34,9 @@ class Expectation(Section):
             raise inconsistent((missing,), "missing", f"given where {given} is")
         if self.replications is not None and self.equals is not None:
             raise inconsistent(("equals",), f"{self.equals}", "at_least or at_most where replications is given")
+        if self.tolerance and isinstance(self.equals, str | bool):
+            bound = f"left out where equals is {self.equals!r}, it goes with numbers"
+            raise inconsistent(("tolerance",), f"{self.tolerance:g}", bound)
         if self.at_least is None and self.at_most is None and self.equals is None:
             raise inconsistent((), "no bound", "at_least, at_most or equals")
         if self.at_least is not None and self.at_most is not None and self.at_least > self.at_most:

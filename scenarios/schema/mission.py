@@ -88,6 +88,11 @@ class Mission(Section):
                 if drone not in group.drones or drone in group.reserve[:i]:
                     bound = f"one of the group's drones {sorted(group.drones)}, named once"
                     raise inconsistent(("groups", k, "reserve", i), f"{drone}", bound)
+            if len(group.reserve) == len(group.drones):
+                bound = "some of the group's drones, at least one must fly from the start"
+                raise inconsistent(("groups", k, "reserve"), f"{list(group.reserve)}", bound)
+        if self.handover_soc is not None and not any(group.reserve for group in self.groups):
+            raise inconsistent(("handover_soc",), f"{self.handover_soc:g}", "left out where no group has a reserve")
         return self
 
 

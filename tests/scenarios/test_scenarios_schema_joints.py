@@ -143,7 +143,7 @@ def test_who_is_sent_home_or_fails_is_no_station_on_the_mains() -> None:
         refused(station % (mains, "drone_leaves", ""), "events.0.drone: 1, must be a drone that flies")
     refused(station % ("true", "battery_fault", fault), "on mains power")
     assert scenario(station % ("false", "battery_fault", fault))
-    reserve = "fleet: {ground: [{drone: 1}]}\nmission: {handover_soc: 0.5, groups: [{drones: [0, 1, 2], phases: [{}], reserve: [%s]}]}"
+    reserve = "fleet: {ground: [{drone: 1}]}\nmission: {groups: [{drones: [0, 1, 2], phases: [{}], reserve: [%s]}]}"
     refused(reserve % "2", "mission.groups.0.drones.1: 1")
     assert scenario(reserve % "")
 
@@ -542,3 +542,19 @@ def test_imported_files_are_those_beside_the_file_and_in_its_packages(tmp_path: 
     assert found == [
         "own.py", "pack/__init__.py", "pack/inner/__init__.py", "pack/inner/deep.py", "pack/one.py", "pack/three.py", "pack/two.py",
     ]  # fmt: skip
+
+
+def test_a_group_has_drones_beside_its_reserve_and_a_charge_to_go_home_at_has_a_reserve() -> None:
+    groups = "mission: {%s groups: [{drones: [1, 2], phases: [{}], reserve: [%s]}]}"
+    refused(groups % ("", "2, 1"), "mission.groups.0.reserve: [2, 1], must be some of the group's drones")
+    refused(
+        groups % ("handover_soc: 0.5,", ""), "mission.handover_soc: 0.5, must be left out where no group has a reserve"
+    )
+    assert scenario(groups % ("handover_soc: 0.5,", "2"))
+
+
+def test_a_tolerance_goes_with_a_number() -> None:
+    expect = "expect: [{metric: policy, equals: %s, tolerance: 0.1}]"
+    refused(expect % "worked", "expect.0.tolerance: 0.1, must be left out where equals is 'worked'")
+    refused(expect % "true", "expect.0.tolerance: 0.1, must be left out where equals is True")
+    assert scenario(expect % "3")
