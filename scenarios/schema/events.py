@@ -35,7 +35,9 @@ class DroneLost(BaseEvent):
 
 class DroneJoins(BaseEvent):
     kind: Literal["drone_joins"]
-    drone: DroneId = Field(description="Who joins the fleet; before its first such event it is on the ground.")
+    drone: DroneId = Field(
+        description="Who joins the fleet; it is on the ground until then, unless it left or was lost before."
+    )
 
 
 class DroneLeaves(BaseEvent):

@@ -46,6 +46,8 @@ LASTING = (
     LinkDrop, Jam, Lie, GnssLoss, Own, PositionFault, HeadingFault, CameraBlocked, SlowPerception,
 )  # fmt: skip
 """Events that have an end."""
+FleetEvent = DroneJoins | DroneLeaves | DroneLost | BatteryFault | CellFailure
+"""Events that change nothing where the drone is on the ground, or flies already."""
 
 
 def group_key(seed: int) -> bytes:
@@ -67,8 +69,9 @@ def schedule(
 
     Events and their ends come before the frame that begins at the same instant.
     """
+    going: dict[int, Event] = {}
     begins = [
-        _Begin(scenario, world, transport, membership, own, e, index, seed, replication)
+        _Begin(scenario, world, transport, membership, own, e, index, seed, replication, going)
         for index, e in enumerate(scenario.events)
     ]
     for begin in begins:
@@ -93,14 +96,23 @@ class _Begin:
         index: int,
         seed: int,
         replication: int,
+        going: dict[int, Event],
     ) -> None:
         self.scenario, self.world, self.transport, self.event = scenario, world, transport, event
         self.membership, self.own = membership, own
         self.index, self.seed, self.replication = index, seed, replication
+        self.going = going
+        """The events of all that have begun and not ended, by their place among the scenario's."""
 
     def __call__(self) -> None:
         world, event = self.world, self.event
         env = world.env
+        if isinstance(event, FleetEvent):
+            world.drain()  # what the drones have spent up to now
+            if why := self._no_effect(event):
+                world.note(event.drone, "no_effect", f"{event.kind}: {why}")
+                return
+        self.going[self.index] = event
         match event:
             case LinkDrop():
                 world.note(event.drone, "link_drop", f"links of {_ends(event)} lose {event.loss_db:g} dB")
@@ -109,28 +121,22 @@ class _Begin:
                 world.note(-1, "jam", f"a jammer of {event.power_dbm:g} dBm at {event.position_m}")
                 world.jammers[self.index] = (event.position_m, event.power_dbm)
             case DroneLost():
-                world.drain()  # what it has spent up to now
-                if world.drones[event.drone].airborne:
-                    world.remove(event.drone, "drone_lost", "fell silent")
+                world.remove(event.drone, "drone_lost", "fell silent")
             case DroneJoins():
-                world.drain()
                 self.membership.join(event.drone)
             case DroneLeaves():
-                world.drain()
                 self.membership.go_home(event.drone)
             case BatteryFault():
-                world.drain()
-                if world.drones[event.drone].airborne:  # who left the air spends nothing any more
-                    lost = f"{event.lost_fraction:.0%} of the remaining energy is gone"
-                    world.note(event.drone, "battery_fault", lost)
-                    world.batteries.fault(event.drone, event.lost_fraction)
-                    world.ground_landed()
+                lost = f"{event.lost_fraction:.0%} of the remaining energy is gone"
+                world.note(event.drone, "battery_fault", lost)
+                world.batteries.fault(event.drone, event.lost_fraction)
+                world.ground_landed()
             case CellFailure():
-                world.drain()
-                if world.drones[event.drone].airborne:
-                    world.batteries.drop_cell(event.drone)
-                    world.note(event.drone, "cell_failure", f"{world.batteries.cells[event.drone]} cells are left")
-                    world.ground_landed()
+                left = world.batteries.cells[event.drone] - 1
+                world.batteries.drop_cell(event.drone)
+                text = {0: "no cell is left", 1: "1 cell is left"}.get(left, f"{left} cells are left")
+                world.note(event.drone, "cell_failure", text)
+                world.ground_landed()
             case ClockSkew() | ClockDrift() | GnssLoss() | Lie():
                 for drone in whom(event, self.scenario.fleet.drones):
                     world.note(drone, *world.own[drone].begin(event, self.index, env.now))
@@ -150,32 +156,55 @@ class _Begin:
                 world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
                 env.process(self._spoof(env, event))
 
+    def _no_effect(self, event: FleetEvent) -> str:
+        """Why an event of a drone that joins, leaves or loses energy changes nothing; empty where it does."""
+        flies, descends = self.world.drones[event.drone].airborne, event.drone in self.world.homebound
+        if not isinstance(event, DroneJoins | DroneLeaves):
+            return "" if flies else "it is not in the fleet"
+        if descends:
+            return "it still descends" if isinstance(event, DroneJoins) else "it already descends"
+        if flies == isinstance(event, DroneJoins):
+            return "it is already in the fleet" if flies else "it is not in the fleet"
+        return ""
+
     def end(self) -> None:
         """End an event that lasts."""
         world, event = self.world, self.event
         env = world.env
+        del self.going[self.index]
         match event:
             case LinkDrop():
                 world.add_loss(event.drone, event.peer, -event.loss_db)
-                world.note(event.drone, "link_back", f"links of {_ends(event)} are back")
+                links = f"links of {_ends(event)}"
+                self._note_end("link_back", f"{links} are back", f"{links} are back only where no other drop lasts")
             case Jam():
                 del world.jammers[self.index]
-                world.note(-1, "jam_over", "the jammer is off")
+                self._note_end("jam_over", "the jammer is off", "this jammer is off, another one is still on")
             case Own():
                 self.own.end(self.index, event.model)
             case PositionFault() | HeadingFault():
-                world.note(event.drone, f"{event.kind}_over", "its believed pose has its usual errors again")
+                usual = "its believed pose has its usual errors again"
+                self._note_end(f"{event.kind}_over", usual, "its believed pose is still wrong: another fault lasts")
             case CameraBlocked():
                 world.drones[event.drone].blocked.discard(self.index)
-                world.note(event.drone, "camera_clear", "its cameras see again")
+                still = "its cameras still see nothing: another block lasts"
+                self._note_end("camera_clear", "its cameras see again", still)
             case SlowPerception():
                 del world.drones[event.drone].slower_s[self.index]
-                world.note(event.drone, "slow_perception_over", "its perception takes its usual time again")
+                usual = "its perception takes its usual time again"
+                still_s = sum(world.drones[event.drone].slower_s.values())
+                self._note_end("slow_perception_over", usual, f"its perception still takes {still_s:g} s longer")
             case GnssLoss() | Lie():
                 for drone in whom(event, self.scenario.fleet.drones):
                     world.note(drone, *world.own[drone].end(event, self.index, env.now))
                 if not isinstance(event, Lie):
                     world.read_clocks()
+
+    def _note_end(self, kind: str, text: str, still: str) -> None:
+        """Write down that the event is over; `still` where another one does the same and lasts."""
+        lasts = any(_alike(self.event, other) for other in self.going.values())
+        drone = getattr(self.event, "drone", -1)
+        self.world.note(drone, *((self.event.kind, still) if lasts else (kind, text)))
 
     def _spoof(self, env: simpy.Environment, event: Spoof) -> Generator[simpy.Event, Any, None]:
         """Imitate the drone's descriptors; the attacker lacks the fleet's key but hears every broadcast."""
@@ -214,6 +243,19 @@ def _fault(event: PositionFault | HeadingFault) -> str:
         return f"believes its heading {event.offset_deg:g}° off, drifting by {event.drift_degps:g}° a second"
     offset_m, drift_mps = (math.hypot(*vector) for vector in (event.offset_m, event.drift_mps))
     return f"believes to be {offset_m:.3g} m away, drifting at {drift_mps:.3g} m/s"
+
+
+def _alike(ended: Event, other: Event) -> bool:
+    """Whether an event that lasts keeps up what one that ended did."""
+    match ended, other:
+        case LinkDrop(), LinkDrop():
+            a, b = ({drop.drone, drop.peer} - {None} for drop in (ended, other))
+            return a <= b or b <= a or len(a) == len(b) == 1  # two drones with weak links share one
+        case PositionFault() | HeadingFault(), PositionFault() | HeadingFault():
+            return ended.drone == other.drone
+        case PositionFault() | HeadingFault(), GnssLoss():
+            return other.position_walk_m > 0 and other.drone in (None, ended.drone)
+    return ended.kind == other.kind and getattr(ended, "drone", -1) == getattr(other, "drone", -1)
 
 
 def _ends(drop: LinkDrop) -> str:

@@ -21,7 +21,7 @@ class Membership:
 
     def __init__(self, scenario: Scenario, world: World) -> None:
         self._world, self._mission, self._frame_s = world, scenario.mission, scenario.frame_s
-        self._level = world.motion
+        self._level, self._stations = world.motion, {station.drone for station in scenario.fleet.ground}
         self._homebound: dict[int, float] = {}
         """By drone that went home and did not come back: when it touches down."""
         self.on_join: Callable[[int], None] = lambda drone: None
@@ -58,13 +58,17 @@ class Membership:
                     self._replaced.add(drone)
                     self.join(reserves.pop(0), f"takes over from drone {drone}")
 
-    def join(self, drone: int, text: str = "takes off") -> None:
-        """A drone on the ground joins the fleet; nothing happens to one that flies."""
+    def join(self, drone: int, text: str = "") -> None:
+        """A drone on the ground joins the fleet; nothing happens to one that flies.
+
+        Args:
+            text: what the record says; empty says that it takes off, or that a ground station is switched on.
+        """
         world, frame = self._world, self._world.next_frame
         self._awaited.discard(drone)
         if world.drones[drone].airborne:
             return
-        world.join(drone, text)
+        world.join(drone, text or ("is switched on" if drone in self._stations else "takes off"))
         if world.drones[drone].airborne:
             self._replaced.discard(drone)
             for reserves in self._reserves:

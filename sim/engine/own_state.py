@@ -71,6 +71,8 @@ class OwnState:
                 return Told("gnss_back", "the clock follows GNSS again")
             case Lie():
                 del self._status.lies[index]
+                if self._status.lies:
+                    return Told("lie", "still lies: another lie lasts")
                 return Told("lie_over", "tells the truth again")
 
     def _set(self, now_s: float, **changes: float) -> None:
