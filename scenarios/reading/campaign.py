@@ -6,17 +6,15 @@ What is wrong is told as for scenarios, in one line with the campaign file's own
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from sortie.scenarios.reading.files import found_beside
 from sortie.scenarios.reading.load import (
-    Overrides,
+    base_path,
     campaigns,
-    condition_sets,
-    library,
     load,
     load_conditions,
     read,
@@ -79,7 +77,7 @@ def load_campaign(path_or_name: str | Path) -> Study:
         raise ScenarioError(f"{source}: is a scenario, a campaign begins with `campaign: its_name` and names its base")
     campaign = validated(root, Campaign)
     here = Path(source).parent
-    base = _base(campaign.base, here, root)
+    base = load(base_path(campaign.base, here, root))
     written = child(root, "set") or root
     sections = base.model_dump(mode="json", exclude_none=True) | {"expect": [], "expect_decisions": []}
     resolved = whole = as_node(
@@ -105,8 +103,10 @@ def load_campaign(path_or_name: str | Path) -> Study:
     return Study(campaign, base, columns, here, root, drones, phases)
 
 
-def read_any(path_or_name: str | Path, overrides: Overrides = ()) -> Scenario | None:
+def read_any(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scenario | None:
     """Read a scenario, a campaign or a set of conditions, whichever the file is, to see whether it can be read.
+
+    Of a set of conditions, the scenario of every condition is read.
 
     Returns:
         The scenario, or a campaign's base; None for a set of conditions.
@@ -119,9 +119,25 @@ def read_any(path_or_name: str | Path, overrides: Overrides = ()) -> Scenario | 
     if child(root, "campaign") is not None:
         return load_campaign(path_or_name).base
     if child(root, "conditions") is not None and child(root, "name") is None:
-        load_conditions(path_or_name)
+        _check_conditions(path_or_name, source, overrides)
         return None
     return load(path_or_name, overrides)
+
+
+def _check_conditions(path_or_name: str | Path, source: str, overrides: Sequence[str]) -> None:
+    """Raises ScenarioError with what is wrong with the scenarios of all conditions, each thing at the first of them."""
+    conditions = load_conditions(path_or_name)
+    assert conditions is not None  # noqa: S101 (the caller looked)
+    found: dict[str, str] = {}
+    for condition in conditions.conditions:
+        try:
+            load(conditions.base, [*conditions.set, *overrides, *condition.set])
+        except ScenarioError as error:
+            for issue in error.issues:
+                found.setdefault(issue, f"{source}: condition {condition.name}: {issue}")
+    if found:
+        first, *others = found.values()
+        raise ScenarioError(first, [first, *others])
 
 
 def _relined(node: Node) -> Node:
@@ -142,21 +158,6 @@ def _put(root: Node, name: str, new: Node) -> Node:
         return assign(root, parts, new)
     except ScenarioError as error:
         raise ScenarioError(f"{new.where}{str(error).removeprefix(new.source)}") from None
-
-
-def _base(name: str, here: Path, root: Node) -> Scenario:
-    """From the library, or a file beside the campaign's; what is wrong within it is told at its own line."""
-    at = f"{(child(root, 'base') or root).where}: base: "
-    path = {**library(), **campaigns(), **condition_sets()}.get(name, here / name)
-    try:
-        text, source = read(path)
-    except ScenarioError as error:
-        raise ScenarioError(f"{at}{error}") from None
-    top = tree(text, source)
-    for key, what in (("campaign", "a campaign itself"), ("conditions", "a set of conditions")):
-        if child(top, key) is not None and child(top, "name") is None:
-            raise ScenarioError(f"{at}{name}, must be a scenario, it is {what}")
-    return load(path)
 
 
 def extremes(spread: Spread, column: tuple[Any, ...]) -> Iterator[Any]:

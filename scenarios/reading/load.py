@@ -31,6 +31,7 @@ from sortie.scenarios.reading.nodes import (
 )
 from sortie.scenarios.reading.strict_yaml import read_yaml, write_yaml
 from sortie.scenarios.schema import Airframe, DescriptorForm, Scenario
+from sortie.scenarios.schema.base import PresetSection
 from sortie.scenarios.schema.conditions import ConditionSet
 
 __all__ = ["Overrides", "ScenarioError", "build", "dump", "library", "load", "loads"]
@@ -117,7 +118,7 @@ def shortened(root: Node, written: Node) -> Node:
     return root
 
 
-def _at(node: Node | None, path: Sequence[str]) -> Node | None:
+def _at(node: Node | None, path: Sequence[str | int]) -> Node | None:
     for part in path:
         node = None if node is None else child(node, part)
     return node
@@ -218,7 +219,7 @@ def _with_on_top(key: str) -> dict[str, Path]:
 
 
 def load_conditions(path_or_name: str | Path) -> ConditionSet | None:
-    """A set of conditions; None if the file holds something else, such as a scenario.
+    """A set of conditions, with its base as a path; None if the file holds something else, such as a scenario.
 
     Raises:
         ScenarioError: as `load` does.
@@ -226,7 +227,34 @@ def load_conditions(path_or_name: str | Path) -> ConditionSet | None:
     text, source = read(path_or_name)
     root = tree(text, source)
     _refuse_old_key(root)
-    return validated(root, ConditionSet) if child(root, "conditions") is not None else None
+    if child(root, "conditions") is None:
+        return None
+    conditions = validated(root, ConditionSet)
+    return conditions.model_copy(update={"base": str(base_path(conditions.base, Path(source).parent, root))})
+
+
+def base_path(name: str, here: Path, root: Node) -> Path:
+    """Where the base of a campaign or of a set of conditions is: in the library, or beside its file.
+
+    Args:
+        name: as the field `base` has it.
+        here: the folder of the file.
+        root: the file's tree, of which an error names the line.
+
+    Raises:
+        ScenarioError: the base cannot be read, or is no scenario.
+    """
+    at = f"{(child(root, 'base') or root).where}: base: "
+    path = {**library(), **campaigns(), **condition_sets()}.get(name, here / name)
+    try:
+        text, source = read(path)
+    except ScenarioError as error:
+        raise ScenarioError(f"{at}{error}") from None
+    top = tree(text, source)
+    for key, what in (("campaign", "a campaign itself"), ("conditions", "a set of conditions")):
+        if child(top, key) is not None and child(top, "name") is None:
+            raise ScenarioError(f"{at}{name}, must be a scenario, it is {what}")
+    return path
 
 
 def _refuse_old_key(root: Node) -> None:
@@ -239,6 +267,13 @@ _OTHERS = (("campaign", "a campaign", "sortie campaign"), ("conditions", "a set 
 """What else lies in files like these, by the key that only it has."""
 
 # --- overrides and errors ------------------------------------------------------------------------
+
+
+def as_texts(overrides: Overrides) -> list[str]:
+    """Overrides that can be read, as they stand after `--set`."""
+    if not isinstance(overrides, Mapping):
+        return [*overrides]
+    return [f"{key}={json.dumps(plain(as_node(value)), ensure_ascii=False)}" for key, value in overrides.items()]
 
 
 def _override(root: Node, override: str) -> Node:
@@ -261,10 +296,18 @@ def _assigned(root: Node, key: object, new: Node, source: str) -> Node:
 
 def _without_presets(root: Node) -> Node:
     """A preset's name above the overridden field becomes the preset's values, so that the override changes one of them."""
-    for path, section in ((("fleet", "airframe"), Airframe), (("context", "form"), DescriptorForm)):
-        node = child(child(root, path[0]) or root, path[1])
+    makes = _at(root, ("fleet", "makes"))
+    count = len(makes.value) if makes is not None and isinstance(makes.value, list) else 0
+    sections: list[tuple[tuple[str | int, ...], type[PresetSection]]] = [
+        (("context", "form"), DescriptorForm),
+        (("fleet", "airframe"), Airframe),
+        *((("fleet", "makes", k, "airframe"), Airframe) for k in range(count)),
+    ]
+    for path, section in sections:
+        node = _at(root, path)
         if node is not None and isinstance(node.value, str) and node.value in section.presets:
-            root = assign(root, path, as_node(section.presets[node.value], node.source, node.line))
+            values = as_node(section.presets[node.value], node.source, node.line)
+            root = assign(root, [str(part) for part in path], values)
     return root
 
 

@@ -33,7 +33,7 @@ class ConditionSet(Section):
     """A set of conditions, compared as a whole."""
 
     description: str = Field("", max_length=2000, description="One paragraph for people.")
-    base: str = Field(min_length=1, description="A library scenario's name, or a file.")
+    base: str = Field(min_length=1, description="A library scenario's name, or a file, relative to this one.")
     set: tuple[Override, ...] = Field((), max_length=50, description="What holds in every condition.")
     seeds: tuple[Annotated[int, Field(ge=0, lt=2**63)], ...] = Field(
         (1,),

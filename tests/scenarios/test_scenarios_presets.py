@@ -69,3 +69,9 @@ def test_editors_accept_a_name_or_a_section() -> None:
     form = schema["$defs"]["Context"]["properties"]["form"]
     assert form["anyOf"] == [{"enum": list(DescriptorForm.presets)}, {"$ref": "#/$defs/DescriptorForm"}]
     assert json.dumps(schema)
+
+
+def test_an_override_changes_one_value_of_a_makes_preset() -> None:
+    text = "name: a\nfleet: {makes: [{name: m, drones: [1], airframe: {mass_kg: 5}}, {name: k, drones: [2], airframe: solo}]}\n"
+    _, make = loads(text, overrides=["fleet.makes.1.airframe.payload_kg=0.3"]).fleet.makes
+    assert make.airframe == Airframe.model_validate({**Airframe.presets["solo"], "payload_kg": 0.3})

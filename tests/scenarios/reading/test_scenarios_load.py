@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 import sortie.scenarios.reading.load as loader
 from sortie.scenarios.reading import strict_yaml
-from sortie.scenarios.reading.load import ScenarioError, build, dump, library, load, loads
+from sortie.scenarios.reading.campaign import read_any
+from sortie.scenarios.reading.load import ScenarioError, as_texts, build, dump, library, load, load_conditions, loads
 from sortie.scenarios.schema import PolicySection, Scenario
 
 BROKEN = sorted((Path(__file__).parent / "broken").glob("*.yaml"))
@@ -501,3 +502,46 @@ def test_any_value_at_any_field_raises_nothing_else(data: st.DataObject) -> None
         ["at_s", "kind", "drone", "phase", "region", "metric", "waypoints_m", "x"]), x, max_size=3), max_leaves=8)  # fmt: skip
     value = yaml.safe_dump(data.draw(values), default_flow_style=True)
     only_scenario_errors(BASE, f"{data.draw(st.sampled_from(fields))}={value}")
+
+
+# --- sets of conditions, and overrides as text ------------------------------------------------------
+
+
+def test_the_base_of_a_set_of_conditions_lies_beside_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text("base: mine.yaml\nconditions: [{name: a, budget: 0.1}]\n")
+    with pytest.raises(ScenarioError, match=r"c\.yaml:1: base: .*mine\.yaml: no such file"):
+        load_conditions(path)
+    (tmp_path / "mine.yaml").write_text("name: mine\n")
+    conditions = load_conditions(path)
+    assert conditions is not None
+    assert load(conditions.base).name == "mine"
+
+
+def test_to_read_a_set_of_conditions_finds_what_is_wrong_with_each_of_its_scenarios(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(
+        "base: track_target\nset: [fleet.dronez=3]\nconditions:\n"
+        "  - {name: a, budget: 0.1, set: [duration_s=-1]}\n  - {name: b, budget: 0.1, set: [context.rate_hz=0]}\n"
+    )
+    with pytest.raises(ScenarioError) as caught:
+        read_any(path)
+    assert [issue.partition(": ")[2].partition(", ")[0] for issue in caught.value.issues] == [
+        "condition a: --set duration_s=-1: duration_s: -1",
+        "condition a: --set fleet.dronez=3: fleet.dronez: unknown key",
+        "condition b: --set context.rate_hz=0: context.rate_hz: 0",
+    ]
+
+
+def test_overrides_of_a_map_are_the_same_as_texts() -> None:
+    formation = {"shape": "line", "spacing_m": 10}
+    overrides = {
+        "name": "on",
+        "description": "a: b, é # 1",
+        "duration_s": 1.5,
+        "fleet.formation": formation,
+        "expect": [],
+    }
+    sections = {"name": "a", "radio": {"tx_power_dbm": 1}}
+    assert build(sections, as_texts(overrides)) == build(sections, overrides)
+    assert as_texts(["duration_s=3"]) == ["duration_s=3"]
