@@ -12,7 +12,7 @@ def stream(seed: int, replication: int, entity: int | tuple[int, ...], purpose: 
 
     Args:
         seed: the scenario's seed, ≥ 0.
-        replication: the replication number of a campaign, ≥ 0.
+        replication: the replication number of a campaign, from 0 to 2³² − 1; a larger one shares numbers with other seeds.
         entity: whose stream it is: a drone id, a pair of ids for a link, or () for the scene.
         purpose: what is drawn ("shadowing", "gust", ...); two purposes share no numbers.
 

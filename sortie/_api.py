@@ -39,7 +39,6 @@ ScenarioLike = str | Path | Mapping[str, object] | Scenario
 """A library scenario's name, a file, plain sections, or a scenario that was loaded before."""
 PolicyLike = str | Policy
 """A name, `name(key=value)`, `path/to/file.py:function`, or any callable of one FleetView."""
-MAX_SEED = 2**63 - 1
 
 
 def load(scenario: ScenarioLike, overrides: Overrides = ()) -> Scenario:
@@ -62,12 +61,7 @@ def load(scenario: ScenarioLike, overrides: Overrides = ()) -> Scenario:
         >>> sortie.load({"name": "mine", "duration_s": 5}).frames
         50
     """
-    if (
-        isinstance(overrides, str)
-        or not isinstance(overrides, Mapping | Sequence)
-        or (not isinstance(overrides, Mapping) and not all(isinstance(entry, str) for entry in overrides))
-    ):
-        raise ScenarioError(f"overrides: {overrides!r}, must be a map or a list: {{'fleet.drones': 3}}")
+    _ensure_overrides(overrides)
     if isinstance(scenario, str | os.PathLike):
         return reading.load(os.fspath(scenario), overrides)
     if isinstance(scenario, Scenario):
@@ -119,7 +113,7 @@ def fly(
     from sortie.sim.engine.sortie import run_sortie
 
     chosen, function = _with_policy(load(scenario, overrides), policy)
-    seed, replication = _whole("seed", seed), _whole("replication", replication) or 0
+    seed, replication = _whole("seed", seed), _whole("replication", replication, 32) or 0
     _ensure_callable("progress", progress)
     if observer is not None and not all(callable(getattr(observer, name, None)) for name in ("begin", "second")):
         raise ScenarioError(f"observer: {observer!r}, must have the methods begin and second")
@@ -226,7 +220,7 @@ def compare(
     own_fusion: bool = False,
     progress: Callable[[str, int, float], None] | None = None,
     half_width: float | None = None,
-    metric: str = "ap50.full_scene",
+    metric: str | None = None,
     pilot: int | None = None,
     most_seeds: int | None = None,
     kept: str | Path | bool = False,
@@ -249,7 +243,7 @@ def compare(
             stage, the number of seeds flown in it, and the number of all its seeds.
         half_width: fly until the 95 % interval of every gain in `metric` reaches at most this far to each side, in AP: 0.01
             is one AP point. Scored by the scenario's detector, or by torch if that is the surrogate. Not with `seeds`.
-        metric: `ap50.full_scene` or `ap50.mission`.
+        metric: `ap50.full_scene` (None) or `ap50.mission`.
         pilot: the seeds that both detectors fly before the rest is planned; None is 12.
         most_seeds: the seeds that the torch detector flies at most; None is 200. `precision.reached` says whether that
             was enough.
@@ -286,7 +280,7 @@ def compare(
         _ensure_callable("progress", progress)
         path = default_path(flown, settings.pilot) if kept is True else as_path("kept", kept) if kept else None
         return Comparison(*compare_to(flown, settings, path, progress))
-    for name, value in (("pilot", pilot), ("most_seeds", most_seeds), ("kept", kept or None)):
+    for name, value in (("metric", metric), ("pilot", pilot), ("most_seeds", most_seeds), ("kept", kept or None)):
         if value is not None:
             raise RunError(f"{name}: goes with half_width, which is missing")
     if isinstance(seeds, Iterable):
@@ -505,7 +499,7 @@ def campaign_folder(name: str) -> Path:
 
 def check(
     scenarios: str | Path | Sequence[str | Path],
-    overrides: Sequence[str] = (),
+    overrides: Overrides = (),
     *,
     update: bool = False,
     progress: Callable[[float], None] | None = None,
@@ -515,7 +509,7 @@ def check(
     Args:
         scenarios: a file, the name of a library scenario, a folder, or a list of these. Of a folder, every scenario
             file below it that has expectations is flown.
-        overrides: fields to change in every scenario, `["fleet.drones=7"]`.
+        overrides: fields to change in every scenario, as for `sortie.load`.
         update: write golden (stored) outcomes instead of comparing with them.
         progress: called with the simulated time of the scenario that flies, s.
 
@@ -538,9 +532,11 @@ def check(
     _ensure_callable("progress", progress)
     chosen = scenarios if isinstance(scenarios, Sequence) and not isinstance(scenarios, str) else [scenarios]
     names = [name for one in chosen for name in scenario_files(as_path("scenarios", one))]
+    _ensure_overrides(overrides)
     for name in names:
         reading.load(name, overrides)  # all of them, before the first one flies
-    return tuple(check_scenario(name, overrides, update=update, progress=progress) for name in names)
+    texts = reading.as_texts(overrides)
+    return tuple(check_scenario(name, texts, update=update, progress=progress) for name in names)
 
 
 @overload
@@ -575,6 +571,15 @@ def env(scenario: ScenarioLike, overrides: Overrides = (), *, team: bool = False
         return TeamEnv(chosen) if team else SortieEnv(chosen)
 
 
+def _ensure_overrides(overrides: Any) -> None:
+    if (
+        isinstance(overrides, str)
+        or not isinstance(overrides, Mapping | Sequence)
+        or (not isinstance(overrides, Mapping) and not all(isinstance(entry, str) for entry in overrides))
+    ):
+        raise ScenarioError(f"overrides: {overrides!r}, must be a map or a list: {{'fleet.drones': 3}}")
+
+
 def _with_policy(scenario: Scenario, policy: PolicyLike | None) -> tuple[Scenario, Policy | None]:
     """The scenario to fly, and the callable that decides in place of its policy; None where the scenario's own does."""
     if policy is None:
@@ -599,7 +604,7 @@ def label(policy: PolicyLike) -> str:
 
 def _precision_settings(half_width: Any, seeds: object, metric: Any, pilot: Any, most_seeds: Any) -> Settings:
     """The arguments of a comparison to a half-width, checked."""
-    from sortie.sim.studies.multifidelity import MOST, PILOT, Settings
+    from sortie.sim.studies.multifidelity import METRICS, MOST, PILOT, Settings
 
     if seeds is not None:
         raise RunError("seeds and half_width: name one of them; a half-width chooses its number of seeds")
@@ -607,15 +612,16 @@ def _precision_settings(half_width: Any, seeds: object, metric: Any, pilot: Any,
         raise RunError(f"half_width: {half_width!r}, must be a number above 0 and below 1; 0.01 is one AP point")
     first, most = _whole("pilot", pilot), _whole("most_seeds", most_seeds)
     most = MOST if most is None else most
+    metric = METRICS[0] if metric is None else metric
     return Settings(float(half_width), metric, min(PILOT, most) if first is None else first, most)
 
 
-def _whole(name: str, value: Any) -> int | None:
+def _whole(name: str, value: Any, bits: int = 63) -> int | None:
     """A seed or a replication as Python's own whole number, also from numpy's; None stays."""
     if value is None:
         return None
-    if isinstance(value, bool) or not hasattr(value, "__index__") or not 0 <= operator.index(value) <= MAX_SEED:
-        raise ScenarioError(f"{name}: {value!r}, must be a whole number from 0 to 2^63 - 1")
+    if isinstance(value, bool) or not hasattr(value, "__index__") or not 0 <= operator.index(value) < 2**bits:
+        raise ScenarioError(f"{name}: {value!r}, must be a whole number from 0 to 2^{bits} - 1")
     return operator.index(value)
 
 

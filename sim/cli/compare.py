@@ -18,7 +18,6 @@ from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, load
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
 from sortie.sim.studies.compare import Flown, chosen_seeds, in_town_of
 from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
-from sortie.sim.studies.multifidelity import METRICS
 
 PRECISE = ("metric", "pilot", "most_seeds", "kept")
 """Options that go with --half-width."""
@@ -112,7 +111,7 @@ def compare(
         with stages() as stage_bar:
             compared = sortie.compare(
                 scenario, labels, [*(set_ or []), *first], own_fusion=own_fusion,
-                progress=lambda stage, done, of: stage_bar(stage, done, round(of)), half_width=half_width, metric=metric or METRICS[0], pilot=pilot, most_seeds=most_seeds,
+                progress=lambda stage, done, of: stage_bar(stage, done, round(of)), half_width=half_width, metric=metric, pilot=pilot, most_seeds=most_seeds,
                 kept=kept or True,
             )  # fmt: skip
     else:

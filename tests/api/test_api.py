@@ -357,6 +357,14 @@ def test_a_folder_is_checked_whole(tmp_path: Path) -> None:
     assert (len(a.failed), len(b.failed)) == (0, 1)
 
 
+def test_a_failure_of_a_check_with_a_map_of_overrides_is_replayed_with_these_overrides(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("name: a\nexpect: [{metric: bytes.data_sent, at_least: 1.0e+15}]\n")
+    (checked,) = sortie.check(str(tmp_path / "a.yaml"), {"duration_s": 1, "perception.detector": "none"})
+    (failed,) = checked.failed
+    overrides = "--set duration_s=1 --set 'perception.detector=\"none\"'"
+    assert checked.replay(failed) == f"sortie fly {tmp_path / 'a.yaml'} {overrides} --view"
+
+
 def test_the_copy_in_a_runs_folder_is_no_scenario_to_check(tmp_path: Path) -> None:
     """It would fly again, shortened or not, whenever someone runs pytest beside a folder of runs."""
     sortie.fly("track_target", {"duration_s": 1, "perception.detector": "none"}).save(tmp_path / "a", recording=False)
@@ -411,6 +419,9 @@ WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "seeds and a half-width": (lambda: sortie.compare("track_target", ["worked"], seeds=3, half_width=0.1), sortie.RunError, "seeds and half_width: name one of them"),
     "a half-width as text": (lambda: sortie.compare("track_target", ["worked"], half_width="1"), sortie.RunError, "half_width: '1', must be a number above 0 and below 1; 0.01 is one AP point"),  # type: ignore[arg-type]
     "a pilot alone": (lambda: sortie.compare("track_target", ["worked"], pilot=8), sortie.RunError, "pilot: goes with half_width, which is missing"),
+    "a metric alone": (lambda: sortie.compare("track_target", ["worked"], metric="ap50.mission"), sortie.RunError, "metric: goes with half_width, which is missing"),
+    "a replication past 32 bits": (lambda: sortie.fly("track_target", replication=2**32), sortie.ScenarioError, "replication: 4294967296, must be a whole number from 0 to 2^32 - 1"),
+    "text for overrides of a check": (lambda: sortie.check("track_target", "duration_s=1"), sortie.ScenarioError, "overrides: 'duration_s=1', must be a map or a list"),
     "a metric of a half-width": (lambda: sortie.compare("track_target", ["worked"], half_width=0.1, metric="ap"), sortie.RunError, "metric: ap, must be one of ap50.full_scene, ap50.mission"),
     "no seeds": (lambda: sortie.compare("track_target", ["worked"], seeds=0), sortie.ScenarioError, "seeds: 0, must be a list of seeds or how many, 1 or more"),
     "seeds and a half": (lambda: sortie.compare("track_target", ["worked"], seeds=1.5), sortie.ScenarioError, "seeds: 1.5, must be a list of seeds or how many"),  # type: ignore[arg-type]
