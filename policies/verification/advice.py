@@ -9,6 +9,7 @@ _ADVICE = (
     ("uses the text of", "put numbers into the reason alone"),
     ("is not a policy of Sortie", "verify it as file.py:function"),
     ("remembers", "decide from the view alone; damping keeps what was decided before"),
+    ("changes the global", "decide from the view alone, and keep functions that change globals in another file"),
     ("identity", "compare values with =="),
     ("keeps results", "leave the cache away"),
     ("for more than arithmetic", "use comparisons, + - * / with constants, min, max, int, floor, ceil or sqrt"),

@@ -197,7 +197,7 @@ class Checks(ast.NodeTransformer):
         return node
 
     def visit_Global(self, node: ast.Global) -> ast.AST:
-        raise SyntaxError(f"changes the global {node.names[0]}")
+        raise SyntaxError(f"changes the global {node.names[0]} in line {node.lineno}")
 
     def visit_AsyncFunctionDef(self, node: ast.AsyncFunctionDef) -> ast.AST:
         raise SyntaxError("has asynchronous code")
