@@ -38,6 +38,7 @@ MOST_TUPLES = 400
 """Combinations of directives of all links on which a line over all links is judged in one cell."""
 MOST_DIRECTIVES = 40
 MOST_COUNT = 9
+"""Up to so many changes of a link are judged; a sequence that has more within the span ends the proof."""
 _REGION = Disc(0.0, 0.0, 32.0)
 
 
@@ -294,8 +295,9 @@ class _Checker:
             for _, move in moves:
                 changed = move.climbs if self._change == "climbs_in" else move.switches
                 changes = (*changes, 0) if self._change and changed else changes
-                count = min(MOST_COUNT, len(changes))
-                broken = (move.enforced, count) in letter.broken
+                if len(changes) > MOST_COUNT:
+                    raise NotFinite(f"a link changes more than {MOST_COUNT} times within {self._span_s:g} s")
+                broken = (move.enforced, len(changes)) in letter.broken
             broken = broken if moves else False
         else:
             broken = tuple([move.enforced for _, move in moves]) in letter.broken
