@@ -40,6 +40,8 @@ _SOC = (0.05, 0.2999, 0.3, 0.5999, 0.6, 0.9, 1.0)
 _GOODPUT_MBPS = (0.0, 1.0, 4.99, 5.0, 20.0, 50.0, 600.0)
 LATENCY_FRAMES = 0.2
 """Age of a descriptor that arrived, in frames."""
+REGIONS_APART_M = 50.0
+"""Each drone has a region of its own, beside that of the drone before."""
 _PLAIN_PLACE = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -95,7 +97,7 @@ class Course(NamedTuple):
             coverage_grid=bytes(COVERAGE_BYTES),
             novelty_flags=PERSON_FLAG * bool(value("person", i)),
             task_phase=TaskPhase(int(value("phase", i))),
-            region=Disc(0.0, 0.0, 32.0) if value("region", i) else None,
+            region=Disc(REGIONS_APART_M * i, 0.0, 32.0) if value("region", i) else None,
             priority_target_ids=(7,) if value("targets", i) else (),
         )
 

@@ -99,7 +99,7 @@ class FleetOfRanges:
         descriptors = {}
         for i in self.heard:
             region = path.picks.get(f"region of drone {i}", False)
-            names = [f"region {part} of drone {i}" for part in ("x_m", "y_m", "radius_m")]
+            names = region_axes(i)
             targets = number(f"targets of drone {i}", 0)
             descriptors[i] = Descriptor(
                 stamp_ns=0,
@@ -331,6 +331,11 @@ def _order_of(receiver: int) -> str:
 def goodput_axis(source: int, destination: int) -> str:
     """The name of a goodput's axis."""
     return f"goodput of drone {source} to drone {destination}"
+
+
+def region_axes(drone: int) -> list[str]:
+    """The names of the axes of a drone's region."""
+    return [f"region {part} of drone {drone}" for part in Disc._fields]
 
 
 def _in_any_order(system: FleetOfRanges, content: Mapping[int, Any]) -> Mapping[int, Any]:

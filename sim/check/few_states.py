@@ -26,7 +26,7 @@ from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.enforced import effective
 from sortie.policies.verification.invariants import Invariant, LinksTerm, Recent, violations
 from sortie.policies.verification.past import ROUNDING_S
-from sortie.policies.verification.ranges import FleetOfRanges
+from sortie.policies.verification.ranges import FleetOfRanges, region_axes
 from sortie.policies.verification.search import Budget, Run, rosters
 from sortie.policies.verification.subject import searchable
 from sortie.policies.verification.symbols import Path, Ranged, Refused, explore
@@ -158,7 +158,7 @@ def _letters_of(
         wrong = find_inexact(answer)
         if wrong is not None:
             raise NotFinite(f"it breaks the contract: {wrong}")
-        asked = {d.destination: _plain(d) for d in answer}
+        asked = {d.destination: _plain(d, view.ego) for d in answer}
         links = []
         for peer in decided.system.peers:
             fidelity = health(
@@ -212,13 +212,13 @@ def _bare(d: Directive) -> Directive:
     return d._replace(source=0, destination=0, reason="")
 
 
-def _plain(d: Directive) -> Directive:
-    """A directive of plain values; a region is the one region."""
-    roi = d.roi
+def _plain(d: Directive, ego: int) -> Directive:
+    """A directive of plain values; the ego's own region, as it is, is the one region."""
+    roi: Any = d.roi
     if roi is not None:
-        named = [part._axis.startswith("region ") if isinstance(part, Ranged) else False for part in roi]
-        if not all(named):
-            raise NotFinite("its directives have regions other than a drone's own")
+        own = [(axis, ()) for axis in region_axes(ego)]
+        if [(part._axis, part._steps) for part in roi if isinstance(part, Ranged)] != own:
+            raise NotFinite("its directives have regions other than the drone's own")
         d = d._replace(roi=_REGION)
     if any(isinstance(value, Ranged) for value in tuple.__iter__(d._replace(reason=""))):
         raise NotFinite("its directives take too many values: a number of the view goes into them")

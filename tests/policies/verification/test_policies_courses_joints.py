@@ -68,7 +68,7 @@ def test_the_views_of_a_course_by_hand() -> None:
     assert [v.descriptors[2].novelty_flags for v in views] == [0] + [PERSON_FLAG] * 5
     last = views[-1].descriptors
     assert (last[1].cpu_headroom, last[1].gpu_headroom) == (0.25, 0.75)
-    assert (last[0].region, last[1].region) == (None, Disc(0.0, 0.0, 32.0))
+    assert (last[0].region, last[1].region) == (None, Disc(50.0, 0.0, 32.0))
     assert [bool(last[i].priority_target_ids) for i in range(3)] == [False, True, False]
     assert [last[i].peer_goodput_mbps for i in range(3)] == [(50.0, 20.0), (50.0, 50.0), (5.0, 50.0)]
     assert last[1].position_m == pytest.approx((10.5, 19.0, 60.0))

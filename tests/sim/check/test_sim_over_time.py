@@ -19,7 +19,7 @@ from sortie.sim.engine.sortie import run_sortie
 TIMES = PlaneTimes(0.1, 0.1, 0.4, 3.0, 10.0, shielded=False)
 STILL = Course(3, 30, 0.1, 0.1, 10.0, {}, {})
 POLICIES = """
-from sortie import Directive, Representation
+from sortie import Directive, Representation, TaskPhase
 
 def send(view, rate_hz):
     rung = Representation.DETECTIONS if rate_hz else Representation.NONE
@@ -33,6 +33,28 @@ def silent_when_tired(view):
 
 def by_charge(view):
     return send(view, 30.0 * view.me.battery_soc if view.me is not None else 0.0)
+
+def hasty(view):
+    me = view.me
+    late_s = 0.1 if me is not None and me.task_phase == TaskPhase.TRACK else 0.2
+    return [d._replace(deadline_s=late_s) for d in send(view, 2.0)]
+
+def within(view, region_of):
+    me = view.me
+    if me is None or any(view.descriptors[i].region is None for i in view.descriptors):
+        return send(view, 0.0)
+    return [d._replace(roi=region_of(d.destination)) for d in send(view, 2.0)]
+
+def own_region(view):
+    return within(view, lambda peer: view.me.region)
+
+def one_of_two_regions(view):
+    searching = view.me is not None and view.me.task_phase == TaskPhase.SEARCH
+    return within(view, lambda peer: view.me.region if searching else view.descriptors[peer].region)
+
+def moved_region(view):
+    far_m = 100.0 if view.me is not None and view.me.task_phase == TaskPhase.TRACK else 0.0
+    return within(view, lambda peer: view.me.region._replace(x_m=view.me.region.x_m + far_m))
 
 def flips(view):
     return send(view, 0.0 if any(view.me.goodput_to(p) < 33.0 for p in view.peers) else 5.0)
@@ -79,6 +101,8 @@ def test_a_flight_of_a_course_enforces_what_the_loop_enforces(policy: str, shiel
         ("two_rates", "climbs_in(dwell) <= 1", "proved"),
         ("flips", "climbs_in(4) <= 1", "refuted"),
         ("by_charge", "climbs_in(dwell) <= 1", "searched"),
+        ("own_region", "climbs_in(dwell) <= 1", "proved"),
+        ("one_of_two_regions", "switches_in(0.5) <= 2", "refuted"),
     ],
 )
 def test_the_verdict_of_a_line_about_time(name: str, line: str, outcome: str, file: Path) -> None:
@@ -110,6 +134,9 @@ def test_a_largest_fleet_of_one_drone_counts_as_two_because_one_has_no_link(file
         ("two_rates", "within 0.7 s: rate_hz > 0", "a sequence of views breaks it"),
         ("two_rates", "when peers >= 1: within 0.3 s: any_link(rate_hz > 0)", "a sequence of views breaks it"),
         ("two_rates", "rate_hz <= fresh.rate_hz and climbs_in(1) <= 9", "fresh directives"),
+        ("hasty", "switches_in(1.2) <= 9", "a link changes more than 9 times within 1.2 s"),
+        ("one_of_two_regions", "switches_in(0.5) <= 2", "regions other than the drone's own"),
+        ("moved_region", "switches_in(0.5) <= 2", "regions other than the drone's own"),
         ("two_rates", "count_links(climbs_in(1) > 1) <= 1", "counts of changes together with functions over links"),
     ],
 )
