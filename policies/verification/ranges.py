@@ -316,6 +316,11 @@ class ViewOfRanges(FleetView):
             }
         return FleetView._replace(self, **fields)
 
+    @property
+    def attached(self) -> FleetView:
+        near: FleetView = FleetView.attached.fget(self)  # type: ignore[attr-defined]
+        return self if near is self else self._replace(descriptors=near.descriptors, age_s=near.age_s)
+
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
         return FleetView

@@ -315,6 +315,8 @@ OUTSIDE = {
     "starred set": "bad = [*{'a', 'b', 'c'}][0] == 'c' and soc == 0.4",
     "order of drones": "bad = list(view.descriptors)[0] == view.peers[-1] and soc == 0.4",
     "order of ages": "bad = next(iter(view.age_s)) != min(view.age_s) and soc == 0.4",
+    "order of the attached": "near = view.attached.descriptors\nbad = len(near) < len(view.descriptors) and next(iter(near)) != min(near) and soc == 0.4",
+    "order of attached ages": "ages = view.attached.age_s\nbad = len(ages) < len(view.age_s) and [*ages.items()] != sorted(ages.items()) and soc == 0.4",
     "order of items": "for p, d in view.descriptors.items():\n    bad = p == max(view.descriptors) and soc == 0.4\n    break",
     "imported at run time": "import importlib\nbad = importlib.import_module('time').time() % 1000 < 1e-6",
     "by __import__": "bad = __import__('time').time() % 1000 < 1e-6",
