@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import sys
 import types
 from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable
 from enum import Enum
+from string import Formatter
 from typing import Any
 
 from sortie.policies.verification.outside import Outside, Unknown
@@ -176,9 +178,22 @@ def _stands_for_text(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any
         return _checked(function(*args, **kwargs))
     if isinstance(found, Text | Ranged):
         if function.__name__ == "format":  # what is wrong with a number of this type must raise
+            if _takes_apart(function.__self__):
+                stop(FORM_BY_VALUE)
             function(*map(_example, args), **{name: _example(value) for name, value in kwargs.items()})
         return Text(found._path, found._axis, "text with a number")
     return stop("makes text of what is known as a range alone")
+
+
+FORM_BY_VALUE = "lets a number of the view decide the form of a text"
+"""By a width that is a value, a part of a value, or a character: whether that is possible depends on the number."""
+_PERCENT_APART = re.compile(r"%[^a-zA-Z%]*(\*|[hlL]?c)")
+
+
+def _takes_apart(template: str) -> bool:
+    """Whether a template of `str.format` does more than write its values."""
+    fields = [(name or "", spec or "") for _, name, spec, _ in Formatter().parse(template)]
+    return any("." in name or "[" in name or "{" in spec or spec[-1:] == "c" for name, spec in fields)
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -207,6 +222,8 @@ def _text_of(write: Callable[[Any], str]) -> Callable[..., Any]:
 
 
 def _format(value: Any, spec: Any = "") -> Any:
+    if _is_stand_in(spec) or (_is_stand_in(value) and spec[-1:] == "c"):
+        stop(FORM_BY_VALUE)
     return value._text(spec) if isinstance(value, Text | Ranged) else _checked(format(value, spec))
 
 
@@ -229,8 +246,11 @@ def _text(*parts: Any) -> Any:
 
 
 def _percent(left: Any, right: Any) -> Any:
-    if type(left) in (str, bytes) and any(map(_has_text, right if type(right) is tuple else (right,))):
-        found = next((p for p in (right if type(right) is tuple else (right,)) if isinstance(p, Text | Ranged)), None)
+    parts = right if type(right) is tuple else (right,)
+    if type(left) in (str, bytes) and any(map(_has_text, parts)):
+        found = next((p for p in parts if isinstance(p, Text | Ranged)), None)
+        if _PERCENT_APART.search(repr(left)) and not all(isinstance(p, float) for p in parts):  # floats raise TypeError
+            stop(FORM_BY_VALUE)
         left % (tuple(map(_example, right)) if type(right) is tuple else _example(right))
         return stop("makes text of a range") if found is None else Text(found._path, found._axis, "text with a number")
     return _checked(left % right)

@@ -17,6 +17,10 @@ TEXTS = (
     "try:\n    bad = complex(str(soc)) == K\nexcept ValueError:\n    pass", "try:\n    bad = int(f'{soc * 1e7:.0f}', 16) == 0x4123457\nexcept ValueError:\n    pass",
     "class T(str):\n    pass\nbad = T(soc) == 'K'", "e = ValueError(str(soc))\nbad = repr(e) == \"ValueError('K')\"", "bad = soc <= 0 and f'{soc}' == '-0.0'",
     "try:\n    '{:d}'.format(soc)\nexcept ValueError:\n    bad = 0.4 < soc < 0.4000001", "try:\n    '%c' % soc\nexcept TypeError:\n    bad = 0.4 < soc < 0.4000001",
+    "try:\n    bad = not f\"{'x':.{int(soc * 1e7) - 4123457}}\"\nexcept ValueError:\n    pass",
+    "try:\n    bad = not format('x', f'.{int(soc * 1e7) - 4123457}')\nexcept ValueError:\n    pass",
+    "try:\n    bad = not '{:.{}}'.format('x', int(soc * 1e7) - 4123457)\nexcept ValueError:\n    pass",
+    "bad = not '%.*s' % (int(soc * 1e7) - 4123457, 'x') and 0.41 < soc < 0.4124", "try:\n    bad = bool('{0[20]}'.format(str(soc)))\nexcept IndexError:\n    pass",
     "bad = me.novelty_flags == 129.0 and soc == K", "out = []\nclass C:\n    x: out.append(soc.hex() == (K).hex()) = 1\nbad = out[0]",
 )  # fmt: skip
 """The text of a number, read by compiled code; and two other things that a stand-in answered otherwise."""
