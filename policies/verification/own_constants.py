@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sortie.policies.contract import FleetView
-from sortie.policies.verification.views import LARGEST, MAX_DRONES, draw_view
+from sortie.policies.verification.views import LARGEST, LONGEST_S, MAX_DRONES, draw_view
 from sortie.scenarios.streams import stream
 
 MOST_SIZES = 12
@@ -63,7 +63,7 @@ def _moved(view: FleetView, constants: Sequence[float], rng: np.random.Generator
         if i != ego and not together:
             continue
         changed: dict[str, Any] = {field: x for field in _SHARES if (x := near(0, 1)) is not None}
-        goodput, age_s, flags = near(0, 1e5), near(0, 3600), near(0, 255)
+        goodput, age_s, flags = near(0, 1e5), near(0, LONGEST_S), near(0, 255)
         if goodput is not None:
             changed["peer_goodput_mbps"] = (goodput,) * len(d.peer_goodput_mbps)
         if flags is not None and rng.random() < 0.3:

@@ -8,7 +8,7 @@ heard, every order of the drones in the view, and
 |---|---|
 | charge and headrooms | every float of 0 … 1 |
 | goodput | every float of 0 … 10⁵ Mb/s |
-| ages | every float of 0 … 3600 s |
+| ages | every float of 0 … 7200 s, the longest sortie |
 | phase, region | all five; none, or any disc within 100 km |
 | novelty flags, target ids | every byte; how many, 0 … 16 |
 | positions, footprints | every order of the peers by `peers_by_overlap`, through which alone they may be read |

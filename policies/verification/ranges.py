@@ -24,7 +24,7 @@ from sortie.policies.verification.stand_ins import (
     space_of,
 )
 from sortie.policies.verification.symbols import Path, Ranged
-from sortie.policies.verification.views import OTHER_CODEBOOK
+from sortie.policies.verification.views import LONGEST_S, OTHER_CODEBOOK
 from sortie.scenarios.disc import disc_overlap
 from sortie.scenarios.link_state import state_of
 
@@ -32,7 +32,7 @@ Choose = Callable[[str, float, float], float]
 """Picks a number of an axis between its bounds."""
 
 _FOOTPRINT_M = 42.0
-_SEARCHED_UP_TO: dict[str, float] = {"goodput": 1e5, "age": 3600.0}
+_SEARCHED_UP_TO: dict[str, float] = {"goodput": 1e5, "age": LONGEST_S}
 
 
 class FleetOfRanges:

@@ -22,12 +22,21 @@ from sortie.policies.contract import (
 )
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS
-from sortie.scenarios.schema import Fleet
+from sortie.scenarios.schema import Fleet, Scenario, Section
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
-LARGEST: int = next(bound.le for bound in Fleet.model_fields["drones"].metadata if hasattr(bound, "le"))
+
+
+def _most(section: type[Section], field: str) -> Any:
+    """The upper bound of a scenario's field."""
+    return next(bound.le for bound in section.model_fields[field].metadata if hasattr(bound, "le"))
+
+
+LARGEST: int = _most(Fleet, "drones")
 """The largest fleet that a scenario may have."""
+LONGEST_S = float(_most(Scenario, "duration_s"))
+"""The longest sortie, and so the greatest age of a descriptor."""
 GONE = "detached_after_periods"
 OTHER_CODEBOOK = "0" * 14
 """A digest that is not the fleet's common one: 7 bytes, as a descriptor has them."""

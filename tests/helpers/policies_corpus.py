@@ -56,6 +56,7 @@ WHOLE = {
     "minus whole": "bad = 1 - soc == 0",
     "over whole": "bad = 1 < first / 7 < 2",
     "age": "bad = 3 < view.age_s[view.peers[0]] < 4",
+    "age after an hour": "bad = view.age_s[view.peers[0]] > 4000",
     "targets": "bad = len(me.priority_target_ids) == 7",
     "targets more": "bad = len(me.priority_target_ids) > 15",
     "enum": "bad = soc >= TaskPhase.SEARCH",
