@@ -32,7 +32,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from sortie.policies.checks import check_directives, find_inexact, find_wrong_type
-from sortie.policies.contract import Directive, FleetView, Policy, PolicyError
+from sortie.policies.contract import DETACHED_AFTER_PERIODS, Directive, FleetView, Policy, PolicyError
 from sortie.policies.verification.advice import advise
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.conformance import missing_links, older_views, raised_part, without_detached
@@ -242,9 +242,11 @@ class _Coverage:
         spent = f"the time of {self.budget.budget_s:g} s ended in fleets of {self.drones + 1}" if self.stopped else ""
         if self.drones < min(2, self.asked):
             return "searched", f"{found.cells} cells; {spent}"
-        cells = f"all views of up to {self.drones} drones, at a period of {self.period_s:g} s, {found.cells} cells" + (
-            f"; {spent}" if spent else ""
+        gone = f"detached after {DETACHED_AFTER_PERIODS:g} periods"
+        cells = (
+            f"all views of up to {self.drones} drones, at a period of {self.period_s:g} s, {gone}, {found.cells} cells"
         )
+        cells += f"; {spent}" if spent else ""
         return ("proved" if self.exact else "proved over the reals"), cells
 
 

@@ -83,7 +83,8 @@ def draw_view(seed: int, number: int, drones: int | None = None) -> FleetView:
         descriptors = {i: d.with_roster(Roster(int(rng.integers(9)), members)) for i, d in descriptors.items()}
     if rng.random() < 0.25:  # and some codes are of another codebook
         descriptors = {i: d._replace(codebook=_one_of(rng, ("", OTHER_CODEBOOK))) for i, d in descriptors.items()}
-    return FleetView(ego, period_s, descriptors, age_s)
+    gone_after = _one_of(rng, (4.0, 20.0, 1000.0)) if rng.random() < 0.25 else DETACHED_AFTER_PERIODS
+    return FleetView(ego, period_s, descriptors, age_s, gone_after)
 
 
 def draw_views(seed: int, count: int) -> Iterator[FleetView]:
@@ -162,6 +163,7 @@ def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
             return True
         return False
 
+    kept(view._replace(detached_after_periods=DETACHED_AFTER_PERIODS))
     for peer in view.peers:
         kept(view._replace(descriptors=_without(view.descriptors, peer), age_s=_without(view.age_s, peer)))
     for i in list(view.descriptors):

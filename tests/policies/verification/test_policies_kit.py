@@ -242,6 +242,7 @@ def test_drawn_views_repeat_and_cover_what_a_plane_may_hand_over() -> None:
     assert any(d.region and math.dist(d.region[:2], d.position_m[:2]) < d.region.radius_m for _, d in drones)
     assert any(d.priority_target_ids for _, d in drones)
     assert any(list(v.descriptors) != sorted(v.descriptors) for v in views), "any order"
+    assert {v.detached_after_periods for v in views} == {4.0, 10.0, 20.0, 1000.0}
 
 
 @pytest.mark.parametrize("number", range(30))

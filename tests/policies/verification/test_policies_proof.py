@@ -169,9 +169,20 @@ def test_a_line_that_larger_fleets_break_is_not_proved_for_them() -> None:
     assert len(verdict.counterexample.descriptors) == 4
 
 
-def test_a_proof_says_how_large_the_fleets_are() -> None:
+def test_a_proof_says_how_large_the_fleets_are_and_when_a_peer_is_detached() -> None:
     verdict = quick(everyone, "count_links(representation > none) <= 2", views=0)[-1]
-    assert (verdict.outcome, verdict.what.partition(",")[0]) == ("proved", "all views of up to 2 drones")
+    covered = "all views of up to 2 drones, at a period of 0.1 s, detached after 10 periods"
+    assert (verdict.outcome, verdict.what.rpartition(", ")[0]) == ("proved", covered)
+
+
+def test_a_fault_where_a_peer_is_detached_later_is_found_by_drawn_views() -> None:
+    def decide(view: FleetView) -> list[Directive]:
+        return [d._replace(rate_hz=10.0 if view.detached_after_periods == 20 else 2.0) for d in worked(view)]
+
+    verdict = quick(decide, "rate_hz <= 5", views=30)[-1]
+    assert verdict.outcome == "refuted"
+    assert verdict.counterexample is not None
+    assert verdict.counterexample.detached_after_periods == 20
 
 
 def test_without_the_solver_the_verdict_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
