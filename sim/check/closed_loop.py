@@ -32,6 +32,7 @@ class PlaneTimes:
     degraded_after_periods: float
     detached_after_periods: float
     shielded: bool
+    has_rosters: bool = False
 
     @classmethod
     def of(cls, scenario: Scenario) -> PlaneTimes:
@@ -44,6 +45,7 @@ class PlaneTimes:
             context.degraded_after_periods,
             context.detached_after_periods,
             policy.shield,
+            context.roster,
         )
 
 

@@ -7,7 +7,7 @@ follows every sequence of these combinations, one a frame, with `damp` itself.
 
 A proof covers all sequences of views of fleets up to a size, even those that no flight has: a charge may rise, an age may
 jump. Drones may come into view one by one; none leaves it. While a region exists, it keeps its place and radius. Decisions
-are exactly a frame apart, no shield stands between, and one policy decides for the whole flight.
+are exactly a frame apart, no shield stands between, no drone publishes a roster, and one policy decides for the whole flight.
 """
 
 from __future__ import annotations
@@ -60,11 +60,15 @@ def prove_over_time(policy: Policy, rule: Invariant, times: PlaneTimes, drones: 
     Raises:
         NotFinite: it is not proved; the text says why.
     """
-    if times.shielded or rule.needs_fresh or times.detached_after_periods != DETACHED_AFTER_PERIODS:
-        what = (
-            "a shield" if times.shielded else "fresh directives" if rule.needs_fresh else "another limit of attachment"
-        )
-        raise NotFinite(f"no proof follows {what}")
+    unfollowed = {
+        "a shield": times.shielded,
+        "rosters": times.has_rosters,
+        "fresh directives": rule.needs_fresh,
+        "another limit of attachment": times.detached_after_periods != DETACHED_AFTER_PERIODS,
+    }
+    for what, is_so in unfollowed.items():
+        if is_so:
+            raise NotFinite(f"no proof follows {what}")
     counts = any(isinstance(n, Recent) for n in rule.nodes)
     alone = rule.of_link and not any(isinstance(n, LinksTerm) for n in rule.nodes)
     if counts and (not alone or rule.within is not None):

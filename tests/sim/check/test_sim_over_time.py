@@ -145,6 +145,19 @@ def test_what_no_proof_is_given_for(name: str, line: str, why: str, file: Path) 
         prove_over_time(resolve(f"{file}:{name}"), parse(line)[0], TIMES, 2, Budget(60))
 
 
+@pytest.mark.parametrize(
+    ("overrides", "why"),
+    [("policy.shield", "a shield"), ("context.roster", "rosters"), ("context.detached_after_periods", "another limit")],
+)
+def test_no_proof_follows_what_a_scenario_adds(overrides: str, why: str, file: Path) -> None:
+    value = 20 if overrides.startswith("context.detached") else "true"
+    scenario = loads("name: base", overrides=[f"{overrides}={value}", "policy.invariants='rate_hz <= 30'"])
+    with pytest.raises(NotFinite, match=f"no proof follows {why}"):
+        prove_over_time(
+            resolve(f"{file}:two_rates"), parse("climbs_in(dwell) <= 1")[0], PlaneTimes.of(scenario), 2, Budget(60)
+        )
+
+
 @pytest.mark.parametrize(("limit_s", "is_proved"), [(0.3, False), (0.4, True)])
 def test_the_longest_wait_for_a_link_is_proved_to_the_frame(limit_s: float, is_proved: bool, file: Path) -> None:
     """Dwell 0.4 s: a link that carries nothing and is asked for 2 or 5 Hz from its first decision on waits exactly that."""
