@@ -229,10 +229,14 @@ def _fly(
 
 
 def flights_of(subject: Subject, rule: Invariant, scenario: Scenario, count: int) -> Iterator[Scenario]:
-    """The scenario as it is, then with other seeds and with links that drop for a while."""
+    """The scenario as it is, then with other seeds and with links that drop for a while. The policy decides alone.
+
+    The scenario's own policies (`policy.changes`, those of its makes) and the commands to them do not fly.
+    """
     data = scenario.model_dump(mode="json", exclude_unset=True)
     data["policy"] = data.get("policy", {}) | {
         "name": subject.name, "params": dict(subject.params), "invariants": rule.text,
+        "changes": [], "commands": [], "of_makes": False,
     }  # fmt: skip
     data["expect"] = [{"metric": "policies.invariant_violations", "equals": 0, "because": rule.text}]
     for number in range(count):

@@ -13,7 +13,7 @@ from sortie.policies.verification.search import Budget
 from sortie.scenarios.reading.load import loads
 from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes
 from sortie.sim.check.few_states import NotFinite, prove_over_time
-from sortie.sim.check.over_time import Subject, course_scenario, judge_over_time
+from sortie.sim.check.over_time import Subject, course_scenario, flights_of, judge_over_time
 from sortie.sim.engine.sortie import run_sortie
 
 TIMES = PlaneTimes(0.1, 0.1, 0.4, 3.0, 10.0, shielded=False)
@@ -156,6 +156,18 @@ def test_no_proof_follows_what_a_scenario_adds(overrides: str, why: str, file: P
         prove_over_time(
             resolve(f"{file}:two_rates"), parse("climbs_in(dwell) <= 1")[0], PlaneTimes.of(scenario), 2, Budget(60)
         )
+
+
+def test_the_policies_of_a_scenario_do_not_fly_for_the_one_that_is_verified() -> None:
+    text = """
+name: changing
+fleet: {drones: 2, makes: [{name: quiet, drones: [1], policy: silence}]}
+policy: {changes: [{at_s: 1, name: silence}, {command: hush, name: silence}], commands: [{at_s: 1, command: hush}]}
+"""
+    (rule,) = parse("within 0.5 s: rate_hz > 0")
+    (flown,) = flights_of(Subject(resolve("everyone"), "everyone", {}), rule, loads(text), 1)
+    assert (flown.policy.name, flown.policy.changes, flown.policy.commands) == ("everyone", (), ())
+    assert not flown.policy.of_makes
 
 
 @pytest.mark.parametrize(("limit_s", "is_proved"), [(0.3, False), (0.4, True)])
