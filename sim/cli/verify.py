@@ -22,6 +22,7 @@ from sortie.policies.verification.conformance import VIEWS, Check, conform, fail
 from sortie.policies.verification.invariants import Invariant, InvariantError, parse
 from sortie.policies.verification.proof import BUDGET_S, DRONES, PLANE, ProofVerdict, prove
 from sortie.policies.verification.properties import PROMISES
+from sortie.policies.verification.shield import check_shieldable
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
 from sortie.policies.verification.views import to_json
 from sortie.scenarios.plugins.reference import Params
@@ -107,6 +108,8 @@ def verify(
     rules = _invariants(section.name, decide, invariants)
     _ensure_own(out_dir / slug(policy))
     over_time = [rule for rule in rules if rule.over_time]
+    if flown is not None and flown.policy.shield:
+        _ensure_shieldable(flown, over_time)
     with watched(DECISION_S):
         broken, kept = _try(
             policy, section, decide, [r for r in rules if not r.over_time], drones, budget, views, bool(over_time)
@@ -244,6 +247,17 @@ def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant
         raise RunError(f"{file}: {error.strerror}") from error
     except InvariantError as error:
         raise RunError(f"{source}, {error}") from error
+
+
+def _ensure_shieldable(scenario: Scenario, over_time: Sequence[Invariant]) -> None:
+    """Refuse a scenario with a shield for a line about time that no shield can keep."""
+    for rule in over_time:
+        try:
+            check_shieldable([rule])
+        except InvariantError:
+            raise RunError(
+                f"policy.shield of {scenario.name} is true, must be false for {rule.text!r}: no shield can keep such a line"
+            ) from None
 
 
 def _counterexamples(

@@ -109,6 +109,30 @@ def test_invariants_may_come_from_a_file(faulty: Path, tmp_path: Path, capsys: p
     assert "line 1, 'rate_hz <=': 'rate_hz <=' is not an expression" in capsys.readouterr().err
 
 
+def test_a_file_of_invariants_is_utf8_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rules = tmp_path / "rules.txt"
+    rules.write_bytes(b"rate_hz <= 5 # \xff\n")
+    assert command("verify", "worked", *QUICK, "--invariants", rules, "--out", tmp_path / "out") == 2
+    assert capsys.readouterr().err == f"error: {rules}: byte 0xff is not UTF-8 text\n"
+    rules.write_text("rate_hz <= 5\nrate_hz <=\n", "utf-8-sig")
+    assert command("verify", "worked", *QUICK, "--invariants", rules, "--out", tmp_path / "out") == 2
+    assert "line 2, 'rate_hz <='" in capsys.readouterr().err, "a byte order mark is no part of line 1"
+
+
+@pytest.mark.parametrize(
+    "line", ["climbs_in(dwell) <= 1", "within 1 s: count_links(representation >= detections) <= 1"]
+)
+def test_a_line_that_no_shield_keeps_is_refused_before_anything_is_tried(
+    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rules, scenario = tmp_path / "rules.txt", tmp_path / "shielded.yaml"
+    rules.write_text(line)
+    scenario.write_text("name: shielded\npolicy: {shield: true, invariants: 'rate_hz <= 10'}\n")
+    assert command("verify", "worked", "--invariants", rules, "--scenario", scenario, "--out", tmp_path / "out") == 2
+    told = f"policy.shield of shielded is true, must be false for {line!r}: no shield can keep such a line"
+    assert capsys.readouterr() == ("", f"error: {told}\n")
+
+
 @pytest.mark.parametrize("name", ["too_fast", "eager", "forgetful"])
 def test_what_breaks_the_plane_shows_in_flight(name: str, faulty: Path) -> None:
     reference = f"{faulty}:{name}"
