@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -10,7 +11,7 @@ import re
 import types
 from collections.abc import Callable
 from decimal import Decimal
-from enum import Enum
+from enum import Enum, Flag
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -134,6 +135,8 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
     elif isinstance(value, types.ModuleType):
         found = [v for n, v in vars(value).items() if n not in _PYTHONS_OWN] if is_users(value.__name__) else []
     elif isinstance(value, type):
+        if issubclass(value, Flag) and is_users(home_of(value)):
+            _fill_cache(value)
         own = {n: v for n, v in vars(value).items() if _may_change(n, v)} if is_users(home_of(value)) else {}
         found = [*(x for item in own.items() for x in item), *(c for c in value.__mro__[1:] if is_users(home_of(c)))]
         found += [type(value)] if is_users(home_of(type(value))) else []
@@ -152,6 +155,25 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
     else:
         raise Refused(f"keeps a {type(value).__name__} from one decision to the next")
     return tuple([_fingerprint(v, met) for v in found])
+
+
+MOST_FLAGS = 8
+
+
+def _fill_cache(kind: type[Flag]) -> None:
+    """Make every member that `|` and `~` can make: Python keeps each one from its first use on, and that is no memory.
+
+    A class with more than `MOST_FLAGS` flags, or that makes members itself, is left as it is.
+    """
+    flags: list[Flag] = list(kind.__members__.values())
+    if len(flags) > MOST_FLAGS or kind._missing_.__func__ is not Flag._missing_.__func__:  # type: ignore[attr-defined]
+        return
+    values = {0}
+    for flag in flags:
+        values |= {value | flag.value for value in values}
+    for value in values:
+        with contextlib.suppress(ValueError):  # a boundary may forbid it
+            Flag.__invert__(kind(value))
 
 
 _BASES = (

@@ -69,6 +69,8 @@ KEPT = (
     ("class C(functools.partial):\n    pass\nC = C(len)\nC.n = 0", "C.n += 1\nn = C.n"),
     ("import types\nclass C(types.ModuleType):\n    pass\nC = C('x')\nC.n = 0", "C.n += 1\nn = C.n"),
     ("class C(enum.Enum):\n    A = 1\nC.A.n = 0", "C.A.n += 1\nn = C.A.n"),
+    ("class C(enum.Flag):\n    A = 1\n    B = 2\n(C.A | C.B).n = 0", "(C.A | C.B).n += 1\nn = (C.A | C.B).n"),
+    ("class C(enum.IntFlag):\n    A = 1", "C._value2member_map_[len(C._value2member_map_)] = 0\nn = len(C._value2member_map_)"),
     ("C = collections.defaultdict(functools.partial(next, itertools.count()))", "n = C[0]\ndel C[0]"),
     ("", "import hashlib\nA = hashlib.algorithms_available\nA.add(len(A))\nn = len(A)\nA.discard(n - 1) if n > 9999 else None"),
     ("", "from sortie.policies.contract import PHASE_OF as P\nn = P.get('x', 0) + 1\nP['x'] = n"),

@@ -65,6 +65,18 @@ def test_what_changes_is_noticed_wherever_a_function_keeps_it(tmp_path: Path, ke
     assert kept.changed() == "changes it"
 
 
+@pytest.mark.parametrize("kind", ["Flag", "IntFlag"])
+def test_what_python_keeps_of_flags_is_no_memory_and_what_a_policy_keeps_is(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "flags.py"
+    path.write_text(f"import enum\nclass Mode(enum.{kind}):\n    A = 1\n    B = 2\n    C = 4\n")
+    mode = load(path).Mode
+    kept = Kept({"it": mode})
+    assert (mode.A | mode.B) & ~mode.B == mode.A
+    assert kept.changed() == ""
+    (mode.A | mode.B).often = 1
+    assert kept.changed() == "changes it"
+
+
 @pytest.mark.parametrize("body", HARMLESS)
 def test_the_same_words_in_correct_policies_stay_proved(tmp_path: Path, body: str) -> None:
     assert outcome(tmp_path, source(body)) == "proved"
