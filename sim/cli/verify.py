@@ -242,9 +242,11 @@ def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant
     if file is None and own is not None and type(own) is not str:  # a text of another class may read otherwise
         raise RunError(f"{source} is of type {type(own).__name__}, must be text")
     try:
-        return parse(str(own or "") if file is None else file.read_text("utf-8"))
+        return parse(str(own or "") if file is None else file.read_text("utf-8-sig"))
     except OSError as error:
         raise RunError(f"{file}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise RunError(f"{file}: byte 0x{error.object[error.start]:02x} is not UTF-8 text") from None
     except InvariantError as error:
         raise RunError(f"{source}, {error}") from error
 
