@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -75,8 +76,9 @@ def replay_scenario(
 
 
 def slug(rule: str) -> str:
-    """A rule as a name of files and scenarios."""
-    return re.sub(r"[^a-z0-9]+", "_", rule.lower()).strip("_")[:60].rstrip("_") or "rule"
+    """A rule as a name of files and scenarios. A long one is cut, and ends with a digest of all of it."""
+    whole = re.sub(r"[^a-z0-9]+", "_", rule.lower()).strip("_") or "rule"
+    return whole if len(whole) <= 60 else f"{whole[:51]}_{hashlib.sha256(rule.encode()).hexdigest()[:8]}"
 
 
 def unused(folder: Path, stem: str) -> Path:

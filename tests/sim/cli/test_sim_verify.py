@@ -248,6 +248,9 @@ def test_any_view_becomes_a_scenario(phase: TaskPhase) -> None:
 def test_slugs_are_names() -> None:
     assert slug("mine/x.py:decide(rho=0.1)") == "mine_x_py_decide_rho_0_1"
     assert slug("≤") == "rule"
+    long = "a/folder/with/quite/a/long/name/of/a/project/that/has/policies.py"
+    assert slug(f"{long}:first") != slug(f"{long}:second")
+    assert max(len(slug(f"{long}:{name}")) for name in ("first", "second")) <= 60
 
 
 ALIASES = {
