@@ -23,7 +23,7 @@ def plain(directives: object) -> set[Directive]:
 @pytest.mark.parametrize("number", [n for n in range(20) if len(draw_view(5, n).peers) >= 2])
 def test_a_detached_peer_gets_nothing_and_the_rest_is_decided_as_without_it(name: str, number: int) -> None:
     view = draw_view(5, number)
-    view = view._replace(period_s=0.1, age_s=dict.fromkeys(view.age_s, 0.0))
+    view = view._replace(period_s=0.1, age_s=dict.fromkeys(view.age_s, 0.0), detached_after_periods=10.0)
     lost = view.peers[number % len(view.peers)]
     with_lost = view._replace(age_s={**view.age_s, lost: GONE_S})
     without = view._replace(

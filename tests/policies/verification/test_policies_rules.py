@@ -229,7 +229,7 @@ def test_age_never_raises_what_the_plane_enforces(name: str, number: int, data: 
     older = view._replace(age_s={**view.age_s, who: view.age_s[who] + older_s})
 
     def enforced(v: FleetView) -> list[Directive]:
-        links = {p: health(v.age_s[p], v.period_s, 3.0, 10.0) for p in v.peers}
+        links = {p: health(v.age_s[p], v.period_s, 3.0, v.detached_after_periods) for p in v.peers}
         return [cap_by_age(d, links[d.destination], v.age_s[d.destination]) for d in POLICIES[name](v)]
 
     without = without_detached(view, older)
