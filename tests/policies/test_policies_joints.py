@@ -95,7 +95,7 @@ def test_detached_peers_change_nothing_but_their_own_links(name: str) -> None:
             continue
         attached = view.attached.peers
         gone = view.peers[: len(view.peers) // 2]
-        ages = {i: (1e3 if i in gone else 0.0) for i in view.descriptors}
+        ages = {i: (1e4 if i in gone else 0.0) for i in view.descriptors}
         ages[view.ego] = 0.0
         old = view._replace(age_s=ages)
         without = old._replace(
