@@ -36,7 +36,7 @@ class DroneLost(BaseEvent):
 class DroneJoins(BaseEvent):
     kind: Literal["drone_joins"]
     drone: DroneId = Field(
-        description="Who joins the fleet; it is on the ground until then, unless it left or was lost before."
+        description="The drone that joins. It begins on the ground, unless an earlier event made it leave or lost it."
     )
 
 

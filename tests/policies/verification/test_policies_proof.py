@@ -231,10 +231,11 @@ def test_a_call_that_no_search_follows_has_a_hint_of_its_own() -> None:
 def test_a_global_that_another_function_of_the_file_changes_is_named_with_its_line(tmp_path: Path) -> None:
     file = tmp_path / "counts.py"
     file.write_text(
-        "calls = 0\n\ndef debug():\n    global calls\n    calls += 1\n\ndef decide(view):\n    return []\n",
+        "from sortie import Directive\ncalls = 0\n\ndef debug():\n    global calls\n    calls += 1\n\n"
+        "def decide(view):\n    return [Directive(view.ego, p, reason='no') for p in view.peers]\n"
     )
     first = prove(resolve(f"{file}:decide", {}), [], max_drones=2, views=5)[0]
     assert first.what.startswith(
-        "Cannot analyse: it changes the global calls in line 4. To make it provable: decide from the view alone, and keep "
+        "Cannot analyse: it changes the global calls in line 5. To make it provable: decide from the view alone, and keep "
         "functions that change globals in another file"
     )
