@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -429,33 +430,31 @@ def campaign(
     if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 0):
         raise RunError(f"workers: {workers!r}, must be a whole number from 0 on, or None")
     if worker_memory_gb is not None and not (_is_number(worker_memory_gb) and 0 < worker_memory_gb < math.inf):
-        raise RunError(f"worker_memory_gb: {worker_memory_gb!r}, must be above 0, or None")
+        raise RunError(f"worker_memory_gb: {worker_memory_gb!r}, must be a number above 0, or None")
     _ensure_callable("progress", progress)
     _ensure_callable("notice", notice)
     tell = _warn if notice is None else notice
     files = None if security is None else _certificates(security)
+    units = _whole("by_torch", by_torch)
     study = load_campaign(as_path("campaign", campaign))
     folder = campaign_folder(study.campaign.campaign) if out is None else as_path("out", out)
     count = len(os.sched_getaffinity(0)) if workers is None else workers
     with user_errors():
         plan = make_plan(study)
-        parts = [(plan, folder, plan.units)]
-        if by_torch is not None:
-            parts.append((plan_by_torch(study, by_torch, plan), folder / FOLDER, by_torch))
-        for its, where, _ in parts:
-            ensure_usable(where, its)
+        ensure_usable(folder, plan)
+        if units is not None:
+            by_torch_plan = plan_by_torch(study, units, plan)
+            ensure_usable(folder / FOLDER, by_torch_plan)
         with open_engine(
             count, scheduler, security=files, wait_s=wait_for_workers_s, notice=tell,
             memory_b=None if worker_memory_gb is None else round(worker_memory_gb * 1e9),
         ) as engine:  # fmt: skip
             watch = (lambda p: None) if progress is None else progress
-            done = [
-                run_campaign(
-                    its, where, engine, resume_only=resume and where == folder, retry_failed=retry_failed, units=units,
-                    progress=watch, notice=tell,
-                )
-                for its, where, units in parts
-            ]  # fmt: skip
+            how: dict[str, Any] = {"retry_failed": retry_failed, "progress": watch, "notice": tell}
+            done = [run_campaign(plan, folder, engine, resume_only=resume, **how)]
+            if units is not None:  # of those that stop_when left
+                units = min(units, done[0].of // plan.unit_runs)
+                done.append(run_campaign(by_torch_plan, folder / FOLDER, engine, units=units, **how))
     total = (sum(getattr(p, name) for p in done) for name in ("finished", "failed", "flown", "seconds"))
     return CampaignResult(folder, *total)
 
@@ -626,7 +625,7 @@ def _whole(name: str, value: Any, bits: int = 63) -> int | None:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _ensure_callable(name: str, value: object) -> None:

@@ -9,7 +9,9 @@ go together from unit to unit.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -21,10 +23,14 @@ from sortie.scenarios.intervals import Estimate, mean_interval
 from sortie.scenarios.reading.campaign import Study
 from sortie.sim.campaign.plan import CampaignPlan, make_plan
 from sortie.sim.campaign.rows import CampaignRows, read_rows
-from sortie.sim.campaign.store import FILE
+from sortie.sim.campaign.store import FILE, CampaignTable
 from sortie.sim.folders import RunError
 
 FOLDER = "by_torch"
+_DECIDES_DETECTOR = re.compile(
+    r"perception|perception\.(detector|detector_params(\..*)?|weights)|fleet|fleet\.makes(\.\d+(\.(detector|weights))?)?"
+)
+"""Varied fields that may set another detector than the plan's, or what belongs to one detector alone."""
 
 
 def plan_by_torch(study: Study, units: int, plan: CampaignPlan) -> CampaignPlan:
@@ -38,9 +44,15 @@ def plan_by_torch(study: Study, units: int, plan: CampaignPlan) -> CampaignPlan:
         PolicyError: as `make_plan`.
     """
     perception, campaign = study.base.perception, study.campaign
-    if perception.detector != "surrogate" or "perception.detector" in campaign.vary:
-        found = "varied" if "perception.detector" in campaign.vary else perception.detector
-        raise RunError(f"--by-torch: perception.detector is {found}, must be surrogate")
+    if perception.detector != "surrogate":
+        raise RunError(f"--by-torch: perception.detector is {perception.detector}, must be surrogate")
+    if varied := [name for name in campaign.vary if _DECIDES_DETECTOR.fullmatch(name)]:
+        raise RunError(f"--by-torch: {varied[0]} is varied; both detectors must fly the same fleet")
+    for make in study.base.fleet.makes:
+        if make.detector not in (None, "none") or make.weights is not None:
+            raise RunError(
+                f"--by-torch: make {make.name} has a detector or weights of its own; both must fly the same fleet"
+            )
     if not campaign.sample.independent:
         raise RunError(f"--by-torch: sample.method is {campaign.sample.method}, whose means have no intervals")
     if not 2 <= units <= plan.units:
@@ -69,13 +81,16 @@ class Answer(NamedTuple):
 
 
 def read_torch(folder: Path, rows: CampaignRows) -> CampaignRows | None:
-    """The torch detector's rows of a campaign; None where it flew none.
+    """The torch detector's rows of a campaign; None where it has flown no whole unit.
 
     Raises:
         RunError: rows there are broken, or of another campaign or other code.
     """
     if not (folder / FOLDER / FILE).is_file():
         return None
+    with closing(CampaignTable(folder / FOLDER)) as store:  # a part is a unit
+        if all(store.part(n) is None for n in range(store.parts)):
+            return None
     torch = read_rows(folder / FOLDER)
     ours, its = ({**r.plan.spec["campaign"], "stop_when": None} for r in (rows, torch))
     if ours != its or rows.plan.spec["policies"] != torch.plan.spec["policies"]:

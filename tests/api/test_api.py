@@ -434,7 +434,7 @@ WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "negative workers": (lambda: sortie.campaign("link_battery", workers=-1), sortie.RunError, "workers: -1, must be a whole number from 0 on, or None"),
     "a dict that holds itself": (lambda: sortie.load(HOLDS_ITSELF), sortie.ScenarioError, "21 levels deep, must be at most 20"),
     "a deep override": (lambda: sortie.load("track_target", {"fleet": HOLDS_ITSELF}), sortie.ScenarioError, "21 levels deep, must be at most 20"),
-    "memory as text": (lambda: sortie.campaign("link_battery", worker_memory_gb="x"), sortie.RunError, "worker_memory_gb: 'x', must be above 0, or None"),  # type: ignore[arg-type]
+    "memory as text": (lambda: sortie.campaign("link_battery", worker_memory_gb="x"), sortie.RunError, "worker_memory_gb: 'x', must be a number above 0, or None"),  # type: ignore[arg-type]
     "a number for a scheduler": (lambda: sortie.campaign("link_battery", scheduler=5), sortie.RunError, "scheduler: 5, must be an address: 'tcp://host:8786'"),  # type: ignore[arg-type]
     "a number for certificates": (lambda: sortie.campaign("link_battery", security=5), sortie.RunError, "security: 5, must be three paths: CA, certificate, key"),  # type: ignore[arg-type]
     "a progress of a check that is no function": (lambda: sortie.check("track_target", SHORT_TEXTS, progress=5), sortie.ScenarioError, "progress: 5, must be a function, or None"),  # type: ignore[arg-type]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from campaign_examples import BASE, CAMPAIGN, rows_on_disk, table_bytes, write
 
 import sortie
 from sortie.scenarios.control_variates import controlled_mean
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.campaign import load_campaign
 from sortie.sim.campaign import by_torch
 from sortie.sim.campaign.by_torch import answers, depends_on_detector, plan_by_torch, read_torch
@@ -19,6 +21,7 @@ from sortie.sim.campaign.drive import Progress, run_campaign
 from sortie.sim.campaign.plan import CampaignPlan, make_plan
 from sortie.sim.campaign.report import write_report
 from sortie.sim.campaign.rows import read_rows
+from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import RunResult, Task, task_key
 from sortie.sim.folders import RunError
 
@@ -140,7 +143,20 @@ def test_the_report_has_both_and_says_what_depends_on_no_detector(tmp_path: Path
         ),
         (
             METRICS.replace("vary:", "vary:\n  perception.detector: {kind: grid, values: [surrogate, torch]}"),
-            SCORED, 3, "--by-torch: perception.detector is varied, must be surrogate",
+            SCORED, 3, "--by-torch: perception.detector is varied; both detectors must fly the same fleet",
+        ),
+        (
+            METRICS.replace("vary:", "vary:\n  perception: {kind: grid, values: [{detector: surrogate}, {detector: torch}]}"),
+            SCORED, 3, "--by-torch: perception is varied; both detectors must fly the same fleet",
+        ),
+        (
+            METRICS.replace("vary:", "vary:\n  fleet.makes.0.detector: {kind: choice, values: [surrogate, torch]}"),
+            SCORED.replace("{drones: 2}", "{drones: 2, makes: [{name: a, drones: [1]}]}"), 3,
+            "--by-torch: fleet.makes.0.detector is varied; both detectors must fly the same fleet",
+        ),
+        (
+            METRICS, SCORED.replace("{drones: 2}", "{drones: 2, makes: [{name: a, drones: [1], detector: surrogate}]}"), 3,
+            "--by-torch: make a has a detector or weights of its own; both must fly the same fleet",
         ),
     ],
 )  # fmt: skip
@@ -151,6 +167,38 @@ def test_what_cannot_be_estimated_is_refused_before_anything_flies(
         sortie.campaign(write(tmp_path, text, base), out=tmp_path / "c", by_torch=units)
     assert str(error.value) == told
     assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize("units", [2.5, "2", True, -1])
+def test_the_number_of_units_is_a_whole_number(units: object, tmp_path: Path) -> None:
+    with pytest.raises(SortieError, match=rf"^by_torch: {units!r}, must be a whole number from 0 to 2\^63 - 1$"):
+        sortie.campaign(write(tmp_path, METRICS, SCORED), out=tmp_path / "c", by_torch=units)  # type: ignore[arg-type]
+
+
+def test_before_torch_has_flown_a_whole_unit_the_report_is_that_of_the_surrogate(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    plan, torch = plans(tmp_path)
+    run_campaign(plan, tmp_path / "c", TwoDetectors())
+    CampaignStore(tmp_path / "c" / by_torch.FOLDER, torch).close()
+    assert "By the torch detector" not in write_report(tmp_path / "c").read_text()
+
+
+def test_torch_flies_no_more_units_than_stop_when_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten of forty draws are asked of torch, and the campaign stops at three."""
+    engines: list[TwoDetectors] = []
+
+    @contextmanager
+    def open_engine(*args: object, **options: object) -> Iterator[TwoDetectors]:
+        engines.append(TwoDetectors())
+        yield engines[0]
+
+    monkeypatch.setattr("sortie.sim.campaign.engine.open_engine", open_engine)
+    text = METRICS.replace("{count: 6}", "{count: 40}")
+    text += "stop_when: {metric: ap50.full_scene, half_width: 0.9, at_least: 3}\n"
+    done = sortie.campaign(write(tmp_path, text, SCORED), out=tmp_path / "c", by_torch=10)
+    kept, torch = (sortie.open_campaign(folder) for folder in (done.path, done.path / by_torch.FOLDER))
+    assert kept.finished < 40 * 8
+    assert torch.finished == kept.finished // 8 * 8 < 10 * 8
 
 
 def test_another_campaign_s_rows_by_torch_are_refused(tmp_path: Path) -> None:

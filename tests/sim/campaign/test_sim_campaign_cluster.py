@@ -234,7 +234,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tu
             lambda ours, theirs: ["--scheduler", "tls://127.0.0.1:1", "--security", ours[0], ours[1], theirs[2]],
             "--security {cert} {their_key}: not a certificate and its key (",
         ),
-        (lambda ours, theirs: ["--workers", "0", "--worker-memory", "0"], "worker_memory_gb: 0.0, must be above 0, or None"),
+        (lambda ours, theirs: ["--workers", "0", "--worker-memory", "0"], "worker_memory_gb: 0.0, must be a number above 0, or None"),
         (lambda ours, theirs: ["--workers", "0", "--worker-memory", "nan"], "worker_memory_gb: nan, must be above 0, or"),
     ],
 )  # fmt: skip
