@@ -146,10 +146,13 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
         n = len(made)
         for column, shape in (("xy_m", (n, 2)), ("size_m", (n, 2)), ("yaw_rad", (n,)), ("score", (n,))):
             value = real_array(getattr(made, column))
-            if value is None or value.shape != shape:
+            if value is None or np.asarray(getattr(made, column)).dtype.kind == "O":
                 raise PluginError(
-                    f"detector {found.name}: {what} returns {column} of shape {np.shape(getattr(made, column))}, must be "
-                    f"numbers of shape {shape}"
+                    f"detector {found.name}: {what} returns {column} without numbers, must be of shape {shape}"
+                )
+            if value.shape != shape:
+                raise PluginError(
+                    f"detector {found.name}: {what} returns {column} of shape {value.shape}, must be {shape}"
                 )
             if not np.isfinite(value).all():
                 raise PluginError(f"detector {found.name}: {what} returns {column} that is not finite")

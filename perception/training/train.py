@@ -142,9 +142,10 @@ def train(
     work.mkdir(parents=True, exist_ok=True)
     checkpoint = work / "checkpoint.safetensors"
     before = _restore(checkpoint, run, net, optimiser, log) if resume else _Progress()
-    done, recent = before.step, before.recent
-    curve = work / "loss.csv"
-    for step, row in _resume_curve(curve, done):
+    done, curve = before.step, work / "loss.csv"
+    rows = _resume_curve(curve, done)
+    recent = before.recent or tuple(row["train/loss"] for _, row in rows[-1:])  # a checkpoint of 0.2.0 has none
+    for step, row in rows:
         show(step, row)
     replicas = [copy.deepcopy(net) for _ in range(SHARDS)]
     with ThreadPoolExecutor(SHARDS) as pool:
@@ -238,7 +239,10 @@ def _resume_curve(path: Path, done: int) -> list[tuple[int, dict[str, float]]]:
     rows: list[dict[str, str]] = []
     if done and path.is_file():
         with path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if int(row["step"]) <= done]
+            whole = (
+                line for line in file if line.endswith("\n") and line.count(",") == len(CURVE)
+            )  # a kill may cut the last
+            rows = [row for row in csv.DictReader(whole) if int(row["step"]) <= done]
     with replacing(path) as part, part.open("w", newline="") as file:
         kept = csv.DictWriter(file, ("step", *CURVE))
         kept.writeheader()
@@ -273,7 +277,7 @@ def _restore(
         return _Progress()
     with safe_open(path, framework="pt") as file:
         facts = json.loads(file.metadata()["sortie"])
-        if "recent" not in facts or any(facts.get(k) != v for k, v in run.items()):
+        if any(facts.get(k) != v for k, v in run.items()):
             log.info("%s belongs to another run (%s); starting anew", path, facts)
             return _Progress()
         tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (not a mapping)
@@ -285,4 +289,4 @@ def _restore(
             state.setdefault(int(index), {})[key] = value
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     log.info("resuming at step %d", facts["step"])
-    return _Progress(facts["step"], facts["spent_s"], tuple(facts["recent"]))
+    return _Progress(facts["step"], facts["spent_s"], tuple(facts.get("recent", ())))

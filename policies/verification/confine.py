@@ -43,7 +43,8 @@ FORBIDDEN = frozenset({
 _ONLY = {"random": {"Random"}}
 """Modules of which a policy may use these names only, such as a random generator with a seed of its own."""
 _EXCEPT = {
-    "contextlib": {"chdir", "redirect_stderr", "redirect_stdout"},
+    "contextlib": {"chdir", "os", "redirect_stderr", "redirect_stdout", "sys"},
+    "json": {"codecs"},
     "numpy": {"DataSource", "ctypeslib", "fromfile", "genfromtxt", "load", "loadtxt", "memmap", "random", "save", "savez"}
 }  # fmt: skip
 _NO_BUILTINS = {"breakpoint", "compile", "eval", "exec", "exit", "globals", "help", "input", "open", "print", "quit"}
@@ -158,7 +159,7 @@ class _Rebuilding:
         home: str = getattr(value, "__module__", None) or type(value).__module__
         if home in SHARED or (home in _ONLY and name in _ONLY[home]):
             return value
-        if _is_forbidden(home):
+        if _is_forbidden(home) or name in _EXCEPT.get(home, ()):
             return _Forbidden(f"{home}.{name}")
         own = home.split(".")[0] not in ALLOWED
         if own and isinstance(getattr(value, "__wrapped__", value), types.FunctionType | functools.partial):

@@ -27,7 +27,7 @@ from sortie.scenarios.representation import LEVELS, NAME_OF
 
 MARK = "shield: "
 MOST_CHANGES = 128
-"""How many changes of links are tried for lines about several links; all links are tried once in any case."""
+"""How many changes of links are tried for each broken line about several links; all links are tried once in any case."""
 Cap = Callable[[Directive], Directive]
 """A directive as far as something allows it, such as the age of its peer's descriptor."""
 _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
@@ -37,7 +37,7 @@ def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
     """A policy that decides as the given one but keeps the invariants. It is as pure; shielding it again changes nothing.
 
     An invariant may contradict another one, depend on the view alone, or need a change of two links for itself. Then it
-    is not kept, and the reasons of the directives that break it state it.
+    is not kept, and the reasons of the directives that break it state it. One that holds is not given up for another.
 
     Raises:
         InvariantError: an invariant uses `sum_links` or `count_links`, so it does not determine the link to change;
@@ -279,7 +279,7 @@ def _plan(context: Context, before: tuple[Directive, ...], asked: Sequence[_Aske
         if best is not None and this.far >= best.far:
             break
         rule, only = cast(_Asked, this.broken)
-        alike, seen = not any(part.of_peer for part in rule.parts), set()
+        alike, seen = not any(part.of_peer for each, _ in asked for part in each.parts), set()
         for k in range(len(before)) if only is None else (only,):
             box = boxes.capped(before[k], boxes.of(before[k]))
             key = _key(before[k], box) if alike and k not in this.keeps else None

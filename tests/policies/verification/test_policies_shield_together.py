@@ -131,3 +131,15 @@ def test_a_product_of_two_fields_that_are_both_zero_can_rise() -> None:
     assert after.rate_hz * after.rho < 1.1
     (plain,) = shielded(["rate_hz * rho > 1"], [link(1, 5, 0.0)])
     assert plain.rate_hz * plain.rho > 1
+
+
+@pytest.mark.parametrize("low", [1, 2])
+def test_links_that_differ_for_another_line_are_each_tried(low: int) -> None:
+    """Both links have the same directive. Only that whose peer has charge left may be raised."""
+    lines = ["any_link(rate_hz >= 5)", "not any_link(rate_hz >= 5 and peer_battery < 0.5)"]
+    view = fleet_of(3)
+    peer = view.descriptors[low]._replace(battery_soc=0.1)
+    view = view._replace(descriptors={**view.descriptors, low: peer})
+    decided = [link(peer, Representation.DETECTIONS, 2.0, 1.0) for peer in (1, 2)]
+    directives = enforce(parse("\n".join(lines)), view, decided)
+    assert {d.destination: d.rate_hz for d in directives} == {low: 2.0, 3 - low: 5.0}

@@ -186,10 +186,7 @@ def test_a_metric_is_asked_with_the_tables_that_a_scenario_may_ask_for() -> None
 
 def test_boxes_of_a_wrong_shape_are_told() -> None:
     (check,) = verify("detector", "broken.py:Blind", {"size": 3})
-    assert (
-        check.what
-        == "alone: detector broken.py:Blind: detect returns size_m of shape (1, 3), must be numbers of shape (1, 2)"
-    )
+    assert check.what == "alone: detector broken.py:Blind: detect returns size_m of shape (1, 3), must be (1, 2)"
 
 
 def test_a_kind_or_a_model_that_is_not_there_is_an_error() -> None:

@@ -80,7 +80,7 @@ def test_an_edited_file_has_another_digest(models: str) -> None:
         ("perception.detector=mine.py:Half", r"^detector mine.py:Half has no 'truth', must have detect, truth, count_boxes, camera_views$"),
         ("perception.detector=mine.py:Short", r"^detector mine.py:Short: detect returns \[\], must be Boxes for each of the jobs$"),
         ("perception.detector=mine.py:Forgets", r"^detector mine.py:Forgets: detect returns None, must be Boxes for each of the jobs$"),
-        ("perception.detector=mine.py:Texts", r"^detector mine.py:Texts: truth returns score of shape \(\d+,\), must be numbers of shape \(\d+,\)$"),
+        ("perception.detector=mine.py:Texts", r"^detector mine.py:Texts: truth returns score without numbers, must be of shape \(\d+,\)$"),
         ("fleet.airframe.power_model=mine.py:negative", r"^power negative: returns -1 W, must be ≥ 0$"),
         ("fleet.battery.cell_model=mine.py:falling", r"^cell falling: falls from 4 to 3.99997 V at a charge of 0.000, must not fall as the charge rises$"),
         ("fleet.battery={cell_model: mine.py:straight, cell_params: {empty_v: 0}}", r"^cell straight: 0 V at a charge of 0.000, must be above 0$"),
