@@ -210,12 +210,13 @@ def _places(sections: dict[str, Any], folder: Path = HERE) -> Iterator[tuple[dic
 def _names_a_file(value: object, folder: Path) -> bool:
     """Whether a parameter of a model is the name of a file, such as a table that the model reads, or of a folder.
 
-    A folder counts where its name has a slash. Otherwise a word such as `train` would mean a folder that lies there by chance.
+    A name has a suffix or a slash. Otherwise a word such as `train` would mean a file that lies there by chance. The
+    working folder and the folders above it never count, so `/`, `./` and `../` are text.
     """
-    if not isinstance(value, str):
+    if not isinstance(value, str) or not ("/" in value or Path(value).suffix):
         return False
-    there = placed(value, folder)
-    return os.path.isfile(there) or ("/" in value and os.path.isdir(there))
+    there = Path(placed(value, folder))
+    return os.path.isfile(there) or (os.path.isdir(there) and not Path.cwd().is_relative_to(there.resolve()))
 
 
 def _models(sections: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:

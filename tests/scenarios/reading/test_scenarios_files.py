@@ -213,12 +213,13 @@ def test_a_parameter_that_names_a_file_is_found_beside_the_scenario(
     assert named_files(sections) == ["own.py", "heights.csv"]
 
 
-def test_a_parameter_may_name_a_file_without_a_suffix_or_a_folder_with_a_slash(tmp_path: Path) -> None:
-    """Also of an installed model. A word is no folder that has its name by chance."""
+def test_a_parameter_may_name_a_file_or_a_folder_by_a_suffix_or_a_slash(tmp_path: Path) -> None:
+    """Also of an installed model. A word is no file or folder that has its name by chance."""
     for name in ("maps", "train"):
         (tmp_path / name).mkdir()
-    (tmp_path / "heights").write_text("1\n")
-    params = {"a": "heights", "b": "maps/", "c": "train", "d": "missing/", "e": ""}
+    for name in ("heights", "val"):
+        (tmp_path / name).write_text("1\n")
+    params = {"a": "./heights", "b": "maps/", "c": "train", "d": "missing/", "e": "", "f": "val"}
     source = "def f(pose):\n    return 0\n"
     with installed_package(tmp_path, "sensors", source, {"sensor": {"wobbly": "sensors:f"}}):
         for model in ("own.py:f", "wobbly"):
@@ -227,6 +228,17 @@ def test_a_parameter_may_name_a_file_without_a_suffix_or_a_folder_with_a_slash(t
             here = {"a": str(tmp_path / "heights"), "b": str(tmp_path / "maps")}
             assert fleet.sensor_params == {**params, **here}
             assert set(here.values()) <= set(named_files({"fleet": fleet.model_dump(mode="json", exclude_none=True)}))
+
+
+def test_the_working_folder_and_those_above_it_are_no_files_of_a_parameter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "above" / "here"
+    (here / "maps").mkdir(parents=True)
+    monkeypatch.chdir(here)
+    texts = ["/", "./", "../", "maps/..", f"{here.parent}/", f"{here}"]
+    params = {f"p{i}": text for i, text in enumerate([*texts, "./maps"])}
+    assert named_files({"policy": {"name": "own.py:decide", "params": params}}) == ["own.py", "./maps"]
 
 
 @pytest.mark.parametrize(
