@@ -72,8 +72,8 @@ def imported_files(path: Path) -> tuple[Path, ...]:
 
 def imported_packages(path: Path) -> set[str]:
     """The installed packages of which a file and the modules beside it import something, by their names on the index."""
-    names = {name.partition(".")[0] for source in _sources(path) for name, _, level in _named(source) if not level}
-    names = {name for name in names if not _is_pythons(name)}
+    imports = {(s.folder, name.partition(".")[0]) for s in _sources(path) for name, _, level in _named(s) if not level}
+    names = {top for folder, top in imports if not (_is_pythons(top) or (folder and _is_beside(folder, top)))}
     return {package for name in names for package in _offered_by().get(name, ())}
 
 

@@ -28,7 +28,7 @@ from sortie.scenarios.intervals import AMOUNT, SHARE, Estimate, Range, mean_inte
 from sortie.scenarios.plugins import reference
 from sortie.scenarios.plugins.reference import Guard, PluginError, checked_array, resolve
 from sortie.scenarios.plugins.user_calls import Guarded, TookTooLongError, watched
-from sortie.scenarios.plugins.user_code import imported_files
+from sortie.scenarios.plugins.user_code import imported_files, imported_packages
 from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Expectation, Mission, Perception, PolicySection, Scenario, Steering, Viewpoints
 from sortie.scenarios.schema.base import models_of_the_past
@@ -528,6 +528,13 @@ def test_a_guard_counts_no_time_where_it_is_told_not_to() -> None:
 
     assert isinstance(Guard("link", Model()).go.args[1], Guarded)
     assert not isinstance(Guard("link", Model(), timed=False).go.args[1], Guarded)
+
+
+def test_a_module_beside_a_file_hides_the_installed_package_of_its_name(tmp_path: Path) -> None:
+    (tmp_path / "p.py").write_text("import numpy\nimport yaml\n")
+    assert imported_packages(tmp_path / "p.py") == {"numpy", "PyYAML"}
+    (tmp_path / "yaml.py").write_text("")
+    assert imported_packages(tmp_path / "p.py") == {"numpy"}
 
 
 def test_imported_files_are_those_beside_the_file_and_in_its_packages(tmp_path: Path) -> None:
