@@ -219,16 +219,19 @@ def make_plan(study: Study, **more: Any) -> CampaignPlan:
     models = {model for whole in wholes for model in named_models(whole)}
     for field in sorted(campaign.vary):  # a model before its parameters, which may name files
         holder, within = (columns, field) if field in columns else (spec["vary"][field], "values")
-        for k, value in enumerate(holder.get(within) or ()):
-            if isinstance(value, int | float):
-                continue
+        values = holder.get(within) or []
+        found = {json.dumps(value): value for value in values if not isinstance(value, int | float)}
+        others: dict[str, list[Any]] = {}  # wholes with other models, by what the field then has
+        for text, value in found.items():
             varied = [with_files(_with(whole, field, value), place, study.folder) for whole in wholes]
-            holder[within][k] = next((v for each in varied if (v := value_at(field, each)) != value), value)
+            found[text] = next((v for each in varied if (v := value_at(field, each)) != value), value)
             flown = [without_brackets(each) for each in varied]
             files.update(file for each in flown for file in named_files(each))
             models.update(model for each in flown for model in named_models(each))
             if named_models(flown[0]) != named_models(wholes[0]):
-                wholes += flown[: len(policies)]
+                others.setdefault(json.dumps(value_at(field, flown[0])), flown[: len(policies)])
+        values[:] = [found.get(json.dumps(value), value) for value in values]
+        wholes += [each for flown in others.values() for each in flown]
     _check_metrics(study, [section for _, section in policies])
     return CampaignPlan(
         {

@@ -14,6 +14,7 @@ from installed_package import installed_package
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.reading.campaign import load_campaign
 from sortie.scenarios.reading.load import ScenarioError
+from sortie.sim.campaign import plan as planning
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import CampaignPlan
@@ -410,6 +411,24 @@ def test_a_file_that_a_varied_parameter_names_is_in_the_key_and_found_beside_the
     }
     (tmp_path / "b.txt").write_text("2\n")
     assert plan(tmp_path, text, base).key(0) != before.key(0)
+
+
+@pytest.mark.parametrize("distinct", [2, 12])
+def test_each_value_that_changes_a_model_is_worked_out_once_for_each_policy(
+    distinct: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many rows have it, and however many other values the field has."""
+    worked = list[object]()
+    whole = planning._with
+    monkeypatch.setattr(planning, "_with", lambda *given: worked.append(given) or whole(*given))
+    (tmp_path / "mine.py").write_text("".join(f"def f{i}(*_):\n    pass\n" for i in range(distinct)))
+    rows = [f"mine.py:f{i % distinct}" for i in range(24)]
+    (tmp_path / "models.csv").write_text("\n".join(["fusion", *rows]) + "\n")
+    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}",
+        "perception.fusion: {kind: column, file: models.csv, column: fusion}")  # fmt: skip
+    made = plan(tmp_path, text)
+    assert len(worked) == distinct * 2
+    assert made.spec["columns"]["perception.fusion"] == [f"{tmp_path}/{row}" for row in rows]
 
 
 def test_an_installed_model_s_package_is_in_the_key_and_a_worker_with_another_one_flies_nothing(tmp_path: Path) -> None:
