@@ -72,7 +72,8 @@ def fly(
         ScenarioError, PolicyError: a policy or its parameters are wrong; raised before anything flies.
         RunError: the folder cannot be used, or files changed meanwhile.
     """
-    asked = [(p, c.name, _task(suite, c, p)) for p in policies for c in suite.conditions]
+    read = functools.cache(_read_from)  # most conditions name the same models and files
+    asked = [(p, c.name, _task(suite, c, p, read)) for p in policies for c in suite.conditions]
     code = flight_code([json.loads(task) for _, _, task in asked])
     kept = _Kept(folder / KEPT)
     found = {
@@ -110,8 +111,8 @@ def fly_callable(
     return flights
 
 
-def _task(suite: ConditionSet, condition: Condition, policy: str) -> str:
-    """What a worker receives; it may stand in another folder."""
+def _task(suite: ConditionSet, condition: Condition, policy: str, read: Callable[..., Mapping[str, object]]) -> str:
+    """What a worker receives; it may stand in another folder. `read` is `_read_from`."""
     scenario = scenario_of(suite, condition, policy)
 
     def place(name: str) -> str:
@@ -120,9 +121,14 @@ def _task(suite: ConditionSet, condition: Condition, policy: str) -> str:
     sections = with_files(scenario.model_dump(mode="json", exclude_none=True), place)
     task = {
         "scenario": sections, "seed": scenario.seed, "replication": 0, "metrics": METRICS,
-        "files": file_digests(named_files(sections)), "packages": packages(named_models(sections), named_files(sections)),
+        **read(tuple(named_models(sections)), tuple(named_files(sections))),
     }  # fmt: skip
     return json.dumps(task, sort_keys=True)
+
+
+def _read_from(models: Sequence[tuple[str, str]], files: Sequence[str]) -> dict[str, object]:
+    """The digests of a task's files, and the packages of its models."""
+    return {"files": file_digests(files), "packages": packages(models, files)}
 
 
 def _flight(result: RunResult) -> Flight:

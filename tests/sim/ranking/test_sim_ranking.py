@@ -173,6 +173,15 @@ def test_a_flight_is_flown_again_after_a_change_of_the_policys_file_and_after_a_
     assert len(here) == 5 + 2
 
 
+def test_a_policys_files_are_read_once_for_all_conditions(here: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    read = list[object]()
+    packages = flights.packages
+    monkeypatch.setattr(flights, "packages", lambda models, files: read.append(files) or packages(models, files))
+    fly(small(), ["mine.py:boxes", "boxes"], Path("out"))
+    assert len(here) == 4
+    assert len(read) == 2
+
+
 def test_a_callable_gets_the_budget_and_flies_as_its_name_does(here: list[int]) -> None:
     budgets = set()
 
