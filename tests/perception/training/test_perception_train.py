@@ -311,3 +311,11 @@ def test_a_finished_run_that_is_started_again_writes_the_same_card_and_the_same_
     assert {**second, "minutes": first["minutes"]} == first
     assert runs.curve("whole") == curve
     assert [step for step, _ in again] == [10, 20, 30, 30]
+
+
+@pytest.mark.parametrize("cut", ["30", "20,1.1,0.0", "20,1.1,0.001,,0.", "\0\0\0\0"])
+def test_a_line_of_the_curve_that_a_kill_cut_is_left_out(cut: str, tmp_path: Path) -> None:
+    curve = tmp_path / "loss.csv"
+    curve.write_text(f"step,loss,lr,ap_single,ap_full\n10,2.5,0.001,,\n{cut}")
+    assert training._resume_curve(curve, 40) == [(10, {"train/loss": 2.5, "train/lr": 0.001})]
+    assert curve.read_text().splitlines() == ["step,loss,lr,ap_single,ap_full", "10,2.5,0.001,,"]

@@ -442,8 +442,15 @@ def test_pure_parts_of_json_and_contextlib_may_be_used_and_no_others(tmp_path: P
         "@contextlib.contextmanager\ndef rate():\n    yield json.loads('2.0')\n\n"
         "def decide(view):\n    with rate() as hz:\n"
         "        return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=hz) for p in view.peers]\n\n"
-        "def moves(view):\n    with contextlib.chdir('.'):\n        return decide(view)\n"
+        "def moves(view):\n    with contextlib.chdir('.'):\n        return decide(view)\n\n"
+        "def asks(view):\n    contextlib.os.getcwd()\n    return decide(view)\n\n"
+        "def reads(view):\n    json.codecs.lookup('ascii')\n    return decide(view)\n\n"
+        "from contextlib import redirect_stdout\n\n"
+        "def hides(view):\n    with redirect_stdout(None):\n        return decide(view)\n"
     )
     reads_only = RULES["reads only its view"]
     assert reads_only(resolve(f"{file}:decide"), FLEET) is None
-    assert reads_only(resolve(f"{file}:moves"), FLEET) == "uses contextlib.chdir, which is not in its view"
+    for name, what in (("moves", "contextlib.chdir"), ("hides", "contextlib.redirect_stdout")):
+        assert reads_only(resolve(f"{file}:{name}"), FLEET) == f"uses {what}, which is not in its view"
+    for name in ("asks", "reads"):
+        assert "which is not in its view" in str(reads_only(resolve(f"{file}:{name}"), FLEET))
