@@ -20,12 +20,12 @@ MOST_M = 100.0
 def over_region(view: FleetView) -> Reposition | None:
     """While tracking: the drone's place if the fleet's centre were over the region. In other phases: its slot.
 
-    The fleet is the attached drones with cameras and with the same region. It shifts as a whole, so no paths cross.
+    The fleet is the attached drones with cameras, except those with another region. It shifts as a whole, so no paths cross.
     """
     me = view.me
     if me is None or me.region is None or me.task_phase != TaskPhase.TRACK:
         return None
-    there = [d.position_m for d in view.attached.descriptors.values() if d is me or _looks_there(d, me.region)]
+    there = [d.position_m for d in view.attached.descriptors.values() if d is me or _belongs(d, me.region)]
     middle_x, middle_y = (fsum(p[axis] for p in there) / len(there) for axis in (0, 1))
     dx_m, dy_m = me.region.x_m - middle_x, me.region.y_m - middle_y
     far_m = hypot(dx_m, dy_m)
@@ -34,10 +34,13 @@ def over_region(view: FleetView) -> Reposition | None:
     return Reposition(x_m + share * dx_m, y_m + share * dy_m, f"the fleet's middle is {far_m:.0f} m from the region")
 
 
-def _looks_there(d: Descriptor, region: Disc) -> bool:
-    """Whether a drone has a camera and this region. A region moves with its target, and a descriptor is a little older."""
+def _belongs(d: Descriptor, region: Disc) -> bool:
+    """Whether a drone has a camera and no other region.
+
+    A region moves with its target, and a descriptor is a little older. One of before the phase turned has none yet.
+    """
     if d.region is None or d.footprint_radius_m <= 0.0:
-        return False
+        return d.footprint_radius_m > 0.0
     return hypot(d.region.x_m - region.x_m, d.region.y_m - region.y_m) <= region.radius_m
 
 

@@ -75,7 +75,7 @@ def made(rng: np.random.Generator, shape: str, correlation: float, deviation: fl
 def sorties(expensive: str, cheap: str) -> Floats:
     """[sorties, 2]: two gains over `worked` of the second run, by the names of their columns."""
     with SORTIES.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if int(row["seed"]) >= 4_010_001]
+        rows = [row for row in csv.DictReader(file) if 4_010_001 <= int(row["seed"]) < 4_020_001]
     gains = np.array([[float(row[name] or "nan") for name in (expensive, cheap)] for row in rows])
     return gains[~np.isnan(gains).any(axis=1)]
 

@@ -235,7 +235,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tu
             "--security {cert} {their_key}: not a certificate and its key (",
         ),
         (lambda ours, theirs: ["--workers", "0", "--worker-memory", "0"], "worker_memory_gb: 0.0, must be a number above 0, or None"),
-        (lambda ours, theirs: ["--workers", "0", "--worker-memory", "nan"], "worker_memory_gb: nan, must be above 0, or"),
+        (lambda ours, theirs: ["--workers", "0", "--worker-memory", "nan"], "worker_memory_gb: nan, must be a number above 0, or"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_done_is_one_line(

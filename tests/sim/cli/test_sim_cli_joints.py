@@ -106,7 +106,7 @@ def test_compare(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("half_width", "metric", "pilot", "most_seeds", "kept", "own_fusion")
     assert [seen.kwargs[k] for k in names] == [0.02, "ap50.mission", 6, 90, Path("k.sqlite"), False]
     command(*named, "--half-width", "0.02")
-    assert [seen.kwargs[k] for k in names] == [0.02, "ap50.full_scene", None, None, True, False]
+    assert [seen.kwargs[k] for k in names] == [0.02, None, None, None, True, False]
 
 
 CAMPAIGN = "campaign: named\nbase: s.yaml\nvary: {duration_s: {kind: grid, values: [1, 2]}}\npolicies: [worked]\nmetrics: [frame_s]\n"
@@ -126,6 +126,8 @@ def test_campaign(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         "out",
         "--resume",
         "--retry-failed",
+        "--by-torch",
+        "6",
     )
     assert command("campaign", "c.yaml", *options, "--no-report") == 1, "some failed"
     assert "20 runs finished, 3 failed; 6 of them now, 4.0 a minute" in capsys.readouterr().out
@@ -133,7 +135,7 @@ def test_campaign(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     given = {k: v for k, v in seen.kwargs.items() if k not in ("progress", "notice")}
     assert given == {
         "out": Path("out"), "workers": 5, "scheduler": None, "security": None, "worker_memory_gb": 1.5, "wait_for_workers_s": 300.0,
-        "resume": True, "retry_failed": True,
+        "by_torch": 6, "resume": True, "retry_failed": True,
     }  # fmt: skip
     seen._answer = sortie.CampaignResult(here / "out", 20, 0, 0, 90.0)
     tls = ("--scheduler", "tcp://h:1", "--security", "ca.pem", "cert.pem", "key.pem", "--wait-for-workers", "7")
@@ -143,7 +145,7 @@ def test_campaign(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert given == {
         "out": Path("runs/campaign-named"), "workers": None, "scheduler": "tcp://h:1",
         "security": (Path("ca.pem"), Path("cert.pem"), Path("key.pem")), "worker_memory_gb": None, "wait_for_workers_s": 7.0,
-        "resume": False, "retry_failed": True,
+        "by_torch": None, "resume": False, "retry_failed": True,
     }  # fmt: skip
 
 

@@ -635,7 +635,7 @@ def _spoofed(attack: str, *sets: str) -> list[tuple[float, bytes, list[int]]]:
         last_datagram={}, inject=lambda data, to: put.append((round(env.now, 3), data, list(to)))
     )
     world = SimpleNamespace(env=env, note=lambda *_: None)
-    _Begin(scenario, world, transport, None, None, scenario.events[0], 0, 1, 0)()  # type: ignore[arg-type]
+    _Begin(scenario, world, transport, None, None, scenario.events[0], 0, 1, 0, {})()  # type: ignore[arg-type]
 
     def publish() -> Any:
         yield env.timeout(0.3)

@@ -165,7 +165,7 @@ def test_events_say_what_is_wrong() -> None:
     assert [(event["kind"], event["text"]) for event in found] == [
         ("position_fault", "believes to be 11 m away, drifting at 1 m/s"),
         ("heading_fault", "believes its heading 170° off, drifting by 20° a second"),
-        ("position_fault_over", "its believed pose has its usual errors again"),
+        ("position_fault", "its believed pose is still wrong: another fault lasts"),
         ("heading_fault_over", "its believed pose has its usual errors again"),
     ]
 

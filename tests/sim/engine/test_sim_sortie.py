@@ -310,7 +310,7 @@ def test_a_drone_that_left_the_air_loses_no_energy(fault: str) -> None:
     events = f"events=[{{kind: drone_lost, drone: 1, at_s: 2}}, {{kind: {fault}, drone: 1, at_s: 3}}]"
     o = outcome(run_sortie(example("duration_s=4", events)))
     assert o["energy_j"]["fault"] == 0.0
-    assert [e["kind"] for e in o["events"]] == ["drone_lost"]
+    assert [e["kind"] for e in o["events"]] == ["drone_lost", "no_effect"]
 
 
 def test_jam_and_link_drop_end_when_they_should(base: SortieRecord) -> None:

@@ -23,6 +23,7 @@ from sortie.fleet.logs.vehicle import VehicleState
 from sortie.fleet.messages.wire import decode_directive, encode_directive
 from sortie.perception.geometry import USUAL
 from sortie.perception.types import Capture
+from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, Disc, PolicyError, Representation, TaskPhase
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.live import platform
@@ -331,6 +332,7 @@ def test_an_answer_has_its_number_and_the_time_of_its_own_decision(monkeypatch: 
         seen.append(given)
         return [directive(0, 1), directive(0, 2)]
 
+    pilot.check = check_directives  # type: ignore[attr-defined]
     clock_ns = iter((5_000, 5_700))
     monkeypatch.setattr(time, "thread_time_ns", lambda: next(clock_ns))
     answer = _decide(pilot, Ask(17, view))  # type: ignore[arg-type]
@@ -352,6 +354,7 @@ def test_what_breaks_a_rule_or_raises_is_a_fault_without_directives() -> None:
         (lambda view: [directive(0, 7)], "7"), (lambda view: [directive(1, 2)], "1"), (refuses, "by its own words"),
         (breaks, "division by zero"),
     ):  # fmt: skip
+        pilot.check = check_directives  # type: ignore[attr-defined]
         answer = _decide(pilot, Ask(3, fleet_of(3)))  # type: ignore[arg-type]
         assert (answer.number, answer.directives, answer.elapsed_ns) == (3, (), 0)
         assert words in answer.fault
