@@ -212,10 +212,10 @@ def test_a_lesson_by_torch_asks_it_at_fewer_moments(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("sortie.perception.network.detector.TorchDetector", Seer)
     monkeypatch.setattr(learn, "SECONDS", 4)
     before = Seer.asked
-    lesson = learn.fly_lesson(0, 6, by_torch=True)
+    lesson = learn.fly_lesson(0, 7, by_torch=True)
     assert min(lesson.ap) > 0.8
     assert Seer.asked - before == len(ARMS) * 5 * 2
-    ours = learn.fly_lesson(0, 6)
+    ours = learn.fly_lesson(0, 7)
     # a descriptor that names a target is longer, and meets other frames: goodputs differ a little
     assert lesson.features == pytest.approx(ours.features, rel=0.02)
     assert max(ours.ap) < 0.9
