@@ -170,20 +170,17 @@ class Store:
         self.dropped.append(part)
 
 
+def stopping(at_least: int) -> SimpleNamespace:
+    """The plan of eight runs that may stop early."""
+    campaign = SimpleNamespace(stop_when=StopWhen(metric=AP, half_width=0.2, at_least=at_least))
+    return SimpleNamespace(campaign=campaign, policies=["a", "b"], runs=8, code="", task=lambda run: "", by_torch=False)
+
+
 @pytest.mark.parametrize("at_least", [2, 9])
 def test_a_driver_tells_all_that_it_flew_and_no_more_than_it_keeps(at_least: int) -> None:
     """Of two units it is known with the third part, in which the third unit begins."""
-    asked = StopWhen(metric=AP, half_width=0.2, at_least=at_least)
-    of = SimpleNamespace(
-        campaign=SimpleNamespace(stop_when=asked),
-        policies=["a", "b"],
-        runs=8,
-        code="",
-        task=lambda run: "",
-        by_torch=False,
-    )
     store, told = Store(), list[Progress]()
-    last = _drive(of, store, Engine(), 8, told.append)  # type: ignore[arg-type]
+    last = _drive(stopping(at_least), store, Engine(), 8, told.append)  # type: ignore[arg-type]
     known = [(p.finished, p.of, p.flown) for p in told]
     if at_least == 2:
         assert (known, store.dropped) == ([(2, 8, 0), (4, 8, 2)], [2])
@@ -194,17 +191,8 @@ def test_a_driver_tells_all_that_it_flew_and_no_more_than_it_keeps(at_least: int
 
 
 def test_what_was_flown_beyond_the_end_is_not_among_what_is_finished() -> None:
-    asked = StopWhen(metric=AP, half_width=0.2, at_least=2)
-    of = SimpleNamespace(
-        campaign=SimpleNamespace(stop_when=asked),
-        policies=["a", "b"],
-        runs=8,
-        code="",
-        task=lambda run: "",
-        by_torch=False,
-    )
     store = Store()
-    last = _drive(of, store, Engine(6), 8, lambda p: None)  # type: ignore[arg-type]
+    last = _drive(stopping(2), store, Engine(6), 8, lambda p: None)  # type: ignore[arg-type]
     assert (last.finished, last.of, last.flown, store.dropped) == (6, 6, 4, [2])
 
 
