@@ -454,7 +454,10 @@ def campaign(
             done = [run_campaign(plan, folder, engine, resume_only=resume, **how)]
             if units is not None:  # of those that stop_when left
                 units = min(units, done[0].of // plan.unit_runs)
-                done.append(run_campaign(by_torch_plan, folder / FOLDER, engine, units=units, **how))
+                if units < 2:
+                    tell(f"by_torch: stop_when left {units} {plan.unit}s, must be at least 2; torch flies none")
+                else:
+                    done.append(run_campaign(by_torch_plan, folder / FOLDER, engine, units=units, **how))
     total = (sum(getattr(p, name) for p in done) for name in ("finished", "failed", "flown", "seconds"))
     return CampaignResult(folder, *total)
 

@@ -37,10 +37,11 @@ def over_region(view: FleetView) -> Reposition | None:
 def _belongs(d: Descriptor, region: Disc) -> bool:
     """Whether a drone has a camera and no other region.
 
-    A region moves with its target, and a descriptor is a little older. One of before the phase turned has none yet.
+    A region moves with its target, and a descriptor is a little older. One of before the phase turned has none yet; a drone
+    that searches on has none either, and counts. One that lands does not.
     """
     if d.region is None or d.footprint_radius_m <= 0.0:
-        return d.footprint_radius_m > 0.0
+        return d.footprint_radius_m > 0.0 and d.task_phase != TaskPhase.LANDING
     return hypot(d.region.x_m - region.x_m, d.region.y_m - region.y_m) <= region.radius_m
 
 

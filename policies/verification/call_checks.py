@@ -187,7 +187,8 @@ def _stands_for_text(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any
 
 FORM_BY_VALUE = "lets a number of the view decide the form of a text"
 """By a width that is a value, a part of a value, or a character: whether that is possible depends on the number."""
-_PERCENT_APART = re.compile(r"%[^a-zA-Z%]*(\*|[hlL]?c)")
+_PERCENT_APART = re.compile(r"%(\([^)]*\))?[^a-zA-Z%(]*(\*|[hlL]?c)")
+"""In a template without its `%%`, which stand for themselves."""
 
 
 def _takes_apart(template: str) -> bool:
@@ -249,7 +250,9 @@ def _percent(left: Any, right: Any) -> Any:
     parts = right if type(right) is tuple else (right,)
     if type(left) in (str, bytes) and any(map(_has_text, parts)):
         found = next((p for p in parts if isinstance(p, Text | Ranged)), None)
-        if _PERCENT_APART.search(repr(left)) and not all(isinstance(p, float) for p in parts):  # floats raise TypeError
+        if _PERCENT_APART.search(repr(left).replace("%%", "")) and not all(
+            isinstance(p, float) for p in parts
+        ):  # floats raise TypeError
             stop(FORM_BY_VALUE)
         left % (tuple(map(_example, right)) if type(right) is tuple else _example(right))
         return stop("makes text of a range") if found is None else Text(found._path, found._axis, "text with a number")
