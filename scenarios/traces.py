@@ -25,6 +25,8 @@ DRONE: Bounds = (0.0, 254.0)
 MAX_ROWS = 5_000_000
 SHIPPED = Path(__file__).parent / "library" / "traces"
 """The library's traces, which scenarios name by their path below it."""
+NETWORKS = Path(__file__).parents[1] / "perception" / "network" / "weights"
+"""The shipped networks, which scenarios and commands name likewise."""
 
 
 class TraceError(SortieError):
@@ -84,10 +86,9 @@ def read_columns(path: Path, bounds: Mapping[str, Bounds], required: Iterable[st
 
 
 def located(path: Path) -> Path:
-    """The path itself where it leads to a file, else the shipped trace of that name where there is one."""
-    shipped = SHIPPED / path
+    """The path itself where it leads to a file, else the shipped trace or network of that name where there is one."""
     # os.path: a name that is too long is no file, where pathlib raises
-    return shipped if not os.path.isfile(path) and os.path.isfile(shipped) else path
+    return next((p for p in (path, SHIPPED / path, NETWORKS / path) if os.path.isfile(p)), path)
 
 
 def check_whole(path: Path, name: str, values: Array) -> None:

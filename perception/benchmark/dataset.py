@@ -30,6 +30,8 @@ FORMAT = 1
 """Of the files; a change of what a scene looks like raises it, so that old files are not taken for new ones."""
 SIZES: dict[Split, tuple[int, int]] = {"train": (100, 12), "validation": (12, 6), "tau": (40, 1), "test": (240, 1)}
 """Scenes and frames a scene. The test split has a scene for every frame, as UAV3D's mini-validation."""
+MOST: dict[Split, int] = {split: scenes for split, (scenes, _) in SIZES.items()} | {"train": 10_000}
+"""Scenes that there are of a split: more may be learned from than the usual ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,8 +165,8 @@ def make_split(
     """
     count, frames = SIZES[split]
     which = scenes if isinstance(scenes, range) else range(count if scenes is None else scenes)
-    if not which or which[0] < 0 or which[-1] >= count:
-        raise ValueError(f"scenes is {scenes}, must be 1 to the {count} of the {split} split")
+    if not which or which[0] < 0 or which[-1] >= MOST[split]:
+        raise ValueError(f"scenes is {scenes}, must be 1 to the {MOST[split]} of the {split} split")
     folder = bench.folder(root)
     paths = {k: folder / split / f"scene_{scene_id(bench.seed, split, k)}_{frames}.npz" for k in which}
     known = manifest.listed(folder, split)

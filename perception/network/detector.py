@@ -47,6 +47,7 @@ from sortie.perception.uncertainty import BoxErrors, load_errors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import CELL_NAMES
 from sortie.scenarios.schema import Perception
+from sortie.scenarios.traces import located
 
 WEIGHTS = Path(__file__).parent / "weights"
 SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
@@ -54,13 +55,23 @@ KEPT_CAPTURES = 64
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")
 
-__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "shipped"]
+__all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "named_weights", "shipped"]
 
 
 def shipped(fusion: str) -> Path:
     """The weights that a fusion flies with when the scenario names none: DiscoNet's unless others are shipped for it."""
     own = fusion not in FUSIONS or FUSIONS[fusion].shares != "features"
     return SHIPPED_WEIGHTS if own else WEIGHTS / f"{fusion}.safetensors"
+
+
+def named_weights(weights: Path | None) -> Path:
+    """The file of a network: DiscoNet's shipped one for None; a shipped one may be named without its folder.
+
+    Example:
+        >>> named_weights(None).name, named_weights(Path("fine.safetensors")).parent == WEIGHTS
+        ('disconet.safetensors', True)
+    """
+    return SHIPPED_WEIGHTS if weights is None else located(weights)
 
 
 Part = tuple[float, Disc | None, tuple[int, ...], bool, Disc | None]
@@ -112,7 +123,7 @@ class TorchDetector:
         self._scene, self._config = scene, config
         own = None if config.fusion in FUSIONS else OwnFusion(config.fusion, config.fusion_params)
         self._shares: Shares = "features" if own else FUSIONS[config.fusion].shares
-        path = shipped(config.fusion) if weights is None else weights
+        path = shipped(config.fusion) if weights is None else named_weights(weights)
         net = load_weights(path, own)
         if own is None:
             net.fusion.tune(**config.fusion_params)

@@ -170,12 +170,14 @@ class Align(nn.Module):
     Interpolation blurs what lies between cells, and a car's heading is told in the peer's frame. It begins as the identity.
     """
 
-    def __init__(self, channels: int = FINE_CHANNELS) -> None:
+    def __init__(self, channels: int = FINE_CHANNELS, inner: int = 16) -> None:
         super().__init__()
-        self.widen = nn.Linear(channels + 4, channels)
-        self.narrow = nn.Linear(channels, channels)
-        nn.init.zeros_(self.narrow.weight)
-        nn.init.zeros_(self.narrow.bias)
+        self.said = nn.Linear(channels, inner)
+        self.offset = nn.Linear(2, inner, bias=False)
+        self.turn = nn.Linear(2, inner, bias=False)
+        self.out = nn.Linear(inner, channels)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
 
     def forward(self, said: Tensor, offset: Tensor, turn: Tensor) -> Tensor:
         """[k, p, c] → the same; cells of zeros, where nothing was sent, stay zeros.
@@ -184,9 +186,11 @@ class Align(nn.Module):
             offset: [k, p, 2], how far the cell's centre lies from that of the peer's cell below it, −0.5 … 0.5 cells.
             turn: [k], the peer's heading minus the ego's, radians.
         """
-        direction = torch.stack([turn.sin(), turn.cos()], dim=-1)[:, None].expand(-1, said.shape[1], -1)
-        x = torch.cat([said, offset, direction], dim=-1)
-        out: Tensor = said + self.narrow(F.relu(self.widen(x)))
+        x = self.said(said)
+        x += self.offset(offset)
+        x += self.turn(torch.stack([turn.sin(), turn.cos()], dim=-1))[:, None]
+        out: Tensor = self.out(F.relu(x, inplace=True))
+        out += said
         return out * said.any(dim=-1, keepdim=True)
 
 

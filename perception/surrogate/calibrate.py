@@ -15,7 +15,7 @@ from sortie.perception.files import replacing
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import average_precision, match
 from sortie.perception.network.checkpoint import read_config
-from sortie.perception.network.detector import SHIPPED_WEIGHTS
+from sortie.perception.network.detector import named_weights
 from sortie.perception.surrogate.collect import FLOOR, DetectorRuns, collect, read
 from sortie.perception.surrogate.correlation import fit_correlation, fit_shared_false_positives
 from sortie.perception.surrogate.fit import fit
@@ -57,7 +57,7 @@ def calibrate(
     if scenes < 2 or held_out < 2:
         raise ValueError(f"{scenes} scenes and {held_out} held out, must be at least 2 each")
     report = progress or (lambda stage, done, of: None)
-    path = SHIPPED_WEIGHTS if weights is None else weights
+    path = named_weights(weights)
     config = read_config(path)
     key = hashlib.blake2b(path.read_bytes(), digest_size=5).hexdigest()
     fitted = _detector_runs("fit", scenes, work, seed, weights, key, report)

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from sortie.perception.benchmark.dataset import SIZES, Benchmark
+from sortie.perception.benchmark.dataset import MOST, SIZES, Benchmark
 
 PEAK_LR = 2.5e-3
 Precision = Literal["float32", "bfloat16"]
@@ -22,11 +22,13 @@ class Recipe:
     """
 
     steps: int = 500
-    """Optimiser steps of four fleet-frames."""
+    """Optimiser steps."""
+    batch: int = 4
+    """Fleet-frames a step; an even number, as two shards share them."""
     seed: int = 0
     """Of weights, batches and their order."""
     scenes: int = FULL_SIZE
-    """The first so many scenes of the benchmark's train split."""
+    """The first so many scenes of the benchmark's train split; it goes on beyond its usual 100."""
     peak_lr: float = PEAK_LR
     """The cycle's highest learning rate."""
     cell_dropout: float = 0.0
@@ -41,10 +43,17 @@ class Recipe:
     """Name of the weights that it begins from; empty for none. Tensors that do not fit begin anew."""
 
     def __post_init__(self) -> None:
-        for name, low, high in (("steps", 1, 10**6), ("seed", 0, 2**31), ("scenes", 1, FULL_SIZE)):
+        for name, low, high in (
+            ("steps", 1, 10**6),
+            ("batch", 2, 1024),
+            ("seed", 0, 2**31),
+            ("scenes", 1, MOST["train"]),
+        ):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ValueError(f"{name} is {value}, must be {low} to {high}")
+        if self.batch % 2:
+            raise ValueError(f"batch is {self.batch}, must be even")
         if not 0 < self.peak_lr <= 1:
             raise ValueError(f"peak_lr is {self.peak_lr}, must be above 0 and at most 1")
         if not 0 <= self.cell_dropout <= 1:

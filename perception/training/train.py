@@ -13,8 +13,9 @@ import csv
 import json
 import logging
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,15 +32,17 @@ from sortie.perception.network.checkpoint import load_weights, read_config
 from sortie.perception.network.fusion.own import OwnFusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.model import CarNet, ModelConfig
-from sortie.perception.training.learn import SHARDS, Thinning, apply, draw_batch, gradients
+from sortie.perception.training.learn import SHARDS, Batch, Thinning, apply, draw_batch, gradients
 from sortie.perception.training.recipe import PEAK_LR, Recipe, benchmark_root
 from sortie.perception.training.validation import history, publish, validate, validate_all
 from sortie.scenarios.streams import stream
 
+AHEAD = 2
+"""So many steps ahead their batches are drawn."""
 SAVE_STEPS, SAVE_S = 100, 120.0
 """A checkpoint is written every so many steps, and after so many seconds."""
-CHECK_STEPS, CHECK_FRAMES, CHECK_EGOS = 100, 12, 2
-"""Validation AP is looked at every so many steps, on so many frames with so many egos each."""
+CHECK_STEPS, CHECKS, CHECK_FRAMES, CHECK_EGOS = 100, 20, 12, 2
+"""Validation AP is looked at every so many steps, in a long run so many times, on so many frames with so many egos each."""
 
 log_to_nowhere = logging.getLogger("sortie.train")
 Scalars = Callable[[int, dict[str, float]], None]
@@ -129,7 +132,7 @@ def train(
         varied = load_frames(
             make_split(other, "train", root, scenes=recipe.scenes, progress=lambda i, n: tell("rendering varied", i, n))
         )
-    check = _first(validation, CHECK_FRAMES)
+    check, check_steps = _first(validation, CHECK_FRAMES), max(CHECK_STEPS, recipe.steps // CHECKS // 10 * 10)
     log.info("%d training frames in %d scenes", len(data), len(files))
 
     torch.manual_seed(recipe.seed)
@@ -148,10 +151,14 @@ def train(
     for step, row in rows:
         show(step, row)
     replicas = [copy.deepcopy(net) for _ in range(SHARDS)]
-    with ThreadPoolExecutor(SHARDS) as pool:
+
+    def draw(step: int, shard: int) -> Batch:
+        from_varied = recipe.varied and stream(recipe.seed, 0, step, "train.varied").random() < recipe.varied
+        return draw_batch(varied if from_varied else data, recipe, step, shard, config.geometry)
+
+    with ThreadPoolExecutor(SHARDS) as pool, ThreadPoolExecutor(SHARDS) as drawing:
         saved_s = time.monotonic()
-        for step in range(done, recipe.steps):
-            from_varied = recipe.varied and stream(recipe.seed, 0, step, "train.varied").random() < recipe.varied
+        for step, batches in _drawn_ahead(drawing, draw, range(done, recipe.steps)):
             rate = learning_rate(step, recipe.steps, recipe.peak_lr)
             for group in optimiser.param_groups:
                 group["lr"] = rate
@@ -159,13 +166,12 @@ def train(
                 pool.submit(
                     gradients,
                     r,
-                    draw_batch(varied if from_varied else data, recipe.seed, step, i),
-                    stream(recipe.seed, 0, (step, i), "train.egos"),
+                    batch,
                     where,
                     Thinning.of(recipe, step, i),
                     recipe.precision,
                 )
-                for i, r in enumerate(replicas)
+                for i, (r, batch) in enumerate(zip(replicas, batches, strict=True))
             ]
             values, grads = zip(*(job.result() for job in jobs), strict=True)
             apply(net, replicas, list(grads), optimiser)
@@ -174,7 +180,7 @@ def train(
             late = minutes is not None and time.monotonic() - begun > 60 * minutes
             if done % 10 == 0 or done == recipe.steps or late:
                 row = {"train/loss": float(np.mean(recent)), "train/lr": rate}
-                if done % CHECK_STEPS == 0 and done < recipe.steps:
+                if done % check_steps == 0 and done < recipe.steps:
                     gain = validate(copy.deepcopy(net), check, where, CHECK_EGOS)
                     row |= {"validation/ap_single": gain.ap_a, "validation/ap_full": gain.ap_b}
                 _note(curve, done, row)
@@ -191,7 +197,13 @@ def train(
     spent = before.spent_s + time.monotonic() - begun
     loss = float(np.mean(recent))
 
-    facts = {**asdict(recipe), "done": done, "loss": round(loss, 4), "minutes": round(spent / 60, 1)}
+    facts = {
+        **asdict(recipe),
+        "device": _called(where),
+        "done": done,
+        "loss": round(loss, 4),
+        "minutes": round(spent / 60, 1),
+    }
     levels = validate_all(net, validation, bench, where, lambda i, n: tell("validating", i, n))
     publish(net.cpu(), out, bench, [*history(warm_start), facts], levels)
     usual = levels[0].gain
@@ -200,18 +212,34 @@ def train(
     return TrainResult(out, done, loss, usual, len(data), spent / 60)
 
 
+def _drawn_ahead(
+    pool: ThreadPoolExecutor, draw: Callable[[int, int], Batch], steps: range
+) -> Iterator[tuple[int, list[Batch]]]:
+    """Each step and the batches of its shards, which are drawn while earlier steps are computed."""
+    coming: deque[list[Future[Batch]]] = deque()
+    for step in steps:
+        for later in range(step + len(coming), min(step + AHEAD + 1, steps.stop)):
+            coming.append([pool.submit(draw, later, shard) for shard in range(SHARDS)])
+        yield step, [job.result() for job in coming.popleft()]
+
+
 def device_named(name: str | None) -> torch.device:
-    """Where to train: "cpu", "cuda" or one of several as in "cuda:1"; left out, cuda where there is one.
+    """Where to train: "cpu", "cuda" or one of several as in "cuda:1"; "auto" or left out, cuda where there is one.
 
     Raises:
         ValueError: there is none of that name here.
     """
-    there = ["cpu"]
+    there = ["auto", "cpu"]
     if torch.cuda.is_available():
         there += ["cuda", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))]
     if name is not None and name not in there:
         raise ValueError(f"device is {name!r}, must be one of {', '.join(there)} here")
-    return torch.device(name or ("cuda" if "cuda" in there else "cpu"))
+    return torch.device(("cuda" if "cuda" in there else "cpu") if name in (None, "auto") else name)
+
+
+def _called(device: torch.device) -> str:
+    """What a card calls the machine of a run."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{SHARDS} cores"
 
 
 def _first(frames: Frames, count: int) -> Frames:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames
+from sortie.perception.benchmark.difficulty import VARIED
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
@@ -19,7 +20,7 @@ from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.checkpoint import read_facts, save_weights
 from sortie.perception.network.model import CarNet
-from sortie.perception.training.learn import EGOS, SHARD_FRAMES, SHARDS
+from sortie.perception.training.learn import EGOS
 from sortie.perception.training.recipe import command, of_benchmark
 from sortie.scenarios.report_text import interval, table
 
@@ -89,19 +90,21 @@ def publish(
 
 def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
     """The model card, Markdown, from the facts in the weights file."""
-    bench = facts["benchmark"]
+    bench, runs = facts["benchmark"], facts["runs"]
+    outs = [*(r["warm_start"] for r in runs[1:]), name]
     made = "\n".join(
         table(
-            ("run", "made by", "steps done", "loss, mean of the last 50", "minutes on two shared cores"),
+            ("run", "made by", "steps done", "loss, mean of the last 50", "minutes", "on"),
             (
                 (
                     f"{k}",
-                    f"`{command(r, model, bench['seed'], name)}`",
+                    f"`{command(r, model, bench['seed'], out)}`",
                     f"{r['done']}",
                     f"{r['loss']:.3f}",
                     f"{r['minutes']:.0f}",
+                    r.get("device", "two shared cores"),
                 )
-                for k, r in enumerate(facts["runs"], 1)
+                for k, (r, out) in enumerate(zip(runs, outs, strict=False), 1)
             ),
         )
     )
@@ -125,14 +128,22 @@ def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
             ),
         )
     )
-    last: dict[str, Any] = (
-        facts["runs"][-1] if facts["runs"] else {"scenes": 0, "cell_dropout": 0.0, "unsent": "masked"}
+    last: dict[str, Any] = {"batch": 4, "varied": 0.0} | (
+        runs[-1] if runs else {"scenes": 0, "cell_dropout": 0.0, "unsent": "masked"}
     )
     dropped = (
         f"In {100 * last['cell_dropout']:.0f} % of links only a random part of the cells arrived ({last['unsent']})."
         if last["cell_dropout"]
         else "Full sharing only: no cells were dropped, so what a starved budget does is a property of the fusion."
     )
+    varied, heights, headings = "", "55–65 m", "within a few degrees of each other"
+    if last["varied"]:
+        low, high = VARIED.altitude_m
+        heights, headings = f"{low:g}–{high:g} m", f"that differ by {VARIED.yaw_sigma_deg:g}° (standard deviation)"
+        varied = (
+            f" In {100 * last['varied']:.0f} % of the steps the frames are of as many varied scenes: dense traffic, fleets "
+            f"{heights} up, headings {headings}."
+        )
     scenes, per_scene = SIZES["validation"]
     return f"""# {name}
 
@@ -141,8 +152,8 @@ Weights of `perception/network/model.py`, float32: {", ".join(f"{k} {v}" for k, 
 {made}
 
 **Data**: {last["scenes"] * SIZES["train"][1]} fleet-frames of five drones in {last["scenes"]} scenes, the train split of benchmark
-`{bench["key"]}` (seed {bench["seed"]}, {bench["density"]} density, ±{bench["half_extent_m"]:g} m; `sortie bench make`); no outside data.
-**Learning**: {SHARDS * SHARD_FRAMES} frames a step, AdamW, one cycle; mirrored and turned by quarters. In each frame {EGOS} drones fuse everyone
+`{bench["key"]}` (seed {bench["seed"]}, {bench["density"]} density, ±{bench["half_extent_m"]:g} m; `sortie bench make`); no outside data.{varied}
+**Learning**: {last["batch"]} frames a step, AdamW, one cycle; mirrored and turned by quarters. In each frame {EGOS} drones fuse everyone
 present (two to five) and one is alone, so a third of the supervised outputs are single-drone: the head works without peers.
 {dropped}
 
@@ -152,6 +163,6 @@ Validation split: {scenes * per_scene} fleet-frames in {scenes} scenes, every dr
 drone's *estimated* pose, so its heading error moves every far box: 0.5° is 0.7 m at 80 m, and a car is 1.85 m wide. Every car
 inside the ego's square counts, whether anyone can see it or not.
 
-**Made for** five drones 17–23 m apart, 55–65 m up, headings within a few degrees of each other, banks of a few degrees, towns of
+**Made for** five drones 17–23 m apart, {heights} up, headings {headings}, banks of a few degrees, towns of
 this generator. **Not made for** other altitudes, peers that look another way, real images.
 """

@@ -78,7 +78,7 @@ class Perception(Section):
     )
     weights: str | None = Field(
         None,
-        description="A safetensors file: the network's, or the surrogate's calibration; left out, the shipped one.",
+        description="A safetensors file: the network's, or the surrogate's calibration; left out, the shipped one. `fine.safetensors` names the second network that is shipped.",
     )
     codebook: str | None = Field(
         None,

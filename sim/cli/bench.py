@@ -152,9 +152,9 @@ def difficulty(
     """Measure how each parameter of the difficulty changes AP. An interrupted run continues."""
     with user_errors(), stages() as report:
         from sortie.perception.evaluation.difficulty_effects import measure
-        from sortie.perception.network.detector import SHIPPED_WEIGHTS
+        from sortie.perception.network.detector import named_weights
 
-        used = weights or SHIPPED_WEIGHTS
+        used = named_weights(weights)
         effects = measure(used, store, scenes=scenes, workers=workers, progress=partial(report, "scenes"))
     title = f"AP@0.5 without a threshold, {scenes} scenes, {used.name}; change of AP sharing all, paired by scene, 95 %"
     table = Table("parameter", "moved to", "AP alone", "AP sharing all", "change, points", title=title)

@@ -45,10 +45,10 @@ def fit_codebook(
     from sortie.perception.benchmark.dataset import Benchmark  # here: torch takes a second to import
     from sortie.perception.files import CODEBOOK, beside
     from sortie.perception.network.checkpoint import load_weights
-    from sortie.perception.network.detector import SHIPPED_WEIGHTS
+    from sortie.perception.network.detector import named_weights
     from sortie.perception.training.codebook import CodebookRecipe, make_codebook
 
-    path = weights or SHIPPED_WEIGHTS
+    path = named_weights(weights)
     target = out_file or beside(path, CODEBOOK)
     recipe = CodebookRecipe(stages_, scenes, iterations, seed)
     with user_errors():
@@ -95,9 +95,12 @@ def fit_errors(
     with user_errors():
         if boxes is Boxes.surrogate:
             from sortie.perception.surrogate.model import SHIPPED
+
+            path = weights or SHIPPED
         else:
-            from sortie.perception.network.detector import SHIPPED_WEIGHTS as SHIPPED
-        path = weights or SHIPPED
+            from sortie.perception.network.detector import named_weights
+
+            path = named_weights(weights)
         target = out_file or beside(path, ERRORS)
         ensure_files(target)
         if boxes is Boxes.surrogate:

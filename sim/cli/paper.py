@@ -88,7 +88,7 @@ def paper(
         refuse(context, ("against", "readme"), "the whole report, not with --frame")
     from sortie.perception.evaluation import figures, rows
     from sortie.perception.evaluation.results import TableSettings
-    from sortie.perception.network.detector import SHIPPED_WEIGHTS  # here: torch takes a second to import
+    from sortie.perception.network.detector import named_weights  # here: torch takes a second to import
     from sortie.sim.studies import paper as making
 
     chosen = {"both": ("zero", "masked"), "zero": ("zero",), "masked": ("masked",)}.get(unsent)
@@ -109,7 +109,7 @@ def paper(
         asked = TableSettings(chosen, cells_by, tau, "scene" if scenes else "frame", ways=ways)  # type: ignore[arg-type]
         cores = workers or os.cpu_count() or 1
         job = making.PaperSettings(
-            weights or SHIPPED_WEIGHTS, asked, frames, seed, cores, _command(context), live, fusion_params
+            named_weights(weights), asked, frames, seed, cores, _command(context), live, fusion_params
         )
         if frame is not None:
             _open_frame(

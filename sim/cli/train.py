@@ -49,9 +49,13 @@ def train(
     out_file: Annotated[
         Path, typer.Option("--out", help="File for the weights (safetensors); their card is written beside it.")
     ] = Path("runs/train/disconet.safetensors"),
-    steps: Annotated[int, typer.Option(help="Optimiser steps of four fleet-frames.", min=1)] = 500,
+    steps: Annotated[int, typer.Option(help="Optimiser steps.", min=1)] = 500,
+    batch: Annotated[int, typer.Option(help="Fleet-frames a step, an even number.", min=2)] = 4,
     scenes: Annotated[
-        int, typer.Option(help="Number of scenes of the train split, from the first.", min=1, max=100)
+        int,
+        typer.Option(
+            help="Number of scenes of the train split, from the first; beyond its usual 100, more are made.", min=1
+        ),
     ] = 100,
     seed: Annotated[int, typer.Option(help="Seed of weights and batches.", min=0)] = 0,
     peak_lr: Annotated[float, typer.Option(help="The cycle's highest learning rate.")] = 2.5e-3,
@@ -89,7 +93,7 @@ def train(
         ),
     ] = None,
     minutes: Annotated[float | None, typer.Option(help="Stop after this many minutes.", min=0.1)] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda; default: cuda where available.")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu, cuda, or auto: cuda where available; default: auto.")] = None,
     resume: Annotated[bool, typer.Option(help="Continue from the last checkpoint.")] = True,
 ) -> None:
     """Train the detector on the benchmark's train split. An interrupted run continues.
@@ -98,7 +102,7 @@ def train(
     """
     from sortie.perception.benchmark.dataset import Benchmark  # here: torch takes a second to import
     from sortie.perception.geometry import Geometry
-    from sortie.perception.network.detector import shipped
+    from sortie.perception.network.detector import named_weights, shipped
     from sortie.perception.network.fusion.registry import FUSIONS
     from sortie.perception.network.model import ModelConfig
     from sortie.perception.training.recipe import Recipe
@@ -109,10 +113,11 @@ def train(
 
     half_extent_m = float(range_.value)
     with user_errors():  # before scenes are rendered, which takes minutes
-        if str(warm_start) in FUSIONS:
-            warm_start = shipped(str(warm_start))
+        if warm_start is not None:
+            warm_start = shipped(str(warm_start)) if str(warm_start) in FUSIONS else named_weights(warm_start)
         recipe = Recipe(
             steps=steps,
+            batch=batch,
             seed=seed,
             scenes=scenes,
             peak_lr=peak_lr,

@@ -20,12 +20,15 @@ from sortie.perception.network.fusion.base import PerCell, weighted_sum
 
 
 class EdgeWeights(nn.Module):
-    """One logit ≥ 0 per row and agent: per-cell layers 160 → 128 → 32 → 8 → 1, batch norm on the first three."""
+    """One logit ≥ 0 per row and agent, by layers a cell with batch norm on all but the last.
+
+    Of 80 channels, 160 → 128 → 32 → 8 → 1; of others, which are of finer cells, 2 c → 24 → 16 → 8 → 1.
+    """
 
     def __init__(self, channels: int = CHANNELS) -> None:
         super().__init__()
         self.channels = channels
-        widths = (2 * channels, 8 * channels // 5, 32, 8)
+        widths = (2 * channels, 128, 32, 8) if channels == CHANNELS else (2 * channels, 24, 16, 8)
         self.layers = nn.ModuleList(nn.Linear(a, b, bias=False) for a, b in pairwise(widths))
         self.norms = nn.ModuleList(nn.BatchNorm1d(b) for b in widths[1:])
         self.last = nn.Linear(widths[-1], 1)

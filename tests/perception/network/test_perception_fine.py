@@ -22,11 +22,10 @@ from sortie.perception.network.inference import folded
 from sortie.perception.network.model import Align, CarNet, ModelConfig
 from sortie.perception.network.warp import arriving, moved, support
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.training.learn import _fit, draw_batch, gradients, loss_of, step_loss
+from sortie.perception.training.learn import _fit, draw_batch, gradients, loss_of, step_loss, targets
 from sortie.perception.training.recipe import Recipe
 from sortie.perception.types import Share
 from sortie.scenarios.schema import Perception, Scene, Target
-from sortie.scenarios.streams import stream
 
 FINE = ModelConfig(grid="fine")
 CPU = torch.device("cpu")
@@ -82,8 +81,8 @@ def test_the_correction_begins_as_none_and_leaves_silence() -> None:
     said[0, :10] = 0.0
     offset, turn = torch.rand(2, 30, 2) - 0.5, torch.tensor([0.0, 1.0])
     assert torch.equal(align(said, offset, turn), said)
-    torch.nn.init.normal_(align.narrow.weight)
-    torch.nn.init.normal_(align.narrow.bias)
+    torch.nn.init.normal_(align.out.weight)
+    torch.nn.init.normal_(align.out.bias)
     with torch.inference_mode():
         out = align(said, offset, turn)
         assert not out[0, :10].any()
@@ -199,32 +198,29 @@ def test_fit_is_the_overlap_of_the_told_box_with_the_true_one() -> None:
 def test_the_fit_is_learned_where_cars_are() -> None:
     car = np.array([[10.0, 5.0, 4.5, 1.85, 0.0]])
     out = torch.zeros(1, 8, 128, 128, requires_grad=True)
-    (slope,) = torch.autograd.grad(loss_of(out, [car]), out)
+    (slope,) = torch.autograd.grad(loss_of(out, targets([car])), out)
     out = out.detach()
     at = [round((v + 102.4) / 1.6 - 0.5) for v in (10.0, 5.0)]
     assert slope[0, 7].nonzero().tolist() == [[at[0] + i, at[1] + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    assert float(loss_of(out[:, :7], [car])) < float(loss_of(out, [car]))
+    assert float(loss_of(out[:, :7], targets([car]))) < float(loss_of(out, targets([car])))
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_every_part_learns(fleet: Frames, precision: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sortie.perception.training.learn.SHARD_FRAMES", 1)
+def test_every_part_learns(fleet: Frames, precision: str) -> None:
     net = network().train()
-    batch, rng = draw_batch(fleet, 0, 1, 0), stream(0, 0, (1, 0), "train.egos")
-    loss, slopes = gradients(net, batch, rng, CPU, None, precision)  # type: ignore[arg-type]
+    loss, slopes = gradients(net, draw_batch(fleet, Recipe(batch=2), 1, 0), CPU, None, precision)  # type: ignore[arg-type]
     assert math.isfinite(loss)
     silent = [name for (name, _), g in zip(net.named_parameters(), slopes, strict=True) if not g.any()]
     assert silent == []
     assert all(g.dtype == torch.float32 and bool(g.isfinite().all()) for g in slopes)
 
 
-def test_half_the_digits_give_nearly_the_same_loss(fleet: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sortie.perception.training.learn.SHARD_FRAMES", 1)
-    net, batch = network().train(), draw_batch(fleet, 0, 1, 0)
+def test_half_the_digits_give_nearly_the_same_loss(fleet: Frames) -> None:
+    net, batch = network().train(), draw_batch(fleet, Recipe(batch=2), 1, 0)
 
     def loss(half: bool) -> float:
         with torch.autocast("cpu", torch.bfloat16, enabled=half), torch.no_grad():
-            return float(step_loss(net, batch, stream(0, 0, (1, 0), "train.egos"), CPU))
+            return float(step_loss(net, batch, CPU))
 
     assert loss(half=True) == pytest.approx(loss(half=False), rel=0.02)
     assert loss(half=True) != loss(half=False)

@@ -136,11 +136,11 @@ def test_features_survive_the_radio_unchanged(net: CarNet) -> None:
 
 def perfect(cars: np.ndarray) -> torch.Tensor:
     """The head output that says exactly what `targets` asks for."""
-    heat, cells, values, weight = targets(cars)
+    labels = targets([cars])
     out = torch.zeros(7, 128, 128)
-    out[0] = torch.logit(torch.from_numpy(heat).clamp(1e-4, 1 - 1e-4))
-    order = np.argsort(weight, kind="stable")  # where two cars claim a cell the nearer one has it
-    out[1:].flatten(1)[:, torch.from_numpy(cells[order])] = torch.from_numpy(values[order]).T
+    out[0] = torch.logit(labels.heat[0].clamp(1e-4, 1 - 1e-4))
+    order = labels.weight.argsort(stable=True)  # where two cars claim a cell the nearer one has it
+    out[1:].flatten(1)[:, labels.cell[order]] = labels.values[order].T
     return out
 
 
@@ -175,12 +175,12 @@ def test_decoding_inverts_the_targets() -> None:
 
 def test_the_loss_knows_right_from_wrong() -> None:
     cars = np.array([(10.3, -20.1, 4.4, 1.8, 0.3), (-60.0, 60.0, 5.5, 2.0, 1.5)])
-    right = loss_of(perfect(cars)[None], [cars])
+    right = loss_of(perfect(cars)[None], targets([cars]))
     shifted = cars + np.array([1.6, 0, 0, 0, 0])
     assert right < 0.6
-    assert loss_of(perfect(shifted)[None], [cars]) > right + 1
-    assert loss_of(perfect(cars * [1, 1, 1.2, 1, 1])[None], [cars]) > right + 0.03
-    assert torch.isfinite(loss_of(torch.zeros(1, 7, 128, 128), [cars[:0]]))
+    assert loss_of(perfect(shifted)[None], targets([cars])) > right + 1
+    assert loss_of(perfect(cars * [1, 1, 1.2, 1, 1])[None], targets([cars])) > right + 0.03
+    assert torch.isfinite(loss_of(torch.zeros(1, 7, 128, 128), targets([cars[:0]])))
 
 
 def test_weights_come_back_as_they_went(net: CarNet, tmp_path: Path) -> None:

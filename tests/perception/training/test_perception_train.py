@@ -2,6 +2,7 @@
 
 import json
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +26,8 @@ from sortie.perception.training.train import learning_rate, train
 from sortie.perception.training.validation import card
 from sortie.scenarios.streams import stream
 
+CPU = torch.device("cpu")
+
 
 @pytest.fixture(scope="module")
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -41,7 +44,6 @@ def small(monkeypatch: pytest.MonkeyPatch, scene_file: Path) -> None:
     """Training and validation on the two frames."""
     monkeypatch.setattr(training, "make_split", lambda *_, **__: [scene_file])
     monkeypatch.setattr("sortie.perception.training.validation.LEVELS", ((1.0, 1.0),))
-    monkeypatch.setattr("sortie.perception.training.learn.SHARD_FRAMES", 1)
 
 
 def test_turning_and_mirroring_keep_cars_on_their_pixels(frames: Frames) -> None:
@@ -59,10 +61,10 @@ def test_turning_and_mirroring_keep_cars_on_their_pixels(frames: Frames) -> None
         )
 
     for step in range(8):
-        batch = draw_batch(frames, 3, step, 0)
-        cars = local_cars(batch.cars[0], batch.pose[0, 0])
-        assert busy(batch.images[0, 0].numpy(), cars) > 1.5
-        assert busy(batch.images[0, 0].numpy(), cars * [-1, 1, 1, 1, 1]) < busy(batch.images[0, 0].numpy(), cars)
+        batch = draw_batch(frames, Recipe(seed=3, batch=2), step, 0)
+        image, cars = batch.seen(CPU)[0, 0].numpy(), local_cars(batch.cars[0], batch.pose[0, 0])
+        assert busy(image, cars) > 1.5
+        assert busy(image, cars * [-1, 1, 1, 1, 1]) < busy(image, cars)
 
 
 def test_turning_and_mirroring_keep_headings_and_what_drones_believe(frames: Frames) -> None:
@@ -70,7 +72,7 @@ def test_turning_and_mirroring_keep_headings_and_what_drones_believe(frames: Fra
     seen = frames.true_pose
     errors = frames.est_pose[..., 2] - seen[..., 2]
     for step in range(8):
-        batch = draw_batch(frames, 3, step, 0)
+        batch = draw_batch(frames, Recipe(seed=3, batch=2), step, 0)
         error = batch.est[..., 2] - batch.pose[..., 2]
         for k in range(len(batch.cars)):
             near = np.abs(np.abs(error[k])[:, None] - np.abs(errors.ravel())).min(axis=1)
@@ -83,10 +85,15 @@ def test_turning_and_mirroring_keep_headings_and_what_drones_believe(frames: Fra
 
 
 def test_batches_follow_from_seed_step_and_shard(frames: Frames) -> None:
-    a, b = draw_batch(frames, 0, 4, 1), draw_batch(frames, 0, 4, 1)
-    assert np.array_equal(a.images, b.images)
+    a, b = draw_batch(frames, Recipe(seed=0, batch=2), 4, 1), draw_batch(frames, Recipe(seed=0, batch=2), 4, 1)
+    assert np.array_equal(a.seen(CPU), b.seen(CPU))
     assert np.array_equal(a.est, b.est)
-    others = [draw_batch(frames, 1, 4, 1), draw_batch(frames, 0, 5, 1), draw_batch(frames, 0, 4, 0)]
+    assert torch.equal(a.labels.heat, b.labels.heat)
+    others = [
+        draw_batch(frames, Recipe(seed=1, batch=2), 4, 1),
+        draw_batch(frames, Recipe(seed=0, batch=2), 5, 1),
+        draw_batch(frames, Recipe(seed=0, batch=2), 4, 0),
+    ]
     assert not any(a.images.shape == o.images.shape and np.array_equal(a.images, o.images) for o in others)
 
 
@@ -96,7 +103,7 @@ def test_keys_and_queries_learn_from_the_detection_loss(frames: Frames) -> None:
     def grads() -> dict[str, torch.Tensor]:
         torch.manual_seed(3)
         net = CarNet(ModelConfig(fusion="when2com")).train()
-        _, found = gradients(net, draw_batch(frames, 0, 1, 0), np.random.default_rng(1), torch.device("cpu"))
+        _, found = gradients(net, draw_batch(frames, Recipe(seed=0, batch=2), 1, 0), CPU)
         named = zip(net.named_parameters(), found, strict=True)
         return {name: grad for (name, _), grad in named if name.startswith("fusion.handshake.")}
 
@@ -118,7 +125,9 @@ def test_the_rate_rises_and_falls() -> None:
     ("field", "value", "message"),
     [
         ("steps", 0, "steps is 0, must be 1 to 1000000"),
-        ("scenes", 101, "scenes is 101, must be 1 to 100"),
+        ("scenes", 10_001, "scenes is 10001, must be 1 to 10000"),
+        ("batch", 1, "batch is 1, must be 2 to 1024"),
+        ("batch", 5, "batch is 5, must be even"),
         ("peak_lr", 0.0, "peak_lr is 0.0, must be above 0 and at most 1"),
         ("cell_dropout", 1.5, "cell_dropout is 1.5, must be 0 to 1"),
         ("unsent", "half", "unsent is 'half', must be masked or zero"),
@@ -222,7 +231,7 @@ def test_a_share_of_the_steps_is_on_the_varied_scenes(
 ) -> None:
     """Which scenes a step is drawn from follows from the seed alone."""
     other = make_scene_file(Benchmark(difficulty=VARIED), "train", 77, 1, tmp_path / "scene_78_1.npz")
-    scenes: list[int] = []
+    scenes: dict[int, int] = {}
 
     def split(bench: Benchmark, *_: object, **__: object) -> list[Path]:
         return [other if bench.difficulty == VARIED else scene_file]
@@ -230,19 +239,17 @@ def test_a_share_of_the_steps_is_on_the_varied_scenes(
     class Stop(Exception):
         """The steps have been drawn."""
 
-    def draw(frames: Frames, seed: int, step: int, shard: int) -> object:
-        scenes.append(int(frames.scene[0]))
+    def draw(frames: Frames, recipe: Recipe, step: int, *_: object) -> None:
         if step == 19:
             raise Stop
-        return None
+        scenes[step] = int(frames.scene[0])
 
     monkeypatch.setattr(training, "make_split", split)
     monkeypatch.setattr(training, "draw_batch", draw)
     monkeypatch.setattr(training, "gradients", lambda net, *_: (1.0, [torch.zeros_like(p) for p in net.parameters()]))
     with pytest.raises(Stop):
         train(tmp_path / "w.safetensors", Recipe(steps=30, varied=0.3), device="cpu", resume=False)
-    steps = scenes[:-1:2]
-    assert len(steps) == 19
+    steps = [scenes[step] for step in range(19)]
     assert steps.count(78) == sum(stream(0, 0, step, "train.varied").random() < 0.3 for step in range(19)) > 0
     assert steps.count(77) > steps.count(78)
 
@@ -267,7 +274,7 @@ class Runs:
         monkeypatch.setattr(training, "validate_all", lambda *_: [SimpleNamespace(gain=gain)])
         monkeypatch.setattr(training, "publish", lambda net, out, bench, runs, levels: self.published.append(runs[-1]))
 
-    def _draw(self, frames: Frames, seed: int, step: int, shard: int) -> int:
+    def _draw(self, frames: Frames, recipe: Recipe, step: int, *_: object) -> int:
         if step == self.killed_at:
             raise Killed
         return step
@@ -319,3 +326,35 @@ def test_a_line_of_the_curve_that_a_kill_cut_is_left_out(cut: str, tmp_path: Pat
     curve.write_text(f"step,loss,lr,ap_single,ap_full\n10,2.5,0.001,,\n{cut}")
     assert training._resume_curve(curve, 40) == [(10, {"train/loss": 2.5, "train/lr": 0.001})]
     assert curve.read_text().splitlines() == ["step,loss,lr,ap_single,ap_full", "10,2.5,0.001,,"]
+
+
+def test_batches_are_drawn_ahead_and_come_in_order() -> None:
+    """No more than two steps ahead, and a batch that cannot be drawn fails at its own step."""
+    drawn: list[int] = []
+
+    def draw(step: int, shard: int) -> tuple[int, int]:
+        drawn.append(step)
+        if step == 5:
+            raise Killed
+        return step, shard
+
+    with ThreadPoolExecutor(1) as pool:
+        steps: Any = training._drawn_ahead(pool, draw, range(2, 9))  # type: ignore[arg-type]
+        for wanted in (2, 3, 4):
+            assert next(steps) == (wanted, [(wanted, 0), (wanted, 1)])
+            assert max(drawn) <= wanted + 2
+        with pytest.raises(Killed):
+            next(steps)
+
+
+def test_a_device_is_chosen_by_name_or_left_to_what_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert {str(training.device_named(name)) for name in (None, "auto", "cpu")} == {"cpu"}
+    with pytest.raises(ValueError, match="device is 'cuda', must be one of auto, cpu here"):
+        training.device_named("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert [str(training.device_named(name)) for name in (None, "auto", "cuda:1")] == ["cuda", "cuda", "cuda:1"]
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Some Card")
+    assert training._called(torch.device("cuda")) == "Some Card"
+    assert training._called(torch.device("cpu")) == "2 cores"

@@ -42,7 +42,10 @@ def test_a_drone_learns_the_cars_of_its_own_square_in_its_own_frame() -> None:
 
 def test_targets_lie_about_each_car_and_say_where_it_is_and_how_it_is_turned() -> None:
     """Heat is 1 in the nearest cell, else a Gaussian of 0.8 cells; what is learned lies in three by three cells."""
-    heat, cells, values, weight = targets(CARS, HALF)
+    labels = targets([CARS, CARS[:1]], HALF)
+    first = labels.sample == 0
+    assert torch.equal(labels.sample, labels.sample.sort().values), "output by output"
+    assert labels.cars == len(CARS) + 1
     cell_m = 102.4 / HEAD_PX
     at = (CARS[:, :2] + 51.2) / cell_m - 0.5
     expected = np.zeros((HEAD_PX, HEAD_PX))
@@ -58,8 +61,8 @@ def test_targets_lie_about_each_car_and_say_where_it_is_and_how_it_is_turned() -
                     size = np.log(car[2:4] / REFERENCE_SIZE_M)
                     turn = np.sin(2 * car[4]), np.cos(2 * car[4])
                     rows.append((cell[0] * HEAD_PX + cell[1], *(place - cell), *size, *turn, g))
-    np.testing.assert_allclose(heat, expected, atol=1e-6)
-    table = np.column_stack([cells, values, weight])
+    np.testing.assert_allclose(labels.heat[0], expected, atol=1e-6)
+    table = np.column_stack([part[first] for part in (labels.cell, labels.values, labels.weight)])
     rows = np.array(rows)
     np.testing.assert_allclose(
         table[np.lexsort((table[:, 3], table[:, 0]))], rows[np.lexsort((rows[:, 3], rows[:, 0]))], atol=1e-5
@@ -72,21 +75,21 @@ def test_a_loss_is_that_of_heat_by_cars_and_of_boxes_by_weight(planes: int) -> N
     torch.manual_seed(3)
     out = 0.5 * torch.randn(2, planes, HEAD_PX, HEAD_PX)
     labels = [CARS, CARS[:1]]
-    made = [targets(c, HALF) for c in labels]
+    made = [targets([c], HALF) for c in labels]
     logit = out[:, 0].numpy().astype(float)
-    p, heat = 1 / (1 + np.exp(-logit)), np.stack([m[0] for m in made])
+    p, heat = 1 / (1 + np.exp(-logit)), np.concatenate([m.heat for m in made])
     centre = heat > 0.9999
     focal = -((1 - p) ** 2 * np.log(p))[centre].sum() - ((1 - heat) ** 4 * p**2 * np.log(1 - p))[~centre].sum()
-    said = np.concatenate([out[k, 1:].flatten(1).numpy()[:, m[1]].T for k, m in enumerate(made)])
-    want, weight = np.concatenate([m[2] for m in made]), np.concatenate([m[3] for m in made])
+    said = np.concatenate([out[k, 1:].flatten(1).numpy()[:, m.cell].T for k, m in enumerate(made)])
+    want, weight = np.concatenate([m.values for m in made]), np.concatenate([m.weight for m in made])
     scale = np.array([1, 1, 0.5, 0.5, 0.4, 0.4]) * ([2, 2, 1, 1, 1, 1] if planes == 8 else 1)
     expected = focal / 4 + (np.abs(said[:, :6] - want) * scale * weight[:, None]).sum() / weight.sum()
     if planes == 8:
         fit, x = _fit(said[:, :6], want, HALF.head_m), said[:, 6]
         each = np.logaddexp(0, -x) * fit + np.logaddexp(0, x) * (1 - fit)
         expected += (each * weight).sum() / weight.sum()
-    assert float(loss_of(out, labels, HALF)) == pytest.approx(expected, rel=1e-4)
-    assert float(loss_of(out, [c[:0] for c in labels], HALF)) > 0
+    assert float(loss_of(out, targets(labels, HALF), HALF)) == pytest.approx(expected, rel=1e-4)
+    assert float(loss_of(out, targets([c[:0] for c in labels], HALF), HALF)) > 0
 
 
 def test_a_fit_is_the_overlap_of_the_boxes_that_are_meant() -> None:
