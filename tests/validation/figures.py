@@ -470,6 +470,12 @@ def _difficulty() -> Tables:
     return {"difficulty": Table([Column("parameter"), Column("moved to"), *ap, *gains], rows, about)}
 
 
+def _fine_network() -> Tables:
+    import fine_network
+
+    return fine_network.tables(WORK, ROOT / "runs/bench")
+
+
 def _survey() -> Tables:
     """As `sortie bench survey --scenes 40`."""
     from sortie.perception.benchmark.dataset import SIZES, Benchmark
@@ -726,6 +732,7 @@ FIGURES: dict[str, Figure] = {
     "ranking_by_torch": Figure(20, _ranking_by_torch),
     "handshakes": Figure(5, _handshakes),
     "requests": Figure(5, _requests),
+    "fine_network": Figure(25, _fine_network, timed=True),
     "fusion_methods": Figure(25, _fusion_methods),
     "paper_seeds": Figure(30, _paper_seeds),
     "held_out": Figure(30, _held_out),
