@@ -202,7 +202,7 @@ def _joined_many(
     if not every:
         return out
     counts = [len(s.boxes) for s in every]
-    boxes = Boxes.join([_moved(s) for s in every])
+    boxes = Boxes.join([boxes_at_fusion(s) for s in every])
     source = np.repeat(np.arange(len(every)), counts)
     first = np.cumsum([0, *map(len, sources_of)])  # of each ego's sources
     ego_of = np.repeat(np.arange(len(receivers)), np.diff(first))  # of each source
@@ -265,7 +265,7 @@ def _of_one_thing(boxes: Boxes, source: NDArray[np.intp], ego: NDArray[np.intp])
     return np.concatenate([i[same], a[near]]), np.concatenate([j[same], b[near]])
 
 
-def _moved(source: SourceBoxes) -> Boxes:
+def boxes_at_fusion(source: SourceBoxes) -> Boxes:
     """The boxes of a source where they are at the fusion, as far as their velocities are known."""
     boxes, velocity = source.boxes, source.velocity_mps
     if velocity is None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.classes import TargetClass
-from sortie.perception.geometry import USUAL, Cameras, to_world
+from sortie.perception.geometry import USUAL, Cameras, to_local, to_world
 from sortie.perception.motion import Tracks
 from sortie.perception.uncertainty import BoxErrors
 from sortie.scenarios.disc import Disc
@@ -142,6 +142,15 @@ class Boxes:
     def table(self) -> NDArray[np.float64]:
         """[n, 5] float64: x, y, length, width, yaw."""
         return np.concatenate([self.xy_m, self.size_m, self.yaw_rad[:, None]], axis=1).astype(np.float64)
+
+    def moved(self, placed_by: tuple[float, float, float], pose: tuple[float, float, float]) -> Boxes:
+        """The boxes as another pose (x, y, yaw) of their drone places them."""
+        if placed_by == pose:
+            return self
+        x, y = self.xy_m.T.astype(np.float64)
+        x, y = to_world(*to_local(x, y, placed_by), pose)
+        yaw = self.yaw_rad + np.float32(pose[2] - placed_by[2])
+        return replace(self, xy_m=np.stack([x, y], axis=1).astype(np.float32), yaw_rad=yaw)
 
     def single(self) -> Boxes:
         """The same boxes in float32, as sorties record them."""

@@ -13,7 +13,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,7 +27,7 @@ from sortie.perception.errors import InputError
 from sortie.perception.files import CODEBOOK, ERRORS, beside
 from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.ground_truth import ground_truth
-from sortie.perception.joining import EgoSources, Pose, SourceBoxes, joined_many, sendable, source_of
+from sortie.perception.joining import EgoSources, Pose, SourceBoxes, boxes_at_fusion, joined_many, sendable, source_of
 from sortie.perception.lateness import weighed
 from sortie.perception.network.bev import lift
 from sortie.perception.network.checkpoint import load_weights
@@ -39,6 +39,7 @@ from sortie.perception.network.fusion.own import OwnFusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.inference import folded
 from sortie.perception.network.memory import keep_freed
+from sortie.perception.pose_matching import matched_poses, sure
 from sortie.perception.scene.render import Renderer, views_shape
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import Bytes
@@ -165,7 +166,8 @@ class TorchDetector:
         known = self._encode([c for c in seen if c.looked])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
         look = {s.capture for s in shared if s.is_detected}
-        alone = [ego for ego, shares in jobs if not any(self._is_fused(s) and s.weight > 0.0 for s in shares)]
+        fused = self._config.match_poses
+        alone = [e for e, shares in jobs if fused or not any(self._is_fused(s) and s.weight > 0.0 for s in shares)]
         look |= {ego for ego in alone if ego.looked}
         for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
             if capture in look:
@@ -175,7 +177,7 @@ class TorchDetector:
         for share in shared:
             if share.representation == "codes":
                 self._read_codes(share, known)
-        if self._shares == "boxes":
+        if self._shares == "boxes" or self._config.match_poses:
             for share in shared:
                 if share.is_map:
                     self._head_in_part(share, known)
@@ -311,21 +313,46 @@ class TorchDetector:
     def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
         maps = [s for s in shares if self._is_fused(s) and s.weight > 0.0]
+        boxed = [s for s in shares if not self._is_fused(s) and s.weight > 0.0]
         silent = self._silent(ego, maps, now) if maps or ego.looked else []
-        out = self._fuse(ego, maps, silent, now, known) if maps or silent else None
+        late = [self._source(s, now, known) for s in boxed]
+        place, places = ego.est_pose, [self._map_pose(s, now) for s in maps]
+        if self._config.match_poses:
+            place, places, late = self._matched(ego, maps, places, late, known)
+        peers = [*map(partial(self._peer, known), maps, places), *(Peer(c.est_pose, 1.0) for c in silent)]
+        out = self._fuse(ego, place, peers, known) if peers else None
         if out is not None:
-            own = self._place(out, ego.est_pose)
+            own = self._place(out, place)
         elif not ego.looked:
             own = Boxes.empty()
         elif (alone := known[ego].boxes) is not None:
-            own = alone.result()
+            own = alone.result().moved(ego.est_pose, place)
         else:
-            own = self._place(self._head(known[ego].maps.result()[None]), ego.est_pose)
-        late = [self._source(s, now, known) for s in shares if not self._is_fused(s) and s.weight > 0.0]
+            own = self._place(self._head(known[ego].maps.result()[None]), place)
         sources = EgoSources.of(ego, shares, own, bool(maps) and out is not None, late)
         if any(s.covariance_m2 is not None for s in late):
             sources = sources._replace(errors=self._own_errors)
         return joined_many([sources], self._config.join, self._config.common_share)[0]
+
+    def _matched(
+        self, ego: Capture, maps: Sequence[Share], places: Sequence[Pose], late: Sequence[SourceBoxes], known: Known
+    ) -> tuple[Pose, list[Pose], list[SourceBoxes]]:
+        """The poses of an ego and of the maps that came, and the boxes that came, where all fit together."""
+        seen = [
+            self._place(known[s.capture].in_part[_part(s)].result(), at) for s, at in zip(maps, places, strict=True)
+        ]
+        seen += [boxes_at_fusion(source) for source in late]
+        own = known[ego].boxes
+        seen.append(Boxes.empty() if own is None else own.result())
+        believed = [*places, *(source.pose for source in late), ego.est_pose]
+        fitted: list[Pose] = [
+            tuple(row) for row in matched_poses(believed, [sure(boxes).xy_m for boxes in seen]).tolist()
+        ]
+        moved = [
+            replace(source, boxes=source.boxes.moved(source.pose, pose), pose=pose)
+            for source, pose in zip(late, fitted[len(maps) :], strict=False)
+        ]
+        return fitted[-1], fitted[: len(maps)], moved
 
     def _silent(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture]) -> list[Capture]:
         """The other drones of the moment that count as zeros because no map of theirs came."""
@@ -338,28 +365,15 @@ class TorchDetector:
         heard = {ego.drone, *(s.capture.drone for s in maps)}
         return [capture for drone, capture in now.items() if drone not in heard]
 
-    def _fuse(
-        self,
-        ego: Capture,
-        maps: Sequence[Share],
-        silent: Sequence[Capture],
-        now: Mapping[int, Capture],
-        known: Known,
-    ) -> Tensor | None:
+    def _peer(self, known: Known, share: Share, pose: Pose) -> Peer:
+        """A share's map, placed by a pose."""
+        whole = known[share.capture].maps.result()
+        return Peer(pose, share.weight, self._map(share, known).result(), self._sent(share, known), whole)
+
+    def _fuse(self, ego: Capture, pose: Pose, peers: Sequence[Peer], known: Known) -> Tensor | None:
         """The head's output after fusion; None where no peer takes part in any cell."""
-        peers = [
-            Peer(
-                self._map_pose(s, now),
-                s.weight,
-                self._map(s, known).result(),
-                self._sent(s, known),
-                known[s.capture].maps.result(),
-            )
-            for s in maps
-        ]
-        peers += [Peer(capture.est_pose, 1.0) for capture in silent]
         own = known[ego].maps.result() if ego.looked else None
-        fused = fused_map(self._net, ego.est_pose, own, peers, self._config.unsent_cells)
+        fused = fused_map(self._net, pose, own, peers, self._config.unsent_cells)
         return None if fused is None else self._head(fused)
 
     def _map(self, share: Share, known: Known) -> Future[Tensor]:

@@ -123,6 +123,10 @@ class Perception(Section):
         "average",
         description="How boxes of several drones become one list: of those that overlap, their weighted mean (average), or only the best (nms).",
     )
+    match_poses: bool = Field(
+        False,
+        description="Receivers correct the poses of all drones they hear, and their own, by what both see, before they fuse (the torch detector's).",
+    )
     common_errors: Literal["fitted", "unknown"] = Field(
         "fitted",
         description="What covariance intersection assumes that the errors of several drones' boxes have in common: a fitted share, or anything, as in its first form (Julier and Uhlmann 1997).",

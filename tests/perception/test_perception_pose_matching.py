@@ -1,0 +1,96 @@
+"""Poses corrected by what several drones see: a closed form, errors that are known, and a sortie's detector."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sortie.perception.pose_matching import (
+    BOX_SIGMA_M,
+    GATE_M,
+    HEADING_SIGMA_RAD,
+    POSITION_SIGMA_M,
+    matched_poses,
+    sure,
+)
+from sortie.perception.types import Boxes
+
+RNG = np.random.default_rng(3)
+CARS = RNG.uniform(-80, 80, (40, 2))
+
+
+def placed(cars: np.ndarray, true: np.ndarray, believed: np.ndarray) -> np.ndarray:
+    """Where a drone that believes another pose than its true one puts cars."""
+    c, s = np.cos(believed[2] - true[2]), np.sin(believed[2] - true[2])
+    return believed[:2] + (cars - true[:2]) @ np.array([[c, s], [-s, c]])
+
+
+def fleet(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """True and believed poses."""
+    true = np.column_stack([rng.uniform(-20, 20, (n, 2)), rng.uniform(-3, 3, n)])
+    return true, true + rng.normal(0.0, [POSITION_SIGMA_M, POSITION_SIGMA_M, HEADING_SIGMA_RAD], (n, 3))
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_what_all_drones_agree_on_is_left_and_what_they_differ_in_goes(n: int) -> None:
+    """Without errors of the boxes the corrected poses put every car of every drone in nearly one place."""
+    true, believed = fleet(n, np.random.default_rng(n))
+    seen = [placed(CARS, *pair) for pair in zip(true, believed, strict=True)]
+    fitted = matched_poses(believed, seen)
+    again = np.stack([placed(CARS, *pair) for pair in zip(true, fitted, strict=True)])
+    spread = [np.abs(each - each.mean(axis=0)).max() for each in (np.stack(seen), again)]
+    assert spread[1] < 0.2 * spread[0]
+    error = fitted - true
+    assert np.abs(error[:, :2].mean(axis=0) - (believed - true)[:, :2].mean(axis=0)).max() < 0.02, "nobody sees it"
+
+
+def test_two_drones_share_a_shift_by_the_closed_form() -> None:
+    """Cars in a ring about both: no turn, and of a difference d each takes its part of the posterior mean."""
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = 40 * np.column_stack([np.cos(angle), np.sin(angle)])
+    fitted = matched_poses([(0, 0, 0.4), (0, 0, -0.2)], [ring + np.array([0.3, 0.0]), ring])
+    per_drone, per_difference = POSITION_SIGMA_M**2, 2 * BOX_SIGMA_M**2 / len(ring)
+    part = 0.3 * per_drone / (2 * per_drone + per_difference)
+    np.testing.assert_allclose(fitted, [(-part, 0, 0.4), (part, 0, -0.2)], atol=1e-9)
+
+
+def test_on_average_errors_of_poses_get_smaller_under_errors_of_boxes() -> None:
+    left, before = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(100 + seed)
+        true, believed = fleet(5, rng)
+        seen = [placed(CARS, t, b)[rng.random(len(CARS)) < 0.8] for t, b in zip(true, believed, strict=True)]
+        noisy = [each + rng.normal(0, 0.4, each.shape) for each in seen]
+        error = matched_poses(believed, noisy) - true
+        left.append(error)
+        before.append(believed - true)
+    ratio = np.std(np.stack(left), axis=(0, 1)) / np.std(np.stack(before), axis=(0, 1))
+    assert (ratio < 0.75).all(), "five drones' common error is 0.45 of one's"
+    assert (ratio > 0.4).all(), "and stays"
+
+
+def test_nothing_is_corrected_where_nothing_is_matched() -> None:
+    nobody = np.empty((0, 2))
+    poses = [(1.0, 2.0, 0.3), (4.0, 2.0, 0.1)]
+    np.testing.assert_array_equal(matched_poses(poses, [nobody, CARS]), poses)
+    np.testing.assert_array_equal(matched_poses(poses[:1], [CARS]), poses[:1])
+    far = np.array([[0.0, 0.0]])
+    np.testing.assert_array_equal(matched_poses(poses, [far, np.array([[GATE_M + 0.01, 0.0]])]), poses)
+    between = np.array([[0.0, 0.0], [1.0, 0.0]])  # the second one's nearest is nearer to the first
+    moved = matched_poses(poses, [between[:1], between])
+    assert np.array_equal(moved[:, :2], np.array(poses)[:, :2]), "one pair, which agrees"
+
+
+def test_weak_boxes_are_not_matched() -> None:
+    boxes = Boxes(CARS[:2], np.ones((2, 2)), np.zeros(2), np.array([0.31, 0.29]))
+    assert sure(boxes).xy_m.tolist() == [CARS[0].tolist()]
+
+
+def test_boxes_move_with_their_drones_pose() -> None:
+    old, new = (3.0, -2.0, 0.5), (3.4, -2.5, 0.52)
+    local = RNG.uniform(-50, 50, (6, 2))
+    boxes = Boxes(placed(local, np.zeros(3), np.array(old)), np.ones((6, 2)), np.arange(6.0), np.ones(6))
+    moved = boxes.moved(old, new)
+    np.testing.assert_allclose(moved.xy_m, placed(local, np.zeros(3), np.array(new)), atol=1e-4)
+    np.testing.assert_allclose(moved.yaw_rad, np.arange(6) + 0.02, atol=1e-6)
+    assert boxes.moved(old, old) is boxes
