@@ -308,10 +308,11 @@ class Outcome(TypedDict):
     data_rate_mbps: Annotated[float, "Payload bytes handed to the radio over the whole sortie, as Mb/s."]
     deadline_miss_rate: Annotated[
         float | None,
-        "Payloads that expired or were replaced before all of them was delivered, over those whose fate is known.",
+        "Payloads that expired or were replaced before all of them was delivered, over those whose fate is known. Handshakes "
+        "are no payloads.",
         SHARE,
     ]
-    payload_fates: Annotated[dict[str, int], "Counts by status and reason."]
+    payload_fates: Annotated[dict[str, int], "Counts of payloads by status and reason, without handshakes."]
     medium_busy_fraction: Annotated[float, "Share of the time in which the channel was busy.", SHARE]
     age_s: Annotated[Percentiles, "Age of peers' descriptors when a policy read them."]
     data_age_s: Annotated[Percentiles, "Age of peers' captures when they were fused."]

@@ -69,10 +69,15 @@ class Traffic:
                 out[REST[fate.reason]] += s.payload_bytes - s.arrived_bytes
         return out
 
+    @property
+    def _payloads(self) -> dict[Fate, Sums]:
+        """Without a method's requests and answers: a handshake carries no payload."""
+        return {fate: s for fate, s in self._sums.items() if fate.representation != HANDSHAKE}
+
     def fates(self) -> dict[str, int]:
         """How many payloads came to each `status/reason`."""
         counts: defaultdict[tuple[str, str], int] = defaultdict(int)
-        for fate, s in self._sums.items():
+        for fate, s in self._payloads.items():
             counts[fate.status, fate.reason] += s.payloads
         ordered = sorted(counts.items(), key=lambda item: item[0][0])
         return {f"{status}{'/' + reason if reason else ''}": count for (status, reason), count in ordered}
@@ -82,8 +87,9 @@ class Traffic:
 
         One of tiles that was cut short is one, whatever of it had come: it is `partial`, with the reason of an expired one.
         """
-        known = sum(s.payloads for fate, s in self._sums.items() if fate.status != Status.IN_FLIGHT)
-        missed = sum(s.payloads for fate, s in self._sums.items() if fate.reason in REASONS[Status.EXPIRED])
+        payloads = self._payloads.items()
+        known = sum(s.payloads for fate, s in payloads if fate.status != Status.IN_FLIGHT)
+        missed = sum(s.payloads for fate, s in payloads if fate.reason in REASONS[Status.EXPIRED])
         return missed / known if known else None
 
 
