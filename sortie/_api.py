@@ -156,17 +156,19 @@ class Comparison:
     @cached_property
     def table(self) -> pa.Table:
         """One row for each sortie: `policy`, `seed`, `town_seed` (its `perception.scene.seed`), then every metric of the
-        outcome by its name with dots, such as `ap50.mission`."""
+        outcome by its name with dots, such as `ap50.mission`; null where a sortie has none, 0 where it counted none."""
         import pyarrow as pa
 
         from sortie._run import numbers
+        from sortie.sim.results.outcome_fields import COUNTS
 
         rows = [
             {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, **dict(numbers(s.outcome))}
             for s in self.sorties
         ]
         names = list(dict.fromkeys(name for row in rows for name in row))
-        return pa.table({name: [row.get(name) for row in rows] for name in names})
+        none = {name: 0 if name.startswith(COUNTS) else None for name in names}
+        return pa.table({name: [row.get(name, none[name]) for row in rows] for name in names})
 
     def summary(self) -> Summary:
         """The policies side by side, and why their figures differ, as `sortie compare` prints it.

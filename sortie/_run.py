@@ -16,6 +16,7 @@ from sortie.scenarios.reading.nodes import nearest
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
+from sortie.sim.results.outcome_fields import is_zero_count
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.user_errors import missing, user_errors
 
@@ -41,6 +42,8 @@ class Metrics(dict[str, float]):
     """
 
     def __missing__(self, name: str) -> float:
+        if is_zero_count(name, sum(key.startswith("battery.") for key in self)):
+            return 0
         near = nearest(name, self)
         meant = f"did you mean {near}?" if near else "`sorted(run.metrics)` lists the names"
         raise UnknownMetricError(f"{name}: this run has no such metric, {meant}")
@@ -113,7 +116,7 @@ class Run:
     def metrics(self) -> Metrics:
         """The numbers of the outcome by name, such as `ap50.mission`, as `expect`, `compare` and campaigns use them.
 
-        Numbers without a value are left out. An unknown name raises a `SortieError` that is a `KeyError` too.
+        Numbers without a value are left out, and a count that is left out is 0. An unknown name raises a `SortieError` that is a `KeyError` too.
 
         Example:
             >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})

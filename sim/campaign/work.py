@@ -30,6 +30,7 @@ from sortie.sim.folders import RunError
 from sortie.sim.identity import codes_here, file_digest
 from sortie.sim.process import own_process
 from sortie.sim.results.outcome import outcome
+from sortie.sim.results.outcome_fields import COUNTS
 from sortie.sim.results.record import SortieRecord
 
 Task = tuple[int, str]
@@ -159,11 +160,11 @@ def _without_result(task: Task, code: str, error: str) -> RunResult:
 
 
 def number(result: dict[str, Any], name: str) -> float | None:
-    """A metric's number; None where this run has none. The plan has seen to it that some run may have one."""
+    """A metric's number; None where this run has none, 0 of a count. The plan has seen to it that some run may have one."""
     try:
         value = metric(result, name)
     except KeyError:
-        return None
+        return 0.0 if name.startswith(COUNTS) else None
     return float(value) if value is not None and math.isfinite(value) else None
 
 

@@ -10,7 +10,7 @@ from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.report_text import interval
 from sortie.scenarios.schema import DecisionExpectation, Expectation, Scenario
 from sortie.sim.results.outcome import describe
-from sortie.sim.results.outcome_fields import possible
+from sortie.sim.results.outcome_fields import is_zero_count, possible
 from sortie.sim.results.record import SortieRecord
 
 TOLERANCE = 1e-9
@@ -33,7 +33,7 @@ class Verdict:
 
 
 def metric(result: dict[str, Any], dotted: str) -> Any:
-    """A field of an outcome by its dotted name; list items by number.
+    """A field of an outcome by its dotted name; list items by number. A count that is not there is 0.
 
     Raises:
         KeyError: no such field, naming the fields that there are.
@@ -44,6 +44,8 @@ def metric(result: dict[str, Any], dotted: str) -> Any:
             value = value[int(part)]
         elif isinstance(value, dict) and part in value:
             value = value[part]
+        elif is_zero_count(dotted, len(result.get("battery", ()))):
+            return 0
         else:
             known = (
                 ", ".join(value)

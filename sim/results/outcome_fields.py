@@ -344,12 +344,21 @@ class Outcome(TypedDict):
 
 WALL = ("wall_s", "realtime_factor", "policy_eval_us")
 REASONS = {
-    Status.DELIVERED: ("",),
+    Status.DELIVERED: ("", "other_feature_space"),
     Status.LOST: ("fragment_lost", "no_link", "receiver_gone", "sender_gone"),
     Status.EXPIRED: ("deadline_in_service", "deadline_queued", "replaced"),
     Status.IN_FLIGHT: ("",),
 }
-"""By fate: the reasons that the radio gives; what arrived in part has those of what was lost or expired."""
+"""By fate: the reasons that the radio gives, and that of a payload that its receiver cannot use; what arrived in part has those of what was lost or expired."""
+
+COUNTS = ("payload_fates.", "descriptor_drops.", "distrusted_by.", "policies.decisions.")
+"""Where an outcome counts by key: a key that is not there was counted 0 times."""
+
+
+def is_zero_count(name: str, drones: int) -> bool:
+    """Whether a dotted name that an outcome of so many drones does not have is a count of 0; policies are not known here."""
+    section, _, key = name.partition(".")
+    return name.startswith(COUNTS[:-1]) and key in open_keys(drones, 0, (), traced=False)[section]
 
 
 def open_keys(

@@ -243,7 +243,7 @@ def test_what_is_wrong_is_told_at_its_line(tmp_path: Path, old: str, new: str, m
         ("phases.1.begin_s", "phases.1.begin_s: phases has no '1', it has 0 … 0"),
         ("events.x", "events.x: events has no 'x', it has entries by number"),
         ("payload_fates.lost", "payload_fates.lost: payload_fates has no 'lost', did you mean lost/fragment_lost?"),
-        ("payload_fates.x", "payload_fates.x: payload_fates has no 'x', it has delivered, lost/fragment_lost, "),
+        ("payload_fates.x", "payload_fates.x: payload_fates has no 'x', it has delivered, delivered/other_feature_space, "),
         ("descriptor_drops.forgd", "descriptor_drops.forgd: descriptor_drops has no 'forgd', did you mean forged?"),
         (
             "policies.decisions.workd",
@@ -267,7 +267,7 @@ def test_a_metric_that_only_some_runs_have_is_kept(tmp_path: Path) -> None:
     )
     names = (
         "battery.3, drones.3.soc, distrusted_by.3, phases.1.begin_s, energy_j.recorded, policies.decisions.silence, "
-        "events.7.t_s, transitions.5.peers.1, payload_fates.lost/no_link, payload_fates.partial/deadline_queued, "
+        "events.7.t_s, transitions.5.peers.1, payload_fates.lost/no_link, payload_fates.delivered/other_feature_space, payload_fates.partial/deadline_queued, "
         "descriptor_drops.forged, ap50.mission, drones.0.airborne"
     )
     text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", vary)
@@ -285,6 +285,22 @@ def test_the_number_of_a_metric_is_null_where_a_run_has_none() -> None:
     result = {"a": {"b": 2, "c": None, "d": math.inf}, "phases": [{"x": True}]}
     names = ("a.b", "a.c", "a.d", "a.e", "phases.0.x", "phases.1.x")
     assert [number(result, name) for name in names] == [2.0, None, None, None, 1.0, None]
+
+
+def test_a_count_that_a_run_does_not_have_is_zero() -> None:
+    """Means over the runs that have one would leave out all those in which nothing was lost."""
+    result = {
+        "payload_fates": {"delivered": 3},
+        "policies": {"decisions": {"worked": 4}},
+        "battery": {"0": 1.0},
+        "a": {},
+    }
+    names = (
+        "payload_fates.delivered", "payload_fates.lost/no_link", "policies.decisions.silence", "distrusted_by.0",
+        "descriptor_drops.forged", "a.b",
+    )  # fmt: skip
+    result |= {"distrusted_by": {}, "descriptor_drops": {}}
+    assert [number(result, name) for name in names] == [3.0, 0.0, 0.0, 0.0, 0.0, None]
 
 
 BUDGETS = CAMPAIGN.replace(

@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from record_by_hand import record, told_outcome
 from sim_examples import example
 
+from sortie import Comparison
+from sortie._run import Metrics, UnknownMetricError
 from sortie.perception.metrics.ap import Matched
 from sortie.scenarios.intervals import SHARE, mean_interval
 from sortie.sim.studies import compare, comparison_page
@@ -336,3 +338,19 @@ def test_lines_over_time_are_each_policy_s_own() -> None:
 
 def _with(sortie: Compared) -> Compared:
     return Compared(sortie.policy, sortie.seed, sortie.town_seed, sortie.outcome, sortie.gain, record())
+
+
+def test_a_count_that_one_sortie_lacks_is_zero_in_the_table_and_a_figure_is_null() -> None:
+    both = flown((3,))
+    del both.sorties[1].outcome["payload_fates"]["lost/retries"]
+    both.sorties[1].outcome["ap50"]["mission"] = None
+    table = Comparison(both.sorties, both.gains).table
+    assert table["payload_fates.lost/retries"].to_pylist() == [1, 0]
+    assert table["ap50.mission"].to_pylist() == [pytest.approx(0.502), None]
+
+
+def test_a_count_that_a_run_lacks_is_zero_among_its_metrics() -> None:
+    metrics = Metrics({"battery.0": 1.0, "payload_fates.delivered": 3})
+    assert metrics["payload_fates.lost/no_link"] == metrics["distrusted_by.0"] == 0
+    with pytest.raises(UnknownMetricError):
+        metrics["distrusted_by.1"]
