@@ -130,7 +130,8 @@ class PeopleOutcome(TypedDict):
         float | None, "The same by the drone's own thermal camera in that frame, without its peers.", SHARE
     ]
     in_region_drone_s: Annotated[
-        float | None, "Time in which a person truly was in a flying drone's region, summed over drones, s."
+        float | None,
+        "Time in which a person truly was in a flying drone's region, summed over drones, s. Ground stations do not count.",
     ]
     unknown_share: Annotated[
         float | None,

@@ -33,7 +33,10 @@ def people_outcome(record: SortieRecord) -> dict[str, float | None]:
     n, frame_s = record.scenario.fleet.drones, record.scenario.frame_s
     states = record.tables["states"]
     t_s = states["t_s"].to_numpy()[::n]
-    flying = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, n))
+    fleet = record.scenario.fleet
+    there = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, n))
+    flying = there & [fleet.station(drone) is None for drone in range(n)]
+    looking = there & [drone not in fleet.without_camera for drone in range(n)]
     people_m = _people(record.tables["people"], len(t_s), len(perception.people))
     discs = Regions(record.tables["mission"], record.scenario.mission).at(
         np.repeat(t_s, n), np.tile(range(n), len(t_s))
@@ -45,7 +48,7 @@ def people_outcome(record: SortieRecord) -> dict[str, float | None]:
     without = flying & ~np.isnan(discs[..., 2]) & ~present
     width_s = np.diff(t_s, append=record.scenario.duration_s)
     return {
-        "ap_2m": None if perception.thermal is None else _average_precision(record, t_s, flying, people_m),
+        "ap_2m": None if perception.thermal is None else _average_precision(record, t_s, looking, people_m),
         **dict(zip(("located_share", "located_alone_share"), _located(record), strict=True)),
         "in_region_drone_s": _drone_s(present, width_s),
         "unknown_share": _share(present & ~known, present, width_s),
@@ -128,11 +131,11 @@ def _known(alerts: pa.Table, t_s: Floats, drones: int, frame_s: float) -> Bools:
     return out
 
 
-def _average_precision(record: SortieRecord, t_s: Floats, flying: Bools, people_m: Floats) -> float | None:
-    """AP of the sightings of each drone and frame, by distance on the ground."""
+def _average_precision(record: SortieRecord, t_s: Floats, looking: Bools, people_m: Floats) -> float | None:
+    """AP of the sightings of each drone and frame, by distance on the ground; `looking` [T, N]: whose camera counts."""
     camera = record.scenario.perception.thermal
     assert camera is not None  # noqa: S101 (the caller asks for a camera's)
-    n = flying.shape[1]
+    n = looking.shape[1]
     states, table = record.tables["states"], record.tables["sightings"]
     position = np.stack([states[c].to_numpy() for c in ("x_m", "y_m", "z_m")], axis=-1).reshape(-1, n, 3)
     frame = np.searchsorted(t_s, table["t_s"].to_numpy() - _INSTANT_S)
@@ -147,7 +150,7 @@ def _average_precision(record: SortieRecord, t_s: Floats, flying: Bools, people_
         at, drone = divmod(key, n)
         found = np.array(of_image.get(key, []), np.int64)
         truth = (
-            people_m[at][in_cone(people_m[at], position[at, drone], camera)] if flying[at, drone] else people_m[:0, 0]
+            people_m[at][in_cone(people_m[at], position[at, drone], camera)] if looking[at, drone] else people_m[:0, 0]
         )
         if not len(found) and not len(truth):
             continue

@@ -243,7 +243,10 @@ def test_what_is_wrong_is_told_at_its_line(tmp_path: Path, old: str, new: str, m
         ("phases.1.begin_s", "phases.1.begin_s: phases has no '1', it has 0 … 0"),
         ("events.x", "events.x: events has no 'x', it has entries by number"),
         ("payload_fates.lost", "payload_fates.lost: payload_fates has no 'lost', did you mean lost/fragment_lost?"),
-        ("payload_fates.x", "payload_fates.x: payload_fates has no 'x', it has delivered, delivered/other_feature_space, "),
+        (
+            "payload_fates.x",
+            "payload_fates.x: payload_fates has no 'x', it has delivered, delivered/other_feature_space, ",
+        ),
         ("descriptor_drops.forgd", "descriptor_drops.forgd: descriptor_drops has no 'forgd', did you mean forged?"),
         (
             "policies.decisions.workd",

@@ -117,6 +117,21 @@ def test_unknown_time_is_what_alerts_and_truth_say(kept: SortieRecord) -> None:
     assert outcome(kept)["people"]["unknown_share"] == pytest.approx(unknown / (3 * len(inside)))
 
 
+def test_a_ground_station_without_a_camera_changes_no_figure_about_people() -> None:
+    """It is no drone, and its thermal camera, which it does not have, overlooks nobody."""
+    station = (
+        "fleet.drones=4", "fleet.ground=[{drone: 3, position_m: [13, 0, 20]}]",
+        "events=[{kind: link_drop, at_s: 0, drone: 3, loss_db: 200}]",
+    )  # fmt: skip
+    drones, with_station = (
+        outcome(crossing("duration_s=10", "perception.detector=none", "events=[]", *more))["people"]
+        for more in ((), station)
+    )
+    assert drones["in_region_drone_s"] > 5
+    for name in ("ap_2m", "in_region_drone_s", "unknown_share", "unknown_longest_s", "false_alert_share"):
+        assert with_station[name] == pytest.approx(drones[name])
+
+
 def test_without_people_nothing_changes() -> None:
     told = outcome(run_sortie(example()))["people"]
     assert set(told.values()) == {None}
