@@ -16,6 +16,8 @@ from sortie.scenarios.errors import SortieError
 from sortie.scenarios.report_text import replace_section
 
 _PARTIAL, _ASIDE = ".partial", ".old"
+_RUN = ("outcome.json", "record.json", "scenario.yaml")
+"""Every run's folder has these, and its tables as Parquet."""
 _NAME_BYTES = 228
 """A name may have so many bytes: file systems allow 255, and `run_folder.beside` and `partial_path` add some."""
 
@@ -54,13 +56,30 @@ def ensure_files(*paths: Path | None) -> None:
     """Refuse paths of files that could not be written, before anything is flown or measured; None is no file.
 
     Raises:
-        RunError: one is a folder, or cannot be made.
+        RunError: one is a folder, a part of a run, named twice, or cannot be made.
     """
+    places: set[Path] = set()
     for path in filter(None, paths):
         if path.is_dir():
             raise RunError(f"{path}: is a folder, must be a file")
-        if not _is_device(path):
-            _ensure_place(path)
+        if _is_device(path):
+            continue
+        _ensure_place(path)
+        _ensure_spared(path.resolve())
+        if path.resolve() in places:
+            raise RunError(f"{path}: two outputs have this name, and one would replace the other; name two files")
+        places.add(path.resolve())
+
+
+def _ensure_spared(path: Path) -> None:
+    """Refuse to replace a file of a run: without it the others are none.
+
+    Raises:
+        RunError: it is one.
+    """
+    its = path.name in _RUN or path.suffix == ".parquet"
+    if its and path.exists() and all((path.parent / name).is_file() for name in _RUN):
+        raise RunError(f"{path}: is a part of the run in {path.parent}, which would be lost; name another file")
 
 
 def ensure_between(path: Path | None, begin: str, end: str) -> None:
@@ -139,6 +158,7 @@ def writing_durably(path: Path) -> Iterator[BinaryIO]:
     """A file to write, as `write_durably` does, piece by piece; where the block fails, an older file stays.
 
     Raises:
+        RunError: it is a part of a run.
         OSError: the disk refuses.
     """
     with partial_file(path) as partial, partial.open("wb") as file:
@@ -161,6 +181,7 @@ def partial_file(path: Path) -> Iterator[Path]:
         yield path
         return
     place = path.resolve()
+    _ensure_spared(place)
     with partial_path(place, Path.touch) as partial:
         yield partial
         partial.replace(place)

@@ -12,7 +12,7 @@ from sortie.scenarios.traces import TraceError
 from sortie.sim.cli.console import out
 from sortie.sim.export.endpoint import read_key
 from sortie.sim.export.origin import parse_origin
-from sortie.sim.folders import RunError, ensure_folder
+from sortie.sim.folders import RunError, ensure_files, ensure_folder
 from sortie.sim.results import run_folder
 from sortie.sim.user_errors import missing
 
@@ -68,6 +68,7 @@ def export(
         from sortie.sim.export.telemetry import save_tlog
 
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
+        ensure_files(path)
         try:
             frames = save_tlog(run_folder.load(run), path, began_us, where, secret, drone)
         except TraceError as error:
@@ -78,6 +79,7 @@ def export(
         from sortie.sim.export.pcap import write_pcap
 
         path = out_path or run / PCAP
+        ensure_files(path)
         sent = write_pcap(run_folder.load(run), path, began_us * 1000)
         parts = ", ".join(f"{count} {kind}" for kind, count in sent.items())
         out.print(f"{sum(sent.values())} packets ({parts}), in [bold]{path}[/bold]", soft_wrap=True)

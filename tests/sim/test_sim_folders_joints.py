@@ -67,6 +67,26 @@ def test_a_place_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
+def test_a_part_of_a_run_is_not_replaced_by_a_page_or_a_table_made_of_it(tmp_path: Path) -> None:
+    for name in ("outcome.json", "record.json", "scenario.yaml", "views.parquet"):
+        (tmp_path / name).write_text("the run's")
+    (tmp_path / "link").symlink_to(tmp_path / "views.parquet")
+    for name in ("outcome.json", "views.parquet", "link"):
+        for write in (ensure_files, lambda path: write_text(path, "a page")):
+            with pytest.raises(RunError, match=r"is a part of the run in .*, which would be lost; name another file"):
+                write(tmp_path / name)
+    assert (tmp_path / "views.parquet").read_text() == (tmp_path / "outcome.json").read_text() == "the run's"
+    write_text(tmp_path / "report.html", "a page")
+    (tmp_path / "record.json").unlink()  # no run: a comparison's own outcome.json, say
+    write_text(tmp_path / "outcome.json", "anew")
+
+
+def test_two_outputs_of_one_name_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="two outputs have this name, and one would replace the other"):
+        ensure_files(tmp_path / "a.json", None, tmp_path / "." / "x" / ".." / "a.json")
+    ensure_files(Path("/dev/null"), Path("/dev/null"))
+
+
 def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
     there, link = tmp_path / "there", tmp_path / "link"
     there.mkdir()

@@ -84,6 +84,16 @@ def test_a_file_whose_temporary_name_is_too_long_is_refused_before_work_is_lost(
         ensure_files(tmp_path / LONG[:229])
 
 
+@pytest.mark.parametrize("form", ["--tlog", "--pcap"])
+def test_an_export_does_not_replace_a_part_of_its_run(
+    form: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("outcome.json", "record.json", "scenario.yaml", "energy.parquet"):
+        (folder / name).touch()
+    told = refusal(folder, ("export", ".", form, "--out", "energy.parquet"), capsys)
+    assert "error: energy.parquet: is a part of the run in" in told.replace(str(folder.resolve()) + "/", "")
+
+
 def test_counterexamples_have_a_folder_before_anything_is_proved(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
