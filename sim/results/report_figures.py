@@ -176,6 +176,7 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
 
     since = dict.fromkeys(range(n), (0.0, "nothing"))
     carried: dict[tuple[int, int], str] = {}
+    down: set[int] = set()
 
     def close(drone: int, t_s: float) -> None:
         begin_s, kind = since[drone]
@@ -185,17 +186,20 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
 
     for drone, begin_s, until_s, kind in arrived(record):
         axes.broken_barh([(begin_s, until_s - begin_s)], (drone + 0.11, 0.26), facecolor=SENT[kind])
-    for change in transitions(record.tables["directives"], {}):
-        carried |= {(change["drone"], peer): change["to"] for peer in change["peers"]}
-        kind = best(carried, change["drone"])
-        if kind != since[change["drone"]][1]:
-            close(change["drone"], change["t_s"])
-            since[change["drone"]] = (change["t_s"], kind)
-    down = _down_s(record)
+    changes = [*landings(record), *transitions(record.tables["directives"], {})]
+    for change in sorted(changes, key=lambda change: change["t_s"]):
+        drone, t_s = change["drone"], change["t_s"]
+        if "airborne" in change:
+            (down.discard if change["airborne"] else down.add)(drone)
+        else:
+            carried |= {(drone, peer): change["to"] for peer in change["peers"]}
+        kind = (
+            "nothing" if drone in down else best(carried, drone)
+        )  # who is down sends nothing, whatever was last decided
+        if kind != since[drone][1]:
+            close(drone, t_s)
+            since[drone] = (t_s, kind)
     for drone in range(n):
-        if drone in down:  # who is down sends nothing, whatever was last decided
-            close(drone, down[drone])
-            since[drone] = (down[drone], "nothing")
         close(drone, end_s)
     axes.set_yticks(range(n), [f"drone {i}" for i in range(n)])
     axes.set_ylim(n - 0.5, -0.5)
@@ -230,12 +234,16 @@ def arrived(record: SortieRecord) -> list[tuple[int, float, float, str]]:
     return spans
 
 
-def _down_s(record: SortieRecord) -> dict[int, float]:
-    """When each drone that came down did."""
-    states = record.tables["states"]
-    down = ~states["airborne"].to_numpy()
-    drones, first = np.unique(states["drone"].to_numpy()[down], return_index=True)
-    return dict(zip(drones.tolist(), _column(states, "t_s")[down][first].tolist(), strict=True))
+def landings(record: SortieRecord) -> list[dict[str, Any]]:
+    """When each drone left the air or came back: `t_s`, `drone`, `airborne`; at the begin, those on the ground."""
+    states, n = record.tables["states"], _drones(record)
+    flying = states["airborne"].to_numpy().reshape(-1, n)
+    before = np.concatenate([np.ones((1, n), bool), flying[:-1]])
+    t_s = _column(states, "t_s")[::n]
+    return [
+        {"t_s": float(t_s[k]), "drone": drone, "airborne": bool(flying[k, drone])}
+        for k, drone in np.argwhere(flying != before).tolist()
+    ]
 
 
 def _edges(record: SortieRecord) -> Floats:

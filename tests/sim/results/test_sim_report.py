@@ -187,6 +187,22 @@ def test_a_lane_says_nothing_of_a_drone_that_is_down() -> None:
     assert lanes[0][-1][1:] == (6.0, report_figures.SENT["features"])
 
 
+def test_a_lane_goes_on_when_a_drone_comes_back_or_joins() -> None:
+    events = "{kind: drone_lost, at_s: 2, drone: 2}, {kind: drone_joins, at_s: 3, drone: 2}, {kind: drone_joins, at_s: 3, drone: 1}"
+    record = run_sortie(example("duration_s=6", f"events=[{events}]"))
+    told = {
+        (row["drone"], row["airborne"]): row["t_s"]
+        for row in report_figures.landings(record)
+        if row["t_s"] > 0 or row["drone"] == 1
+    }
+    assert told == pytest.approx({(1, False): 0.0, (1, True): 3.0, (2, False): 2.0, (2, True): 3.0})
+    last = {}
+    for bar in drawn(report_figures._lanes, record).collections:
+        box = bar.get_datalim(bar.axes.transData)
+        last[round((box.y0 + box.y1) / 2)] = (box.x1, to_hex(bar.get_facecolor()[0]))
+    assert last[1] == last[2] == (6.0, report_figures.SENT["features"])
+
+
 @pytest.fixture(scope="module")
 def eventful() -> SortieRecord:
     """Events at 2 s (twice), at 3 s with a change of phase, and a jammer."""
