@@ -15,8 +15,7 @@ from rich.table import Table
 
 from sortie.perception.detectors import make_detector
 from sortie.policies.catalogue.adaptive import ARMS
-from sortie.policies.registry import resolve
-from sortie.scenarios.report_text import number, points, size
+from sortie.scenarios.report_text import number, percent, points, size
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import bars, out
 from sortie.sim.cli.options import SetOption
@@ -34,8 +33,6 @@ def compare_conditions(
     by_torch: bool = False,
 ) -> None:
     """Fly every policy in every condition, print AP by condition and the sums, keep both as JSON."""
-    for policy in policies:
-        resolve(policy)
     ensure_files(out_file)
     conditions = conditions.model_copy(update={"set": (*conditions.set, *sets)})
     with bars() as bar:
@@ -46,6 +43,13 @@ def compare_conditions(
         out.print(table)
     if blind := list(dict.fromkeys(c.condition for c in cells if math.isnan(c.ap))):
         out.print(f"no car was to be seen in {', '.join(blind)}: no accuracy counts what was flown there")
+    if gone := {
+        c.condition: min(d.flown_share for d in cells if d.condition == c.condition)
+        for c in cells
+        if c.flown_share < 1.0
+    }:
+        least = ", ".join(f"{name} ({percent(share)} of drone-seconds flown)" for name, share in gone.items())
+        out.print(f"drones left the air in {least}: AP is of those that fly")
     rows = summarise(cells)
     fixed = best_fixed(rows)
     flown = [p for p in policies if p in FIXED]
@@ -105,10 +109,10 @@ def _by_condition(
 
 
 def _figures(title: str, *columns: str) -> Table:
-    """A narrow table whose cells stay whole."""
+    """A narrow table whose figures stay whole; names in the first column may take several lines."""
     table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0))
-    for column in columns:
-        table.add_column(column, no_wrap=True)
+    for k, column in enumerate(columns):
+        table.add_column(column, no_wrap=k > 0, overflow="ellipsis" if k else "fold")
     return table
 
 

@@ -38,6 +38,8 @@ class Cell:
     energy_j: float
     miss_rate: float | None
     """Share of payloads past their deadline, mean over the seeds that have one; None where no payload had a deadline."""
+    flown_share: float = 1.0
+    """`mission.flown_share`, mean over the seeds. Below 1, `ap` is of the drones that fly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +115,7 @@ def _fly(
         float(np.mean([r["bytes"]["data_sent"] for r in results])),
         float(np.mean([r["energy_j"]["total"] for r in results])),
         mean_of_known(r["deadline_miss_rate"] for r in results),
+        float(np.mean([r["mission"]["flown_share"] for r in results])),
     )
 
 

@@ -375,6 +375,7 @@ def test_compare_over_conditions(
     assert [(row["policy"], row["data_bytes"]) for row in kept["summary"]] == [("silence", 0.0), ("boxes", 2e6)]
     assert kept["cells"][3] == {
         "policy": "boxes", "condition": "narrow", "ap": 0.125, "data_bytes": 2e6, "energy_j": 4000.0, "miss_rate": 0.25,
+        "flown_share": 1.0,
     }  # fmt: skip
     command("compare", "c.yaml", "--policies", "silence")
     assert flown.kwargs["detector_of"] is not None

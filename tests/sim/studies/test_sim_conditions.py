@@ -155,6 +155,25 @@ def test_compare_prints_every_policy_over_the_conditions(tmp_path: Path, capsys:
     assert all(0 < c["ap"] < 1 and c["data_bytes"] > 0 for c in kept["cells"])
 
 
+def test_conditions_name_those_in_which_drones_left_the_air_and_take_policies_with_parameters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A drone is lost half-way: of two drones' 2 s each, 3 s are flown."""
+    path, out = tmp_path / "small.yaml", tmp_path / "out.json"
+    lost = "{name: lost, budget: 0.1, set: ['duration_s=2', 'fleet.drones=2', 'events=[{kind: drone_lost, at_s: 1, drone: 1}]']}"
+    path.write_text(f"{SMALL.partition('  - {name: rich')[0]}  - {lost}\n")
+    policies = "silence,best-2(received_budget=0.3)"
+    monkeypatch.setattr(sys, "argv", ["sortie", "compare", str(path), "--policies", policies, "--out", str(out)])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert not stop.value.code
+    printed = capsys.readouterr().out
+    assert "drones left the air in lost (75.0 % of drone-seconds flown): AP is of those that fly" in printed
+    shares = {(c["policy"], c["condition"]): c["flown_share"] for c in json.loads(out.read_text())["cells"]}
+    assert shares == pytest.approx({(p, c): s for p in policies.split(",") for c, s in (("poor", 1.0), ("lost", 0.75))})
+
+
 def test_a_single_condition_has_no_interval(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

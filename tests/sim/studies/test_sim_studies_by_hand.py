@@ -144,6 +144,7 @@ def test_the_command_prints_and_keeps_each_policy_s_own_figures(
     assert [r["miss_rate"] for r in kept["summary"]] == [pytest.approx(0.2), pytest.approx(0.1), None]
     assert kept["cells"][3] == {
         "policy": "worked", "condition": "rich", "ap": 0.8, "data_bytes": 3e6, "energy_j": 4000.0, "miss_rate": 0.15,
+        "flown_share": 1.0,
     }  # fmt: skip
     assert [(r["policy"], r["ap"], r["of_oracle"]) for r in kept["summary"]] == [
         ("all-4", pytest.approx(0.5), pytest.approx(0.5 / 0.525)), ("worked", pytest.approx(0.65), pytest.approx(0.65 / 0.525)),
