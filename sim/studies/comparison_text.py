@@ -193,11 +193,14 @@ def side_by_side(flown: Flown) -> dict[str, list[str]]:
 
 
 def _of_classes(flown: Flown, mean: Callable[..., list[str]]) -> dict[str, list[str]]:
-    """Rows of trucks and people, where drones look for them."""
-    first = flown.sorties[0].outcome
-    of = [name for name, ap in first["ap_by_class"].items() if name != "car" and ap["full_scene"] is not None]
+    """Rows of trucks and people, where a sortie has a figure of them."""
+
+    def known(*path: str) -> bool:
+        return any(_at(s.outcome, path) is not None for s in flown.sorties)
+
+    of = [name for name in PLURAL if name != "car" and known("ap_by_class", name, "full_scene")]
     rows = {f"AP of {PLURAL[name]}, full scene": mean("ap_by_class", name, "full_scene", text=number) for name in of}
-    if first["people"]["located_share"] is not None:
+    if known("people", "located_share"):
         rows["people located"] = mean("people", "located_share", text=percent)
     return rows
 

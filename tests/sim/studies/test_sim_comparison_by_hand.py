@@ -340,6 +340,16 @@ def _with(sortie: Compared) -> Compared:
     return Compared(sortie.policy, sortie.seed, sortie.town_seed, sortie.outcome, sortie.gain, record())
 
 
+def test_people_have_their_rows_where_any_sortie_found_some() -> None:
+    """The first sortie saw nobody."""
+    both = flown()
+    both.sorties[0].outcome["people"]["located_share"] = None
+    both.sorties[0].outcome["ap_by_class"]["person"]["full_scene"] = None
+    rows = side_by_side(both)
+    assert rows["people located"] == ["32.5 % (1 of 2)", "36.0 %"]
+    assert rows["AP of people, full scene"] == ["0.711 (1 of 2)", "0.746"]
+
+
 def test_a_count_that_one_sortie_lacks_is_zero_in_the_table_and_a_figure_is_null() -> None:
     both = flown((3,))
     del both.sorties[1].outcome["payload_fates"]["lost/retries"]
