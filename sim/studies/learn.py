@@ -27,7 +27,7 @@ from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.sortie import DetectorMaker, run_sortie
-from sortie.sim.folders import write_text
+from sortie.sim.folders import RunError, write_text
 from sortie.sim.results.accuracy import matched
 from sortie.sim.studies.in_flight import torch_answers
 
@@ -117,7 +117,11 @@ def fly_lessons(
     workers: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> list[Lesson]:
-    """Lessons of so many conditions, with overrides of fields (`sets`); those in which AP is undefined are left out."""
+    """Lessons of so many conditions, with overrides of fields (`sets`); those in which AP is undefined are left out.
+
+    Raises:
+        RunError: none is left.
+    """
     with ProcessPoolExecutor(max_workers=workers) as pool:
         lessons = []
         every = pool.map(fly_lesson, [seed] * count, range(count), [by_torch] * count, [sets] * count)
@@ -126,6 +130,10 @@ def fly_lessons(
                 progress(k + 1)
             if np.isfinite(lesson.ap).all():
                 lessons.append(lesson)
+    if not lessons:
+        raise RunError(
+            f"no accuracy in any of {count} conditions: there was no car to be seen, or perception.detector is none"
+        )
     return lessons
 
 

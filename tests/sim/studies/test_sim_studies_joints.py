@@ -14,6 +14,7 @@ from sortie.perception.metrics.ap import Matched
 from sortie.policies.catalogue.adaptive import ARMS, features, spend
 from sortie.policies.contract import FleetView, TaskPhase
 from sortie.scenarios.reading.load import loads
+from sortie.sim.folders import RunError
 from sortie.sim.studies import learn, multifidelity, overhead
 from sortie.sim.studies.compare import Compared, Contender, _over_sorties
 from sortie.sim.studies.learn import Lesson, fit
@@ -97,6 +98,9 @@ def test_lessons_in_which_an_arm_has_no_ap_are_left_out(monkeypatch: pytest.Monk
     lessons = learn.fly_lessons(7, 5, sets=("a=1",), by_torch=True, workers=2, progress=done.append)
     assert [x.features[0] for x in lessons] == [0, 2, 4]
     assert done == [1, 2, 3, 4, 5]
+    monkeypatch.setattr(learn, "fly_lesson", lambda *_: Lesson((0.0,), (math.nan, 0.2), ""))
+    with pytest.raises(RunError, match="no accuracy in any of 5 conditions: there was no car to be seen"):
+        learn.fly_lessons(7, 5, workers=2)
 
 
 @pytest.mark.parametrize(
