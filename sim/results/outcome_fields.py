@@ -45,7 +45,7 @@ class Ap50(Accuracy):
     calibration: Annotated[str | None, "Which fit a surrogate detector is of."]
     grounded_blind: Annotated[
         Accuracy,
-        "The same with every drone that left the air counted as blind: at each scored instant it detects nothing, and "
+        "The same with every drone that left the air, or has not joined yet, counted as blind: at each scored instant it detects nothing, and "
         "the cars about the place that it would have in the formation count as missed. Equal where all fly to the end.",
     ]
     sample_rate_hz: Annotated[float, "Accuracy is sampled at this rate while traffic runs at the full one."]
@@ -84,7 +84,7 @@ class TrackingOutcome(TypedDict):
 class MissionOutcome(TypedDict):
     flown_share: Annotated[
         float,
-        "Share of drone-seconds flown, 0 … 1: 1 where no drone leaves the air. Ground stations do not count.",
+        "Share of drone-seconds flown, 0 … 1: 1 where all fly from begin to end. Ground stations do not count.",
         SHARE,
     ]
     region_observed_share: Annotated[
@@ -255,7 +255,9 @@ class ContextOutcome(TypedDict):
 
 
 class PhaseOutcome(TypedDict):
-    phase: Annotated[str, "The mission's phase."]
+    phase: Annotated[
+        str, "A phase of `mission.phases`. Its figures are of the whole fleet, also of drones in `mission.groups`."
+    ]
     begin_s: Annotated[float, "From when."]
     end_s: Annotated[float, "Until when, exclusive."]
     ap50: Annotated[Accuracy, "Accuracy within it."]
@@ -315,7 +317,10 @@ class Outcome(TypedDict):
     ]
     payload_fates: Annotated[dict[str, int], "Counts of payloads by status and reason, without handshakes."]
     medium_busy_fraction: Annotated[float, "Share of the time in which the channel was busy.", SHARE]
-    age_s: Annotated[Percentiles, "Age of peers' descriptors when a policy read them."]
+    age_s: Annotated[
+        Percentiles,
+        "Age of peers' descriptors when a policy read them. The last one of a drone that fell silent grows older to the end.",
+    ]
     data_age_s: Annotated[Percentiles, "Age of peers' captures when they were fused."]
     data_age_mean_s: Annotated[float | None, "Its mean; it follows the mean over time, at any rate of sending."]
     descriptor_drops: Annotated[dict[str, int], "Descriptors refused at receivers, by reason."]
