@@ -37,7 +37,7 @@ def test_the_summary_has_every_figure_under_its_own_name() -> None:
         "  AP of trucks": "0.601 full scene, 0.602 mission",
         "  AP of people": "0.701 full scene, – mission",
         "  search 0–2 s": "0.500 full, – mission, 0.0 Mb/s, 2.0 kB a payload, 33.3 % missed",
-        "  track 2–4 s": "0.500 full, 0.667 mission, 0.0 Mb/s, 3.0 kB a payload, 50.0 % missed",
+        "  track 2–4 s": "0.500 full, 0.667 mission, 0.0 Mb/s, 3.0 kB a payload, 100.0 % missed",
         "people": "31.5 % of those in a drone's region located, 21.6 % by the drone's own camera",
         "mission": "81.2 % of the region in view; target in view 71.3 % of the time, longest gap 1.2 s; "
         "target detected 61.4 % of the time, longest gap 2.8 s",
@@ -160,7 +160,7 @@ def test_the_page_s_tables_of_phases_and_drones_are_the_outcome_s() -> None:
     ]
     assert read == [
         ["search, 0–2 s", "0.200", "0.600", "7.5 Mb/s", "33.3 %", "37.5 %"],
-        ["track, 2–4 s", "0.300", "0.700", "8.5 Mb/s", "50.0 %", "66.7 %"],
+        ["track, 2–4 s", "0.300", "0.700", "8.5 Mb/s", "100.0 %", "66.7 %"],
         ["drone 0", "91.0 %", "4.4 kJ", "15.25 V", "flying"],
         ["drone 1", "62.0 %", "7.2 kJ", "14.50 V", "down"],
         ["station 2", "mains", "", "", "on"],
