@@ -105,6 +105,7 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("Context plane", size(data["context_sent"]), f"{percent(result['context_share'])} of all bytes"),
         ("Descriptors lost", percent(result["context"]["lost"]), losses_in_words(result["context"]) or "of receptions"),
         ("Energy", f"{result['energy_j']['total'] / 1e3:.1f} kJ", f"least charge left {percent(least)}"),
+        *((f"metrics.{name}", number(value, ".4g"), "a metric of your own") for name, value in result["metrics"].items()),
     ]  # fmt: skip
 
 

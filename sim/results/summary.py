@@ -111,6 +111,8 @@ def outcome_table(result: dict[str, Any]) -> Table:
     )
     if result["disagreement"]["share"] is not None:
         table.add_row("disagreement", disagreement_in_words(result["disagreement"]))
+    for name, value in result["metrics"].items():
+        table.add_row(escape(f"metrics.{name}"), number(value, ".4g"))
     if result["own_files"]:
         table.add_row("own files", escape(", ".join(" ".join(file) for file in result["own_files"].items())))
     table.add_row("fingerprint", result["fingerprint"][:16])

@@ -59,6 +59,15 @@ def test_the_summary_has_every_figure_under_its_own_name() -> None:
     }
 
 
+def test_metrics_of_one_s_own_are_in_the_summary_and_on_the_page() -> None:
+    made = told_outcome() | {"metrics": {"first_s": 1.25, "none": None}}
+    shown = dict(cells(summary.outcome_table(made)))
+    assert (shown["metrics.first_s"], shown["metrics.none"]) == ("1.25", "–")
+    assert report._tiles(made)[-2:] == [
+        ("metrics.first_s", "1.25", "a metric of your own"), ("metrics.none", "–", "a metric of your own"),
+    ]  # fmt: skip
+
+
 def test_rows_without_anything_to_say_are_left_out() -> None:
     made = told_outcome() | {"descriptor_drops": {}, "own_files": {}}
     made["mission"] |= {"flown_share": 1.0, "region_observed_share": None, "target_detected_share": None}
