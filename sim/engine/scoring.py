@@ -141,7 +141,9 @@ class Scorer:
             came_back = agent.here is not None and agent.here.t_s < since_s  # and has not sensed yet
             if came_back or not agent.status.airborne:
                 moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))
-            elif agent.here is not None and (agent.latest is not None or not agent.status.looks):
+            elif agent.here is not None and (
+                agent.latest is not None or not agent.status.looks or agent.status.blocked
+            ):
                 shares = self._shares(agent, now_s)
                 job = self._job(agent, agent.here, [of_vehicles(s) for s in shares], now_s)
                 moment[1].append(Ego(agent.here, job, people=self._people.known(agent.here, shares, now_s)))

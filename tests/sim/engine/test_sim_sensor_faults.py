@@ -139,6 +139,18 @@ def test_a_blocked_camera_takes_no_looks() -> None:
     assert (plain[plain.drone == 0].looks.to_numpy() == blocked[blocked.drone == 0].looks.to_numpy()).all()
 
 
+def test_a_drone_that_is_blind_from_take_off_counts_in_accuracy() -> None:
+    """Alone it detects nothing, and with peers it is scored as often as they are."""
+    blind = "events=[{kind: camera_blocked, at_s: 0, drone: 0}]"
+    alone = outcome(run_sortie(example("duration_s=2", blind, "fleet.drones=1", "perception.detector=surrogate")))[
+        "ap50"
+    ]
+    assert (alone["full_scene"], alone["scored_fusions"]) == (0.0, 4)
+    fleet = run_sortie(example("duration_s=2", blind, "perception.detector=surrogate"))
+    scored = fleet.tables["fusions"]["drone"].to_pylist()
+    assert {drone: scored.count(drone) for drone in set(scored)} == dict.fromkeys(range(fleet.scenario.fleet.drones), 4)
+
+
 def test_slow_perception_delays_what_is_sent_by_so_much() -> None:
     busy = (WHOLE, "policy.name=all-4", "policy.params={}")
     rows = (
