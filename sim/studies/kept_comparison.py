@@ -71,6 +71,8 @@ def kept(path: Path, of: str) -> Iterator[tuple[Flown, sqlite3.Connection]]:
             db.execute("PRAGMA locking_mode = EXCLUSIVE")
             db.execute("PRAGMA synchronous = EXTRA")  # a committed row survives a power cut
             db.execute("BEGIN EXCLUSIVE")
+            if {name for (name,) in db.execute("SELECT name FROM sqlite_master")} - {"comparison", "flown"}:
+                raise RunError(f"{path}: no comparison there (it has other tables); name another file")
             db.execute("CREATE TABLE IF NOT EXISTS comparison (identity TEXT)")
             db.execute("CREATE TABLE IF NOT EXISTS flown (kind TEXT, content TEXT)")
             known = db.execute("SELECT identity FROM comparison").fetchone()
@@ -81,7 +83,11 @@ def kept(path: Path, of: str) -> Iterator[tuple[Flown, sqlite3.Connection]]:
                     f"{path}: holds a comparison of other policies, another scenario, seed or version; name another file"
                 )
             db.execute("COMMIT")
-            yield _read(db), db
+            try:
+                flown = _read(db)
+            except (TypeError, ValueError) as error:
+                raise RunError(f"{path}: a row is damaged ({error}); name another file") from error
+            yield flown, db
     except sqlite3.OperationalError as error:
         busy = "locked" in str(error)
         raise RunError(f"{path}: {'another comparison is using this file' if busy else error}") from error

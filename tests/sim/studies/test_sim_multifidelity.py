@@ -350,6 +350,24 @@ def test_files_of_others_are_refused(flights: list[tuple[str, int]], tmp_path: P
         compare_to(contenders(), Settings(0.02), tmp_path / "text")
 
 
+def test_a_database_of_something_else_stays_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "campaign.sqlite"
+    with sqlite3.connect(path) as db:
+        db.execute("CREATE TABLE rows (run INTEGER)")
+    before = path.read_bytes()
+    with pytest.raises(sortie.SortieError, match=r"campaign\.sqlite: no comparison there \(it has other tables\)"):
+        kept(path, "a").__enter__()
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", ["{cut", '{"x": 1}', "[1]"])
+def test_a_damaged_row_names_its_file(content: str, tmp_path: Path) -> None:
+    with kept(tmp_path / "c.sqlite", "a") as (_, db):
+        db.execute("INSERT INTO flown VALUES ('row', ?)", (content,))
+    with pytest.raises(sortie.SortieError, match=r"c\.sqlite: a row is damaged \("):
+        kept(tmp_path / "c.sqlite", "a").__enter__()
+
+
 def test_a_file_in_use_is_refused(tmp_path: Path) -> None:
     with kept(tmp_path / "c.sqlite", "a") as (_, db):
         keep(db, row("torch", 1, 0.1))
