@@ -281,7 +281,9 @@ class FleetBatteries:
         if voltage_v is not None:
             self.voltage_v[drone] = voltage_v
         current = trace.current_at(now_s)
-        self.current_a[drone] = spent_j / dt_s / self.voltage_v[drone] if current is None else current
+        if current is None:  # a trace may say 0 V, which tells nothing of the current
+            current = spent_j / dt_s / self.voltage_v[drone] if self.voltage_v[drone] else 0.0
+        self.current_a[drone] = current
         if self.soc[drone] <= self._packs[drone].landing_soc:
             self.land(drone)
 

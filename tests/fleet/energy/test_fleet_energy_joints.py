@@ -114,6 +114,18 @@ def test_what_a_trace_says_was_spent_on_the_ground_is_spent_at_take_off() -> Non
     assert packs.voltage_v[0] == pytest.approx(4 * float(open_circuit_cell_v(0.6)), abs=1e-2)
 
 
+def test_a_trace_of_no_voltage_has_no_current() -> None:
+    trace = BatteryTrace(
+        [0.0, 10.0], [0.9, 0.8], energy_fraction([0.9, 0.8]).tolist(), [0.0, 10.0], [16.0, 0.0], [], []
+    )
+    packs = FleetBatteries(Battery(), (), 1, {0: trace})
+    packs.step(5.0, *LOAD)
+    assert packs.current_a[0] > 0.0
+    packs.step(5.0, *LOAD)
+    assert (packs.voltage_v[0], packs.current_a[0]) == (0.0, 0.0)
+    assert packs.soc[0] == pytest.approx(0.8, abs=1e-3)
+
+
 def test_every_drone_has_the_efficiency_of_its_own_drive() -> None:
     packs = FleetBatteries([Battery(drivetrain_efficiency=e) for e in (0.5, 0.8)], (), 2)
     packs.step(1.0, [100.0] * 2, [0.0] * 2, [0.0] * 2)
