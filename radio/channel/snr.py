@@ -7,7 +7,7 @@ links within earshot (`sortie.radio.channel.large_fleet`). What fades is each fr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import log10
+from math import inf, log10
 from typing import Any
 
 import numpy as np
@@ -48,8 +48,10 @@ def earshot_m(settings: AirSettings) -> float:
     """The distance beyond which no frame is heard.
 
     There a link with 5 σ of shadowing (one in 3.5 million) and the highest of 65,536 fades is still 2 dB short of
-    half the group frames.
+    half the group frames. A link model of one's own may make any link a good one: there is no such distance then.
     """
+    if settings.link is not None:
+        return inf
     gain_db = _EARSHOT_SIGMA * settings.shadowing_sigma_db + float(fade_table_db(settings.rician_k_db)[-1])
     group_db = group_curve(settings.group_rate_mbps).snr_db(0.5) - 10.0 * log10(settings.bandwidth_mhz / 20.0)
     needed_db = min(CURVES[0].snr_db(0.5), group_db)

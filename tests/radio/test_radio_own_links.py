@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from sortie.radio.channel.pathloss import free_space_loss_db, path_loss_db, range_m
-from sortie.radio.channel.snr import Channel
+from sortie.radio.channel.snr import OUT_OF_RANGE_DB, Channel
 from sortie.radio.settings import AirSettings
 from sortie.scenarios.plugins.reference import PluginError
 
@@ -51,6 +51,19 @@ def test_a_jammer_is_heard_through_the_same_path_loss() -> None:
     free, walled = channel(STILL, path_loss="free_space"), channel(STILL, path_loss=wall)
     quiet_mw, loud_mw = (10.0 ** (c.noise_rise_db(jammer) / 10.0) - 1.0 for c in (walled, free))
     assert_allclose(quiet_mw, loud_mw * 10.0**-1.2, rtol=1e-9)
+
+
+def test_a_link_model_reaches_every_link_of_a_large_fleet() -> None:
+    """Also those that the built-in models leave out, because nobody would hear anything there."""
+
+    class Good(Less):
+        def snr_db(self, t_s: float, positions_m: Any, snr_db: Any) -> Any:
+            return np.full_like(snr_db, 30.0)
+
+    weak: dict[str, Any] = {"tx_power_dbm": -12.0, "path_loss_exponent": 3.0}
+    assert (channel(CROWD, **weak).snr_db == OUT_OF_RANGE_DB).any()
+    good_db = channel(CROWD, **weak, link=Good).snr_db
+    assert (good_db[~np.eye(40, dtype=bool)] == 30.0).all()
 
 
 @pytest.mark.parametrize("flight", [STILL, CROWD], ids=["five", "forty"])
