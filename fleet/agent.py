@@ -196,11 +196,26 @@ class Agent:
         self._env.process(self._fly())
 
     def _fly(self) -> Generator[simpy.Event, Any, None]:
-        env, rules = self._env, self._rules
+        env, rules, is_away = self._env, self._rules, False
         for frame in range(rules.frames):
             yield env.timeout(max(0.0, frame * rules.period_s + self._phase_s - env.now))
-            if self.status.airborne:  # it may come back
+            if self.status.airborne:
+                if is_away:
+                    self._come_back()
                 self._tick(frame)
+            is_away = not self.status.airborne
+
+    def _come_back(self) -> None:
+        """Begin every link with nothing: the drone asked for nothing while it was away."""
+        for peer, link in self._links.items():
+            if link.state.enforced[2:8] != _NOTHING:
+                rest = nothing(self.drone, peer, "came back")
+                if self._guard is None:
+                    self._put_in_force(link, rest, rest, LinkHealth.DETACHED)
+            else:
+                rest = link.state.enforced
+            link.state, link.asked = DampedLink(rest), None
+        self._ids = None  # what the policy answered then is no answer of now
 
     def _tick(self, frame: int) -> None:
         sensed = self.publish(frame)

@@ -223,6 +223,27 @@ def test_codes_are_one_sample_also_where_features_are_tiles() -> None:
             assert more.size_bytes - made.size_bytes == 5 * made.cells
 
 
+@pytest.mark.parametrize("left_s", [0.2, 1.0], ids=["an upgrade waited", "features were in force"])
+def test_a_drone_that_comes_back_begins_its_links_with_nothing(left_s: float) -> None:
+    """Also where it hears a peer before it decides for the first time, so that age reduces nothing."""
+    rig = Rig(lambda view: [FEATURES] if 1 in view.peers else [])
+    for k in range(round(10 * left_s)):
+        rig.hear(1)
+        rig.env.run(until=0.1 * (k + 1))
+    rig.agent.status.airborne = False
+    rig.env.run(until=3.005)
+    rig.agent.status.airborne = True
+    granted_s = []
+    for k in range(4):
+        rig.hear(1)
+        rig.env.run(until=3.02 + 0.1 * k)
+        directive = rig.gate.in_force(1)
+        assert directive is not None
+        if directive.representation == Representation.FEATURES:
+            granted_s.append(rig.env.now)
+    assert granted_s[0] == pytest.approx(3.32)  # the dwell time of 0.3 s after its first decision
+
+
 def test_a_drone_looks_as_often_as_any_of_its_links_asks_also_one_that_carries_nothing() -> None:
     gate = Gate()
     gate.enforce(FEATURES._replace(duty_percent=20))
