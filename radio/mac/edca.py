@@ -727,7 +727,7 @@ def finish(
                 if good and kind == BLOCK_REQUEST and S[s, TX_JOB] >= 0:
                     flow = J[S[s, TX_JOB], FLOW]
                     lost = LF[flow, FLOW_LOSS] if LF[flow, FLOW_LOSS] >= 0.0 else LF[flow, FLOW_BURST]
-                    good = uniform(mix(seed)) >= lost
+                    good = LI[flow, FLOW_DEAD] == 0 and uniform(mix(seed)) >= lost
                 is_answered = good
             elif kind == DATA:
                 good = is_noticed(j, S, W, SEG, S[s, TX_MCS], 1.0, curves)

@@ -86,3 +86,20 @@ def test_a_link_of_just_the_least_quality_holds_a_fleet_together() -> None:
     assert connectivity(quality, 5.0) == (True, (), (0, 1, 5.0))
     assert connectivity(quality, 5.1) == (False, (0,), (2, 1, 7.0)) == connectivity(quality, 7.0)
     assert connectivity(quality, 10.0) == (False, (1, 2), None)
+
+
+def test_a_silenced_drone_answers_nobody(tmp_path: Path) -> None:
+    """Also not who asks what has arrived of frames that were sent before."""
+    settings = AirSettings(shadowing_sigma_db=0.0, trace=trace(tmp_path, "0,0,1,,0.9,"))
+    asked = 0
+    for seed in range(12):
+        flight = Hover(settings, ROW_M[:2], seed=seed)
+        flight.air.advance()
+        flight.send(0, 1, 2500, deadline_s=0.09)
+        flight.env.run(until=0.002)
+        flight.air.silence(1)
+        before_s = flight.air.airtime_s[1]
+        flight.env.run(until=0.09)
+        assert flight.air.airtime_s[1] == before_s, seed
+        asked += [row.reason for row in flight.rows] == ["receiver_gone"]
+    assert asked > 6
