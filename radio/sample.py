@@ -10,9 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.radio.mac.airtime import (
+    BLOCK_ACK_LONG_S,
     BLOCK_ACK_S,
+    CTS_S,
     MAX_PPDU_S,
     MPDU_DELIMITER,
+    RTS_S,
     ampdu_frames,
     frame_bytes,
     frames_exchanges,
@@ -214,7 +217,10 @@ class Service:
         """The data rate, Mb/s, and the frames an A-MPDU at which full A-MPDUs alone on the channel carry a goodput."""
         c = self._settings
         access = getattr(c.edca, c.payload_class)
-        around_s = 2 * SIFS_S + BLOCK_ACK_S + (access.aifsn + access.cw_min / 2) * SLOT_S
+        block_ack_s = BLOCK_ACK_S if max(c.block_ack_window, c.max_ampdu_frames) <= 64 else BLOCK_ACK_LONG_S
+        around_s = 2 * SIFS_S + block_ack_s + (access.aifsn + access.cw_min / 2) * SLOT_S
+        if c.rts:
+            around_s += RTS_S + SIFS_S + CTS_S + SIFS_S
         frame_s = c.fragment_bytes * 8e-6 / goodput_mbps
         most = min(c.max_ampdu_frames, self._standard.max_ampdu_frames)
         frames = max(1, min(most, int((MAX_PPDU_S + around_s) / frame_s)))

@@ -88,6 +88,10 @@ def group_frame_s(payload_bytes: int, rate_mbps: float) -> float:
 
 ACK_S = legacy_ppdu_s(14, CONTROL_MBPS)
 BLOCK_ACK_S = legacy_ppdu_s(32, CONTROL_MBPS)
+BLOCK_ACK_LONG_S = legacy_ppdu_s(56, CONTROL_MBPS)
+"""Of more than 64 frames."""
+RTS_S = legacy_ppdu_s(20, CONTROL_MBPS)
+CTS_S = legacy_ppdu_s(14, CONTROL_MBPS)
 
 
 def ampdu_frames(frame: int, rate_mbps: float, max_frames: int, standard: Standard = AX) -> int:

@@ -94,6 +94,16 @@ def test_a_traced_goodput_is_what_a_link_carries(tmp_path: Path) -> None:
     assert flight.air.goodput_mbps(0)[0] == pytest.approx(24.0, rel=0.03)
 
 
+@pytest.mark.parametrize("frames", [16, 64])
+def test_a_traced_goodput_holds_with_rts(frames: int, tmp_path: Path) -> None:
+    """RTS and CTS are within it, also where A-MPDUs take some two milliseconds."""
+    settings = AirSettings(trace=trace(tmp_path, "0,0,1,,,80"), rts=True, max_ampdu_frames=frames)
+    flight = Hover(settings)
+    flight.fly(4.0, lambda frame: flight.send(0, 1, 640 * 1344, kind=f"{frame}"))
+    took_s = [r.t_done_s - r.t_start_s for r in flight.rows if r.status is Status.DELIVERED]
+    assert np.mean(took_s) == pytest.approx(640 * 1344 * 8 / 80e6, rel=0.008)
+
+
 def test_no_goodput_is_no_link(tmp_path: Path) -> None:
     flight = Hover(AirSettings(trace=trace(tmp_path, "0,0,1,,,0")))
 
