@@ -34,7 +34,7 @@ class Transmission(NamedTuple):
     | fragments, fragments_lost | DDS fragments, and how often one was lost in all passes |
     | repairs | repair rounds |
     | mcs, snr_db | of its latest service, or −1 and the mean SNR at its sending |
-    | airtime_s | channel time it was given, contention and retries included, on all hops |
+    | airtime_s | channel time of its frames and their answers, retries included, on all hops; without the backoff before them |
     | hops | links it went over, or the one it was on |
     | arrived_bytes | payload at the receiver: all, none, or that of the pieces that came |
     | missing | pieces that did not come, ascending, where it arrived in part |
