@@ -121,7 +121,9 @@ class Transport:
         if transmission.status == Status.DELIVERED and not self._receivers[transmission.receiver].can_fuse(payload):
             transmission = transmission._replace(reason=OTHER_SPACE)  # it took the air all the same
         self._write(transmission, payload, capture)
-        if transmission.arrived_bytes and transmission.kind != HANDSHAKE:
+        if transmission.kind == HANDSHAKE:
+            self._receivers[transmission.receiver].status.work.payload_bytes += transmission.arrived_bytes
+        elif transmission.arrived_bytes:
             missing, mcs, rates_mbps = transmission.missing, transmission.mcs, self._rates_mbps
             if missing:
                 missing = cells_of(missing, payload.cells, payload.tile_cells)

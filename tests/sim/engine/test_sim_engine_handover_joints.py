@@ -115,7 +115,7 @@ def test_a_data_rate_is_that_of_the_mcs_or_unknown(mcs: int, mbps: float) -> Non
 
 
 def test_what_did_not_arrive_and_what_carries_no_payload_reaches_no_memory() -> None:
-    transport, wire, _, got, recorder = _transport()
+    transport, wire, memories, got, recorder = _transport()
     sent = payload()._replace(feature_space="")
     transport.send(0, 1, sent, capture(0, 0.0), 1.0)
     wire.settled(1, status=Status.LOST, reason="no_link", arrived_bytes=0)
@@ -126,6 +126,7 @@ def test_what_did_not_arrive_and_what_carries_no_payload_reaches_no_memory() -> 
     transport.send(0, 1, sent, capture(0, 0.2), 1.0)
     transport.finish()
     assert got == []
+    assert [m.status.work.payload_bytes for m in memories] == [0, 200, 0]  # its computer reads a handshake all the same
     assert [(t.status, t.reason, c) for t, _, c in recorder.rows["transmissions"]] == [
         (Status.LOST, "no_link", 0.0), (Status.DELIVERED, "", 0.1), (Status.IN_FLIGHT, "", 0.2),
     ]  # fmt: skip
