@@ -61,7 +61,8 @@ def from_dataflash(raw: RawLog) -> tuple[Found, str]:
         if name in tables:
             table = _first_of(tables[name])
             unit = 0.01 if np.issubdtype(table["Volt"].dtype, np.integer) else 1.0
-            found["battery"] = _stacked(_seconds(table), table["Volt"] * unit, table["Curr"] * unit)
+            known = _rows(table, table["Volt"] > 0)  # 0 V: nothing was measured yet
+            found["battery"] = _stacked(_seconds(known), known["Volt"] * unit, known["Curr"] * unit)
             capacity = raw.parameters().get("BATT_CAPACITY", 0.0)
             # a count that stands at nothing is that of a pack whose current is not measured
             if "CurrTot" in table and capacity > 0 and (table["CurrTot"] > 0).any():

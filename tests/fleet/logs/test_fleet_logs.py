@@ -141,17 +141,18 @@ def test_the_first_receiver_is_taken() -> None:
 
 
 def test_what_an_autopilot_does_not_know_is_no_value() -> None:
-    """PX4 says 0 V, −1 A and −1 of the charge; ArduPilot counts nothing where it has no sensor."""
+    """Both say 0 V before they measure, PX4 −1 A and −1 of the charge; ArduPilot counts nothing where it has no sensor."""
     log = assembled("ULog", battery_status={"voltage_v": [0, 16, 16], "current_a": [-1, -1, 5], "remaining": [-1] * 3})
     assert log.charge is None
     assert log.battery is not None
     np.testing.assert_array_equal(log.battery.values, [[16, np.nan], [16, 5]])
     log = assembled(
         "DataFlash",
-        BAT={"Volt": [16.0] * 3, "Curr": [0.0] * 3, "CurrTot": [0.0] * 3},
+        BAT={"Volt": [0.0, 16.0, 16.0], "Curr": [0.0] * 3, "CurrTot": [0.0] * 3},
         PARM={"Name": [b"BATT_CAPACITY"], "Value": [5000.0]},
     )
     assert log.battery is not None
+    assert log.battery.values.tolist() == [[16.0, 0.0]] * 2
     assert log.charge is None
 
 
