@@ -73,6 +73,8 @@ def after(state: VehicleState, message: Any, now_s: float, origin: Origin | None
             now_s,
         )
     if name == "GLOBAL_POSITION_INT" and origin is not None:
+        if message.lat == message.lon == 0:  # it has no fix yet
+            return state
         position_m = local_enu(message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3, origin)
         return _moved(state, position_m, _enu((message.vx * 0.01, message.vy * 0.01, message.vz * 0.01)), now_s)
     if name == "ATTITUDE":

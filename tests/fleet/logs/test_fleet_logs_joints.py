@@ -267,6 +267,14 @@ def test_a_height_is_that_above_the_origin_and_not_above_home() -> None:
     assert state.pose_s == -math.inf
 
 
+def test_a_vehicle_without_a_fix_has_no_place_yet() -> None:
+    """Autopilots say 0° and 0° until they know."""
+    heartbeat = mavlink2.MAVLink_heartbeat_message(2, 12, 0, 0, 0, 3)
+    nowhere = mavlink2.MAVLink_global_position_int_message(0, 0, 0, 17_000, 0, 0, 0, 0, 0)
+    known = after(VehicleState(), heartbeat, 0.0, examples.ORIGIN)
+    assert after(known, nowhere, 1.0, examples.ORIGIN) == known
+
+
 def test_a_local_place_counts_only_where_no_origin_is_given() -> None:
     heartbeat = mavlink2.MAVLink_heartbeat_message(2, 12, 0, 0, 0, 3)
     local = mavlink2.MAVLink_local_position_ned_message(0, 1.0, 2.0, -3.0, 4.0, 5.0, -6.0)
