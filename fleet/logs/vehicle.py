@@ -83,6 +83,8 @@ def after(state: VehicleState, message: Any, now_s: float, origin: Origin | None
         )
     if name == "ATTITUDE_QUATERNION":
         return _turned(state, to_xyzw([message.q1, message.q2, message.q3, message.q4]).tolist(), now_s)
+    if name == "BATTERY_STATUS" and message.id != 0:  # SYS_STATUS tells of the first battery too
+        return state
     if name in ("SYS_STATUS", "BATTERY_STATUS") and message.battery_remaining >= 0:  # −1: it does not know
         return state._replace(soc=min(message.battery_remaining / 100.0, 1.0))
     if name == "EXTENDED_SYS_STATE":

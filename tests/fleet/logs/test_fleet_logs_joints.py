@@ -292,6 +292,13 @@ def test_a_charge_that_is_not_known_keeps_the_one_before() -> None:
     assert after(state, status, 2.0, None).soc == 0.5
 
 
+@pytest.mark.parametrize(("number", "soc"), [(0, 0.4), (1, 0.5)])
+def test_the_charge_is_that_of_the_first_battery(number: int, soc: float) -> None:
+    status = mavlink2.MAVLink_battery_status_message(number, 0, 1, 0, [16_000] * 10, 100, 0, 0, 40)
+    known = VehicleState(system=0, soc=0.5)
+    assert after(known, status, 1.0, None).soc == soc
+
+
 def test_a_drone_answers_messages_to_itself_and_to_all() -> None:
     """Drone 2 is system 3; its neighbours' messages are none of its business."""
     for system, answered in ((0, True), (1, False), (2, False), (3, True), (4, False)):
