@@ -430,13 +430,13 @@ class Agent:
         return health(age_s, self._period_s, rules.degraded_after_periods, rules.detached_after_periods)
 
     def _blame_clock(self, peer: int, fidelity: LinkHealth, age_s: float, now_s: float) -> None:
-        """Report a link that begins to be reduced because a descriptor was too old when it came."""
+        """Report a link that begins to be reduced because a descriptor was too old by its stamp when it came."""
         heard_ago_s, before = self.memory.heard_ago_s(peer, now_s), self._blamed[peer]
         self._blamed[peer] = is_blamed = fidelity != _FRESH and age_s - heard_ago_s > self.memory.clocks.delay_s
         if is_blamed and not before:
             text = (
                 f"link to {peer} {fidelity.name.lower()}: its descriptor came {heard_ago_s:.2f} s ago and is {age_s:.2f} s "
-                "old by its stamp, so a clock is wrong"
+                "old by its stamp: a clock is wrong, or it waited for the channel"
             )
             self._log.event(now_s, self.drone, "clock", text)
 
