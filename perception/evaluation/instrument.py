@@ -77,6 +77,7 @@ class CarNetView:
     ego's own or, where silent peers count as zeros, the ego fused with that many zeros, computed once per view.
     """
 
+    @torch.inference_mode()
     def __init__(
         self, net: CarNet, features: torch.Tensor, est: torch.Tensor, read: torch.Tensor | None = None
     ) -> None:

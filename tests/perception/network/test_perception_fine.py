@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sortie.perception.benchmark.dataset import Frames
 from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.evaluation.instrument import CarNetInstrument, CarNetView
 from sortie.perception.network.checkpoint import load_weights, read_config, save_weights
 from sortie.perception.network.decode import decode
 from sortie.perception.network.detector import TorchDetector
@@ -128,6 +128,15 @@ def test_fusing_where_something_arrived_is_fusing_everywhere(fleet: Frames, unse
         theirs = decode(everywhere(quick, features, fleet, e), 0.01).double().numpy()
         assert len(ours) == len(theirs) > 50
         assert np.sort(ours[:, 5]) == pytest.approx(np.sort(theirs[:, 5]), abs=2e-5)
+
+
+def test_a_view_takes_features_that_were_computed_for_inference(fleet: Frames) -> None:
+    """Its maps are spread at once, wherever it is made."""
+    net = folded(network())
+    with torch.inference_mode():
+        features = net.encoder(torch.from_numpy(fleet.images[0]))
+    view = CarNetView(net, features, torch.zeros(5, 3))
+    assert len(view.detect([Exchange(0, (), np.zeros((0, 64, 64), bool))], 0.01)) == 1
 
 
 def test_it_flies_as_the_harness_measures_it(tmp_path: Path) -> None:
