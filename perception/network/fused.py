@@ -54,11 +54,16 @@ def fused_map(net: CarNet, pose: Pose, own: Tensor | None, peers: Sequence[Peer]
     zeros = torch.zeros(config.fused_channels, config.fused_cells, config.fused_cells)
     theirs = [zeros if p.map is None else p.map for p in peers]
     tables = [each.permute(1, 2, 0).flatten(0, 1) for each in theirs]
-    taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), strict=True))
+    offset = under.offset.flatten(1, 2)
+    taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), offset, under.turn[:, None], strict=True))
 
-    def said(at: Tensor) -> Tensor:
-        moved = torch.stack([rows(table, cells[at], shares[at]) for table, cells, shares in taps])
-        return net.aligned(moved, under.offset.flatten(1, 2)[:, at], under.turn)
+    def said(at: Tensor) -> list[Tensor]:
+        """What each peer says in those cells; one peer after another, so that it stays in the cache."""
+        out = []
+        for table, cells, shares, lies, turn in taps:
+            moved = rows(table, cells.index_select(0, at), shares.index_select(0, at))
+            out.append(net.aligned(moved[None], lies.index_select(0, at)[None], turn)[0])
+        return out
 
     if own is None:
         return _without_own(net, said, part[0, 1:], arrived, weight[0])
@@ -68,7 +73,7 @@ def fused_map(net: CarNet, pose: Pose, own: Tensor | None, peers: Sequence[Peer]
 
 
 def _without_own(
-    net: CarNet, said: Callable[[Tensor], Tensor], part: Tensor, arrived: Tensor, weight: Tensor
+    net: CarNet, said: Callable[[Tensor], list[Tensor]], part: Tensor, arrived: Tensor, weight: Tensor
 ) -> Tensor:
     """Peers alone: in each cell the one that counts most takes the ego's place.
 
@@ -78,7 +83,7 @@ def _without_own(
     """
     k, height, width = part.shape
     lead = (weight[:, None, None] * arrived).argmax(dim=0)  # of equals the first
-    own = said(torch.arange(height * width)).view(k, height, width, -1)
+    own = torch.stack(said(torch.arange(height * width))).view(k, height, width, -1)
     own = own.gather(0, lead[None, ..., None].expand(1, -1, -1, own.shape[-1]))[0].permute(2, 0, 1)
     own = own * arrived.any(dim=0)
     follows = part & (torch.arange(k)[:, None, None] != lead)
