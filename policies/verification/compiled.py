@@ -9,7 +9,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from sortie.policies.contract import Descriptor, Directive, FleetView
 from sortie.policies.verification.invariants import (
@@ -35,6 +35,11 @@ _COMPARE: dict[str, Compare] = {
 _ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {"+": operator.add, "-": operator.sub, "*": operator.mul}
 _OPPOSITE = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "==": "!=", "!=": "=="}
 _MIRRORED = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "==": "==", "!=": "!="}
+READ: dict[str, Callable[[Directive], Any]] = {word: cast(Any, field.raw) for word, field in DECISIONS.items()} | {
+    word: operator.itemgetter(Directive._fields.index(word))
+    for word in ("rho", "rate_hz", "deadline_s", "fusion_weight")
+}
+"""The value of a directive's field, as lines compare it."""
 _MOST_WAYS = 64
 """A part with more alternatives is not taken apart: the shield then changes single fields of it."""
 
@@ -42,13 +47,38 @@ _MOST_WAYS = 64
 class Context:
     """What lines are judged on. Values that depend on the view or on a peer alone are worked out once."""
 
-    __slots__ = ("directives", "fresh", "known", "me", "view")
+    __slots__ = ("_witness", "directives", "fresh", "known", "me", "view")
 
     def __init__(
         self, view: FleetView, me: Descriptor, directives: Sequence[Directive], fresh: Mapping[int, Directive]
     ) -> None:
         self.view, self.me, self.directives, self.fresh = view, me, directives, fresh
         self.known: dict[Any, Any] = {}
+        self._witness: dict[Ask, int | None] = {}
+
+    def having(self, k: int, directive: Directive) -> Context:
+        """The same with another directive for link k."""
+        links = (*self.directives[:k], directive, *self.directives[k + 1 :])
+        found, mine = Context(self.view, self.me, links, self.fresh), directive.destination
+        found.known = self.known
+        for condition, witness in self._witness.items():
+            if witness is None or witness == mine:
+                if condition(self, directive):
+                    found._witness[condition] = mine
+                elif witness is None:
+                    found._witness[condition] = None
+            else:
+                found._witness[condition] = witness
+        return found
+
+    def others(self, condition: Ask, mine: int) -> bool:
+        """Whether a link to another peer than `mine` satisfies a condition."""
+        if condition not in self._witness:
+            self._witness[condition] = next((d.destination for d in self.directives if condition(self, d)), None)
+        witness = self._witness[condition]
+        if witness != mine:
+            return witness is not None
+        return any(d.destination != mine and condition(self, d) for d in self.directives)
 
 
 class Claim(NamedTuple):
@@ -216,18 +246,19 @@ def _ask(node: Node) -> Ask:
 
 
 def _word(word: str) -> Ask:
+    if word in DECISIONS:
+        read = READ[word]
+        return lambda _, link: read(link)
     found = WORDS[word]
-    raw = found.raw
-    if word in DECISIONS and raw is not None:
-        field: Callable[[Directive], Any] = raw
-        return lambda _, link: field(link)
+    if found.raw is not None:
+        of_peer = found.raw
+        return lambda context, link: of_peer(context, link.destination)
 
-    def ask(context: Context, link: Directive) -> Any:
-        key = word if raw is None else (word, link.destination)
+    def ask(context: Context, _: Directive) -> Any:
         known = context.known
-        if key not in known:
-            known[key] = found.value(context) if raw is None else raw(context, link.destination)  # type: ignore[arg-type]
-        return known[key]
+        if word not in known:
+            known[word] = found.value(context)  # type: ignore[arg-type]
+        return known[word]
 
     return ask
 
@@ -257,8 +288,11 @@ def _logic(word: str, parts: tuple[Ask, ...]) -> Ask:
 
 
 def _binary(sign: str, left: Node, right: Node) -> Ask:
-    a = _ask(left)
     compare = _COMPARE.get(sign)
+    if compare is not None and isinstance(left, Name) and left.word in DECISIONS and isinstance(right, Number):
+        read, bound = READ[left.word], right.value
+        return lambda _, link: compare(read(link), bound)
+    a = _ask(left)
     if compare is not None and isinstance(right, Number):
         value = right.value
         return lambda context, link: compare(a(context, link), value)
@@ -290,9 +324,4 @@ def _over_links(function: str, body: Ask) -> Ask:
 
 def _other_links(body: Ask) -> Ask:
     """Whether one of the other links satisfies a condition."""
-
-    def ask(context: Context, link: Directive) -> bool:
-        mine = link.destination
-        return any(d.destination != mine and body(context, d) for d in context.directives)
-
-    return ask
+    return lambda context, link: context.others(body, link.destination)

@@ -14,11 +14,12 @@ import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, Representation
-from sortie.policies.verification.compiled import Claim, Compare, Context, Part, Rule
-from sortie.scenarios.representation import AT_LEVEL, LEVELS
+from sortie.policies.verification.compiled import READ, Claim, Compare, Context, Part, Rule
+from sortie.policies.verification.invariants import Invariant
+from sortie.scenarios.representation import AT_LEVEL
 
 LEAST_RATE_HZ = 2.0
 """The rate of a link that a shield makes carry something, if no line names a rate: the bottom rung of the paper's table."""
@@ -28,15 +29,6 @@ _HIGHEST: dict[str, float] = {
     **{name: bound.high for name, bound in DIRECTIVE_BOUNDS.items() if name != "duty_percent"},
     "duty": 1.0,
     "roi": 1.0,
-}
-_READ: dict[str, Callable[[Directive], Any]] = {
-    **{
-        word: operator.itemgetter(Directive._fields.index(word))
-        for word in ("rho", "rate_hz", "deadline_s", "fusion_weight")
-    },
-    "representation": lambda d: LEVELS[d.representation],
-    "duty": lambda d: d.duty_percent / 100,
-    "roi": lambda d: float(d.roi is not None),
 }
 _FIRST_LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0)
 Holds = Callable[[Directive], bool]
@@ -57,7 +49,18 @@ class Box:
         most: upper bounds of fields, beside those of the lines.
     """
 
-    __slots__ = ("_bounds", "_checks", "_values", "applies", "limits", "others", "rules", "shared")
+    __slots__ = (
+        "_bounded",
+        "_checks",
+        "_others",
+        "applies",
+        "broken_by",
+        "limits",
+        "nearest_to",
+        "parts",
+        "rules",
+        "shared",
+    )
 
     def __init__(
         self,
@@ -68,59 +71,88 @@ class Box:
         most: Mapping[str, float] | None = None,
     ) -> None:
         self.rules, self.applies = rules, applies
-        self.limits: dict[str, tuple[Limit, ...]] = {w: ((operator.le, high),) for w, high in (most or {}).items()}
-        """Of each bounded field."""
-        checks, others = [], []
-        bounds = [(_READ[w], c, v, -1, w) for w, limits in self.limits.items() for c, v in limits]
+        limits: dict[str, tuple[Limit, ...]] = {w: ((operator.le, high),) for w, high in (most or {}).items()}
+        checks, parts = [], list[tuple[Part, int]]()
         for number, rule in enumerate(rules):
             for part in rule.parts:
                 claim = part.bound
                 if claim is None or claim.compare is None or claim.value is None:
-                    others.append((part.holds, number, part))
+                    parts.append((part, number))
                     continue
-                word, value = claim.fields[0], claim.value(context, some)
-                checks.append((_READ[word], claim.compare, value, number, word))
-                self.limits[word] = (*self.limits.get(word, ()), (claim.compare, value))
-        self._checks, self._bounds = checks, [*bounds, *checks]
-        self.others = tuple(others)
+                word, limit = claim.fields[0], (claim.compare, claim.value(context, some))
+                checks.append((READ[word], *limit, number))
+                limits[word] = (*limits.get(word, ()), limit)
+        self._checks = checks
+        self.limits = {word: Values(word, limits.get(word, ())) for word in READ}
+        """What each field may be."""
+        self._bounded = [(word, READ[word], self.limits[word]) for word in limits]
+        self.parts = tuple([part for part, _ in parts])
         """The parts that are no bounds of one field, or have another bound for each link."""
-        self.shared = not any(part.of_peer or part.of_links for _, _, part in others)
+        self._others = [(part.holds, number) for part, number in parts]
+        self.shared = not any(part.of_peer or part.of_links for part, _ in parts)
         """Whether equal directives of different links get the same correction."""
-        self._values: dict[str, tuple[float, ...]] = {}
+        self.broken_by: dict[Any, list[Invariant]] = {}
+        """The lines that a directive breaks, by its key."""
+        self.nearest_to: dict[Any, Directive | None] = {}
+        """The directive that replaces another one, by its key."""
 
-    def broken(self, context: Context, link: Directive) -> list[int]:
-        """The numbers of the lines that a link breaks."""
-        found = [number for read, compare, value, number, _ in self._checks if not compare(read(link), value)]
-        found += [number for holds, number, _ in self.others if not holds(context, link)]
-        return found
+    def broken(self, context: Context, link: Directive) -> list[Invariant]:
+        """The lines that a link breaks."""
+        found = [number for read, compare, value, number in self._checks if not compare(read(link), value)]
+        found += [number for holds, number in self._others if not holds(context, link)]
+        return [self.rules[i].invariant for i in sorted(set(found))] if found else []
 
     def clipped(self, link: Directive) -> dict[str, float] | None:
         """The values of the fields that must change for the bounds; None if a field has no value that they allow."""
         wanted: dict[str, float] = {}
-        for read, compare, bound, _, word in self._bounds:
+        for word, read, values in self._bounded:
             now = read(link)
-            if word not in wanted and not compare(now, bound):
-                value = self._closest(word, now, ())
-                if value is None:
-                    return None
+            value = values.nearest(now)
+            if value is None:
+                return None
+            if value is not now:
                 wanted[word] = value
         return wanted
 
-    def moved(self, word: str, now: float, more: Sequence[Limit] = ()) -> float | None:
-        """The value nearest to the present one that a field may have; None without any."""
-        for compare, value in (*self.limits.get(word, ()), *more):
-            if not compare(now, value):
-                return self._closest(word, now, more)
-        return now
+    def key(self, directive: Directive) -> Any:
+        """What directives have in common that are corrected alike; None if nothing can be said."""
+        if not self.shared:
+            return None
+        _, _, rung, rho, roi, rate_hz, deadline_s, weight, duty, _ = directive
+        for x in (rung, rho, rate_hz, deadline_s, weight, duty):
+            if type(x) not in _PLAIN:
+                return None
+        return rung, rho, id(roi), rate_hz, deadline_s, weight, duty
 
-    def _closest(self, word: str, now: float, more: Sequence[Limit]) -> float | None:
-        """The same, where the present value is not allowed."""
-        if more:
-            values = _allowed(word, (*self.limits.get(word, ()), *more))
-        elif word in self._values:
-            values = self._values[word]
+
+class Values:
+    """What limits allow one field."""
+
+    __slots__ = ("_all", "_more", "limits", "word")
+
+    def __init__(self, word: str, limits: tuple[Limit, ...]) -> None:
+        self.word, self.limits = word, limits
+        self._all: tuple[float, ...] | None = None
+        self._more: dict[Limit, Values] = {}
+
+    def within(self, limit: Limit) -> Values:
+        """What these limits and one more allow."""
+        if type(limit[1]) not in _PLAIN:
+            return self if limit in self.limits else Values(self.word, (*self.limits, limit))
+        if limit not in self._more:
+            self._more[limit] = self if limit in self.limits else Values(self.word, (*self.limits, limit))
+        return self._more[limit]
+
+    def nearest(self, now: float) -> float | None:
+        """The value nearest to the present one that the field may have; None without any."""
+        for compare, value in self.limits:
+            if not compare(now, value):
+                break
         else:
-            values = self._values[word] = _allowed(word, self.limits[word])
+            return now
+        if self._all is None:
+            self._all = _allowed(self.word, self.limits)
+        values = self._all
         if not values:
             return None
         if now > values[-1]:
@@ -128,150 +160,157 @@ class Box:
         return values[0] if now < values[0] else min(values, key=lambda v: abs(v - now))
 
 
-class _Try(NamedTuple):
-    """A box within the box."""
-
-    at_least: tuple[int, Far]
-    """How many conditions it makes false, and how far its nearest directive is, or a lower bound of that."""
-    number: int
-    limits: Mapping[str, tuple[Limit, ...]]
-    """Those beside the box's."""
-    wanted: Mapping[str, float]
-    """The values of fields that are named; other fields may follow them."""
-    after: Directive | None = None
-    """Its nearest directive, if that is worked out."""
-    exempts: Part | None = None
-    """The part whose condition is to be made false."""
+_Limits = Mapping[str, Values]
+"""What each field may be."""
+_Named = Mapping[str, float]
+"""The values of fields that are named; other fields may follow them."""
+_Try = tuple[int, int, float, int, _Limits, _Named, Directive | None, Part | None]
+"""A box within the box: how many conditions it makes false; in how many fields and by how much in all its nearest directive
+differs, or lower bounds of that; a number; its limits and named values; its nearest directive, if that is worked out; and the
+part whose condition is to be made false."""
 
 
-def nearest(
-    before: Directive, box: Box, also: Sequence[Part], context: Context, allowed: Holds, within: Far | None = None
-) -> Directive | None:
+def nearest(before: Directive, box: Box, also: Sequence[Part], context: Context, allowed: Holds) -> Directive | None:
     """The nearest directive in the box that keeps the parts `also` and is allowed; None if none was found.
 
     Args:
         before: the directive.
         box: the lines that apply to this link.
-        also: parts of a line about all links together.
+        also: parts of lines about several links.
         context: what all are judged on.
         allowed: which directives may replace others.
-        within: only directives nearer than this are wanted.
     """
-    wanted = box.clipped(before)
-    if wanted is None:
+    clipped = box.clipped(before)
+    if clipped is None:
         return None
-    parts, count = [*[part for _, _, part in box.others], *also], 0
-    queue = [_Try((0, (0, 0.0)), 0, {}, wanted)]
+    parts, region, number = (*box.parts, *also), context.me.region, 0
+    queue: list[_Try] = []
+    this: _Try = (0, 0, 0.0, 0, box.limits, clipped, None, None)
     for _ in range(MOST):
+        exempted, fields, far, _, limits, named, found, exempts = this
+        if found is not None:
+            return found
+        after = _changed(before, named, region)
+        ways: Iterable[_Way] = ()
+        if after is None:
+            pass
+        elif exempts is not None:
+            ways = _mended(before, exempts.exempt, limits, named, context, after)
+        else:
+            broken = _broken(parts, limits, named, context, before, after)
+            if isinstance(broken, Part):
+                ways = _mended(before, broken.ways, limits, named, context, after)
+                if broken.exempt:
+                    number += 1
+                    heapq.heappush(queue, (exempted + 1, fields, far, number, limits, named, None, broken))
+            elif broken is not None:
+                ways = broken
+            elif allowed(after):
+                if not queue or (queue[0][:3] >= this[:3] and not _follows(before, named, after)):
+                    return after
+                number += 1
+                heapq.heappush(queue, (exempted, *distance(before, after), number, limits, named, after, None))
+        for tighter, names in ways:
+            number += 1
+            heapq.heappush(queue, (exempted, *_far(before, names), number, tighter, names, None, None))
         if not queue:
             return None
         this = heapq.heappop(queue)
-        exempted, far = this.at_least
-        if within is not None and exempted == 0 and far >= within:
-            return None
-        if this.after is not None:
-            return this.after
-        after = _changed(before, this.wanted, context.me.region)
-        if after is None:
-            continue
-        if this.exempts is not None:
-            ways = [w for way in this.exempts.exempt for w in _mended(before, way, box, this, context, after)]
-        else:
-            broken = _broken(box, parts, this, context, before, after)
-            if broken is None:
-                if allowed(after):
-                    if not queue or (queue[0].at_least >= this.at_least and not _follows(before, this.wanted, after)):
-                        return after
-                    count += 1
-                    at = exempted, distance(before, after)
-                    heapq.heappush(queue, this._replace(at_least=at, number=count, after=after))
-                continue
-            if isinstance(broken, Part):
-                ways = [w for way in broken.ways for w in _mended(before, way, box, this, context, after)]
-                if broken.exempt:
-                    count += 1
-                    at = exempted + 1, far
-                    heapq.heappush(queue, this._replace(at_least=at, number=count, exempts=broken))
-            else:
-                ways = broken
-        for limits, named in ways:
-            count += 1
-            heapq.heappush(queue, _Try((exempted, _far(before, named)), count, limits, named))
     return None
 
 
-def _follows(before: Directive, wanted: Mapping[str, float], after: Directive) -> bool:
+def _follows(before: Directive, named: _Named, after: Directive) -> bool:
     """Whether a field changed that was not named."""
-    return "representation" in wanted and any(
-        word not in wanted and _READ[word](before) != _READ[word](after) for word in ("rho", "rate_hz")
+    return "representation" in named and any(
+        word not in named and READ[word](before) != READ[word](after) for word in ("rho", "rate_hz")
     )
 
 
 def distance(a: Directive, b: Directive) -> Far:
     """How many fields differ, and by how much in all: a rung counts a quarter, a number its share of its bounds."""
-    return _far(a, {word: read(b) for word, read in _READ.items()})
+    far, changed = 0.0, 0
+    for word, read in READ.items():
+        now, then = read(a), read(b)
+        if now != then:
+            changed, far = changed + 1, far + abs(then - now) / _HIGHEST[word]
+    return changed, far
 
 
 def _far(before: Directive, wanted: Mapping[str, float]) -> Far:
     """The distance to a directive with these values, without what follows from them in other fields."""
     far, changed = 0.0, 0
     for word, value in wanted.items():
-        now = _READ[word](before)
+        now = READ[word](before)
         if value != now:
             changed, far = changed + 1, far + abs(value - now) / _HIGHEST[word]
     return changed, far
 
 
-_Way = tuple[Mapping[str, tuple[Limit, ...]], Mapping[str, float]]
-"""Further limits, and the values of fields that are named."""
+_Way = tuple[_Limits, _Named]
 
 
 def _broken(
-    box: Box, parts: Sequence[Part], this: _Try, context: Context, before: Directive, after: Directive
+    parts: Sequence[Part], limits: _Limits, named: _Named, context: Context, before: Directive, after: Directive
 ) -> Part | list[_Way] | None:
     """The first part that is broken; or, if a field followed another one out of the box, how to put it back."""
-    if "representation" in this.wanted:
+    if "representation" in named:
         for word in ("rho", "rate_hz"):  # these follow the representation
-            read = _READ[word]
+            read = READ[word]
             now, was = read(after), read(before)
-            if now != was and word not in this.wanted and box.moved(word, now, this.limits.get(word, ())) != now:
+            if now != was and word not in named and limits[word].nearest(now) != now:
                 # A link that is to carry something keeps a rate; cells stay as near to what they were as may be.
-                value = box.moved(word, now if word == "rate_hz" else was, this.limits.get(word, ()))
-                return [] if value is None else [(this.limits, {**this.wanted, word: value})]
-    return next((part for part in parts if not part.holds(context, after)), None)
+                value = limits[word].nearest(now if word == "rate_hz" else was)
+                return [] if value is None else [(limits, {**named, word: value})]
+    for part in parts:
+        if not part.holds(context, after):
+            return part
+    return None
 
 
 def _mended(
-    before: Directive, way: Sequence[Claim], box: Box, this: _Try, context: Context, after: Directive
+    before: Directive,
+    ways: Iterable[Sequence[Claim]],
+    within: _Limits,
+    names: _Named,
+    context: Context,
+    after: Directive,
 ) -> Iterator[_Way]:
-    """The limits with which all claims of a way hold; none if another drone or the view decides against it."""
-    limits, named, tied = dict(this.limits), dict(this.wanted), None
-    for claim in way:
-        if claim.value is not None and claim.compare is not None:
-            word, limit = claim.fields[0], (claim.compare, claim.value(context, after))
-            if limit not in limits.get(word, ()):
-                limits[word] = (*limits.get(word, ()), limit)
-                now = _READ[word](before)
-                value = box.moved(word, now, limits[word])
-                if value is None:
-                    return
-                if value != now or word in named:
-                    named[word] = value
-        elif not claim.holds(context, after):
-            if not claim.fields:
-                return
-            tied = tied or claim
-    if tied is None or limits != this.limits:
-        yield limits, named
-        return
-    allows = {word: (*box.limits.get(word, ()), *limits.get(word, ())) for word in tied.fields}
+    """The limits with which all claims of a way hold; none of a way that another drone or the view decides against."""
+    for way in ways:
+        limits, named, tied = dict(within), dict(names), None
+        for claim in way:
+            if claim.value is not None and claim.compare is not None:
+                word = claim.fields[0]
+                had = limits[word]
+                values = limits[word] = had.within((claim.compare, claim.value(context, after)))
+                if values is not had:
+                    now = READ[word](before)
+                    value = values.nearest(now)
+                    if value is None:
+                        break
+                    if value != now or word in named:
+                        named[word] = value
+            elif not claim.holds(context, after):
+                if not claim.fields:
+                    break
+                tied = tied or claim
+        else:
+            if tied is None or limits != within:
+                yield limits, named
+            else:
+                yield from _untied(tied, limits, named, context, after)
+
+
+def _untied(tied: Claim, limits: _Limits, named: _Named, context: Context, after: Directive) -> Iterator[_Way]:
+    """The ways to keep a claim about several fields by a change of one of them."""
+    allows = {word: limits[word].limits for word in tied.fields}
     values = [(word, _solved(tied, word, allows[word], context, after)) for word in tied.fields]
     if all(value is None for _, value in values):  # one field is not enough
         values = [(word, v) for word in tied.fields for v in _helping(tied, word, allows[word], context, after)]
     for word, value in values:
         if value is not None:
-            side = operator.le if value < _READ[word](after) else operator.ge
-            yield {**limits, word: (*limits.get(word, ()), (side, value))}, {**named, word: value}
+            side = operator.le if value < READ[word](after) else operator.ge
+            yield {**limits, word: limits[word].within((side, value))}, {**named, word: value}
 
 
 def _solved(claim: Claim, word: str, limits: Sequence[Limit], context: Context, after: Directive) -> float | None:
@@ -288,7 +327,7 @@ def _solved(claim: Claim, word: str, limits: Sequence[Limit], context: Context, 
             edges.append(-low_gap * high / (high_gap - low_gap))  # exact if the claim is linear in the field
             if claim.gap(context, moved(high / 2)) != (low_gap + high_gap) / 2:
                 edges.append(_crossing(lambda v: claim.gap(context, moved(v)), high, low_gap))  # type: ignore[misc]
-    now = _READ[word](after)
+    now = READ[word](after)
     values = _near(word, edges)
     for compare, value in limits:
         values = [v for v in values if compare(v, value)]
@@ -309,7 +348,7 @@ def _helping(claim: Claim, word: str, limits: Sequence[Limit], context: Context,
     values, gap = _allowed_any(word, tuple(limits)), abs(claim.gap(context, after))
     for value in dict.fromkeys((*values[:1], *values[-1:])):
         found = _changed(after, {word: value}, context.me.region)
-        if found is not None and value != _READ[word](after) and abs(claim.gap(context, found)) <= gap:
+        if found is not None and value != READ[word](after) and abs(claim.gap(context, found)) <= gap:
             yield value
 
 
@@ -369,22 +408,27 @@ def _near(word: str, edges: Iterable[float]) -> list[float]:
 
 def _changed(before: Directive, wanted: Mapping[str, float], region: Disc | None) -> Directive | None:
     """The directive with changed fields; None if there is no such directive."""
-    changed: dict[str, Any] = {}
+    if not wanted:
+        return before
+    fields: list[Any] = list(before)
     for word, value in wanted.items():
         if word == "representation":
-            changed[word] = AT_LEVEL[value]
+            rung = fields[_RUNG] = AT_LEVEL[value]
+            if rung != before.representation:
+                if rung < Representation.CODES and before.rho and "rho" not in wanted:
+                    fields[_RHO] = 0.0  # only codes and features have cells
+                if rung > before.representation and before.rate_hz <= 0 and "rate_hz" not in wanted:
+                    fields[_RATE_HZ] = LEAST_RATE_HZ  # a link at 0 Hz carries nothing
         elif word == "duty":
-            changed["duty_percent"] = round(value * 100)
+            fields[_DUTY] = round(value * 100)
         elif word == "roi":
             if value and region is None:
                 return None
-            changed["roi"] = region if value else None
+            fields[_ROI] = region if value else None
         else:
-            changed[word] = value
-    rung = changed.get("representation")
-    if rung is not None and rung != before.representation:
-        if rung < Representation.CODES and before.rho and "rho" not in changed:
-            changed["rho"] = 0.0  # only codes and features have cells
-        if rung > before.representation and before.rate_hz <= 0 and "rate_hz" not in changed:
-            changed["rate_hz"] = LEAST_RATE_HZ  # a link at 0 Hz carries nothing
-    return before._replace(**changed) if changed else before
+            fields[_AT[word]] = value
+    return Directive._make(fields)
+
+
+_AT = {word: at for at, word in enumerate(Directive._fields)}
+_RUNG, _RHO, _ROI, _RATE_HZ, _DUTY = (_AT[w] for w in ("representation", "rho", "roi", "rate_hz", "duty_percent"))

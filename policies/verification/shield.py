@@ -14,8 +14,9 @@ left of it (`policies.verification.enforced`). There a limit keeps it from givin
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, FleetView, Policy, Representation
@@ -27,7 +28,7 @@ from sortie.scenarios.representation import LEVELS, NAME_OF
 
 MARK = "shield: "
 MOST_CHANGES = 128
-"""How many changes of links are tried for each broken line about several links; all links are tried once in any case."""
+"""How many changes of links are tried in a decision, beside one of each link for each line about several links that is broken."""
 Cap = Callable[[Directive], Directive]
 """A directive as far as something allows it, such as the age of its peer's descriptor."""
 _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
@@ -37,7 +38,8 @@ def shield(policy: Policy, invariants: Iterable[Invariant]) -> Policy:
     """A policy that decides as the given one but keeps the invariants. It is as pure; shielding it again changes nothing.
 
     An invariant may contradict another one, depend on the view alone, or need a change of two links for itself. Then it
-    is not kept, and the reasons of the directives that break it state it. One that holds is not given up for another.
+    is not kept, and the reasons of the directives that break it state it. One that holds is not given up for another,
+    except one about several links for one about one link: these come first.
 
     Raises:
         InvariantError: an invariant uses `sum_links` or `count_links`, so it does not determine the link to change;
@@ -109,82 +111,65 @@ def enforce(
         fresh: its output at age 0, if a rule needs it.
         cap: gives a directive as far as it is allowed; None allows all.
     """
-    me, directives = view.me, list(decided)
-    if me is None or not rules or not directives:
-        return directives
-    context = Context(view, me, directives, {d.destination: d for d in fresh})
-    lines = [compiled(rule) for rule in rules]
-    boxes = _Boxes([line for line in lines if line.of_link], context, directives[0], cap)
+    me = view.me
+    if me is None or not rules or not decided:
+        return list(decided)
+    known = {d.destination: d for d in fresh}
+    context, lines = Context(view, me, decided, known), [compiled(rule) for rule in rules]
+    boxes = _Boxes([line for line in lines if not line.of_links], context, decided, cap)
+    directives, all_kept = _keep_alone(context, decided, boxes)
     several = [line for line in lines if line.of_links]
-    failed = False
-    for _ in lines:  # a line that cannot be kept at first may be kept after other links have changed
-        before = tuple(directives)
-        failed = not _keep_alone(context, directives, boxes)
-        failed = not _keep_together(context, directives, several, boxes) or failed
-        if not failed or all(now is then for now, then in zip(directives, before, strict=True)):
-            break
-    for k, directive in enumerate(directives) if failed else ():
-        lost = [line.invariant for line in lines if not line.holds(context, directive)]
-        directives[k] = _not_replaced(directive, lost) if lost else directive
+    if several:
+        if any(line.of_link for line in several):
+            boxes = _Boxes([line for line in lines if line.of_link], context, decided, cap)
+        together = _Together(Context(view, me, directives, known), decided, several, boxes)
+        all_kept = together.keep_all() and all_kept
+        directives = together.directives()
+    if not all_kept:
+        context = Context(view, me, tuple(directives), known)
+        for k, directive in enumerate(directives):
+            lost = [line.invariant for line in lines if not line.holds(context, directive)]
+            directives[k] = _not_replaced(directive, lost) if lost else directive
     return directives
 
 
-def _keep_alone(context: Context, directives: list[Directive], boxes: _Boxes) -> bool:
-    """Change each link that breaks a line about one link; False if a link has no directive that keeps all of them."""
-    solved: dict[Any, Directive | None] = {}
-    all_kept = True
-    for k, directive in enumerate(directives):
-        box = boxes.of(directive)
-        broken = box.broken(context, directive)
-        if not broken:
-            continue
-        within = boxes.capped(directive, box)
-        key = _key(directive, within)
-        if key is None or key not in solved:
-            after = nearest(directive, within, (), context, boxes.allowed)
-            if key is not None:
-                solved[key] = after
-        else:
-            after = solved[key]
-        if after is None:
-            all_kept = False
-        else:
-            directives[k] = _replaced(directive, after, [box.rules[i].invariant for i in sorted(set(broken))])
-    return all_kept
-
-
-def _key(directive: Directive, box: Box) -> Any:
-    """What two directives have in common that are corrected alike; None if nothing can be said."""
-    if not box.shared:
-        return None
-    _, _, rung, rho, roi, rate_hz, deadline_s, weight, duty, _ = directive
-    for x in (rung, rho, rate_hz, deadline_s, weight, duty):
-        if type(x) not in _PLAIN:
-            return None
-    return id(box), rung, rho, id(roi), rate_hz, deadline_s, weight, duty
-
-
-_PLAIN = (float, int, Representation)
+def _keep_alone(context: Context, decided: Sequence[Directive], boxes: _Boxes) -> tuple[list[Directive], bool]:
+    """The links, those changed that break a line about one link; and whether all of these lines are kept."""
+    links, all_kept = list(decided), True
+    for k, directive in enumerate(decided):
+        box = boxes.of[k]
+        key = box.key(directive) or k
+        if key not in box.broken_by:
+            box.broken_by[key] = box.broken(context, directive)
+        broken = box.broken_by[key]
+        if broken:
+            within = boxes.capped(k)
+            if key not in within.nearest_to:
+                within.nearest_to[key] = nearest(directive, within, (), context, boxes.allowed)
+            after = within.nearest_to[key]
+            if after is None:
+                all_kept = False
+            else:
+                links[k] = _replaced(directive, after, broken)
+    return links, all_kept
 
 
 class _Boxes:
-    """What the lines about links allow each link. Links to which the same lines apply share a box."""
+    """What the lines about one link each allow each link. Links to which the same lines apply share a box."""
 
-    def __init__(self, lines: Sequence[Rule], context: Context, some: Directive, cap: Cap | None) -> None:
-        self._lines = [r for r in lines if r.when is None or r.when_of_peer or r.when(context, some)]
-        self._asked = [r.when for r in self._lines if r.when is not None and r.when_of_peer]
-        self._context, self._some, self._cap = context, some, cap
+    def __init__(self, lines: Sequence[Rule], context: Context, decided: Sequence[Directive], cap: Cap | None) -> None:
+        self._decided, self._context, self._cap = decided, context, cap
+        self._lines = [r for r in lines if r.when is None or r.when_of_peer or r.when(context, decided[0])]
         self._boxes: dict[Any, Box] = {}
+        asked = [r.when for r in self._lines if r.when is not None and r.when_of_peer]
+        self.of = [self._box(tuple([bool(when(context, d)) for when in asked]), None) for d in decided]
 
-    def of(self, link: Directive) -> Box:
-        """The box of a link."""
-        context = self._context
-        return self._box(tuple([bool(when(context, link)) for when in self._asked]), None)
-
-    def capped(self, link: Directive, box: Box) -> Box:
-        """The link's box within what it is allowed at most."""
+    def capped(self, k: int) -> Box:
+        """A link's box within what it is allowed at most."""
+        box = self.of[k]
         if self._cap is None:
             return box
+        link = self._decided[k]
         most = self._cap(_FULLEST._replace(source=link.source, destination=link.destination))
         return self._box(box.applies, (most.representation, most.rate_hz))
 
@@ -194,7 +179,7 @@ class _Boxes:
             answers = iter(applies)
             rules = [r for r in self._lines if not (r.when is not None and r.when_of_peer) or next(answers)]
             bounds = None if most is None else {"representation": float(LEVELS[most[0]]), "rate_hz": most[1]}
-            self._boxes[key] = Box(rules, applies, self._context, self._some, bounds)
+            self._boxes[key] = Box(rules, applies, self._context, self._decided[0], bounds)
         return self._boxes[key]
 
     def allowed(self, directive: Directive) -> bool:
@@ -205,113 +190,152 @@ class _Boxes:
 _FULLEST = Directive(-1, -1, Representation.RAW, rho=1.0, rate_hz=DIRECTIVE_BOUNDS["rate_hz"].high)
 
 
-_Asked = tuple[Rule, int | None]
-"""A line about several links, and the link that must keep it; None for all links together."""
+_Asked = tuple[int, int | None]
+"""The number of a line about several links, and the link that must keep it; None for all links together."""
 
 
 class _Plan(NamedTuple):
     """Changed links."""
 
     far: Far
-    """How many fields change, and by how much in all."""
+    """How many fields change for lines about several links, and by how much in all."""
+    context: Context
+    """Has the changed links."""
+    keeps: dict[int, tuple[int, ...]]
+    """The numbers of the lines for which a link is changed."""
+
+
+class _Change(NamedTuple):
+    """One more link of a plan is changed, or the same one otherwise."""
+
+    far: Far
+    """As of the plan that it leads to."""
     number: int
-    links: tuple[Directive, ...]
-    keeps: dict[int, tuple[Rule, ...]]
-    """The lines for which a link is changed."""
-    broken: _Asked | None
-    """A line that is still broken."""
+    plan: _Plan
+    link: int
+    after: Directive
+    lines: tuple[int, ...]
+
+    def made(self) -> _Plan:
+        """The plan with the change."""
+        _, context, keeps = self.plan
+        return _Plan(self.far, context.having(self.link, self.after), {**keeps, self.link: self.lines})
 
 
-def _keep_together(context: Context, directives: list[Directive], lines: Sequence[Rule], boxes: _Boxes) -> bool:
-    """Change links so that lines about several links hold too; False if one of them cannot be kept.
+class _Together:
+    """Changes links so that lines about several links hold too, one line after the other.
+
+    A broken line is kept by a change of one link, beside those of the plan so far. If that breaks a line that is kept
+    already, one more link changes, or the same one changes so that it keeps both. So a link may pass a line on to another
+    one. Distances are from what was decided.
 
     Args:
-        context: has these same directives.
-        directives: keep the lines about one link each, where they can.
+        context: has the links, which keep the lines about one link alone, where they can.
+        decided: what was decided for them.
         lines: those about several links.
-        boxes: what the lines about one link each allow.
+        boxes: what all lines about each link allow.
     """
-    kept: list[_Asked] = []
-    broken: list[_Asked] = []
-    for line in lines:
-        for k in range(len(directives)) if line.of_link else (None,):
-            (kept if line.holds(context, directives[k or 0]) else broken).append((line, k))
-    if not broken:
-        return True
-    before, count = tuple(directives), len(kept) + len(broken)
-    links, keeps = before, dict[int, tuple[Rule, ...]]()
-    for asked in broken:
-        if links is before or not _holds(asked, links, context):
-            plan = _plan(context, before, [asked, *kept], boxes)
-            if plan is None:
-                continue
-            links, keeps = plan.links, plan.keeps
-        kept.append(asked)
-    context.directives = directives
-    for k, rules in keeps.items():
-        if links[k] is not before[k]:
-            directives[k] = _replaced(before[k], links[k], [rule.invariant for rule in rules])
-    return len(kept) == count
 
+    def __init__(self, context: Context, decided: Sequence[Directive], lines: Sequence[Rule], boxes: _Boxes) -> None:
+        self._start, self._decided, self._lines, self._boxes = context, decided, lines, boxes
+        self._plan = _Plan((0, 0.0), context, {})
+        self._count = self._further = 0
+        self._alike = not any(part.of_peer for line in lines for part in line.parts)
+        self._fields: dict[int, dict[int, int]] = {}
+        """How many fields of a link must change for a line, by the line's number, as far as it was tried."""
+        self._kept: list[_Asked] = []
+        self._broken: list[_Asked] = []
+        for n, line in enumerate(lines):
+            for k in range(len(decided)) if line.of_link else (None,):
+                (self._kept if self._holds((n, k), context) else self._broken).append((n, k))
 
-def _holds(asked: _Asked, links: Sequence[Directive], context: Context) -> bool:
-    rule, k = asked
-    context.directives = links
-    return rule.holds(context, links[k or 0])
+    def keep_all(self) -> bool:
+        """Keep all lines that can be kept; False if one cannot."""
+        broken: list[_Asked] = []
+        left = self._broken
+        while len(left) != len(broken):
+            broken = left  # a line that cannot be kept at first may be kept after other links have changed
+            left = [asked for asked in broken if not self._keep(asked)]
+        return not left
 
+    def directives(self) -> list[Directive]:
+        """The links, with the reasons of their changes."""
+        links = list(self._start.directives)
+        for k, numbers in self._plan.keeps.items():
+            after = self._plan.context.directives[k]
+            if after != self._decided[k]:
+                broken = self._boxes.of[k].broken(self._start, self._decided[k])
+                because = dict.fromkeys([*broken, *[self._lines[n].invariant for n in numbers]])
+                links[k] = _replaced(self._decided[k], after, because)
+        return links
 
-def _plan(context: Context, before: tuple[Directive, ...], asked: Sequence[_Asked], boxes: _Boxes) -> _Plan | None:
-    """The nearest change of links that keeps all lines that are asked for; None if none was found.
+    def _holds(self, asked: _Asked, context: Context) -> bool:
+        n, k = asked
+        return self._lines[n].holds(context, context.directives[k or 0])
 
-    A broken line is kept by a change of one link. If that breaks another line, one more link changes, or the same one
-    changes so that it keeps both.
-
-    Args:
-        context: what the lines are judged on; its directives are replaced.
-        before: the links.
-        asked: the lines, the first of them broken.
-        boxes: what the lines about one link each allow.
-    """
-    queue, count = [_Plan((0, 0.0), 0, before, {}, asked[0])], 0
-    best: _Plan | None = None
-    while queue and count < MOST_CHANGES:
-        this = heapq.heappop(queue)
-        if best is not None and this.far >= best.far:
-            break
-        rule, only = cast(_Asked, this.broken)
-        alike, seen = not any(part.of_peer for each, _ in asked for part in each.parts), set()
-        for k in range(len(before)) if only is None else (only,):
-            box = boxes.capped(before[k], boxes.of(before[k]))
-            key = _key(before[k], box) if alike and k not in this.keeps else None
-            if key is not None and key in seen:
-                continue  # another link would change by as much
+    def _keep(self, asked: _Asked) -> bool:
+        """Keep one more line by the nearest change that was found of the plan so far."""
+        this, wanted, still = self._plan, [asked, *self._kept], asked
+        queue, seen = list[_Change](), set[Any]()
+        kept = self._holds(asked, this.context)
+        while not kept:
+            key = frozenset(this.keeps.items())
+            if key not in seen and (not seen or self._further < MOST_CHANGES):
+                tried = self._count
+                for change in self._changes(this, *still):
+                    heapq.heappush(queue, change)
+                if seen:
+                    self._further += self._count - tried
             seen.add(key)
-            count += 1
-            now = this.links[k]
-            changed, far = distance(before[k], now) if k in this.keeps else (0, 0.0)
-            others = this.far[0] - changed, this.far[1] - far
-            nearer: Far | None = None if best is None else (best.far[0] - others[0], best.far[1] - others[1])
-            rules = tuple(dict.fromkeys((*this.keeps.get(k, ()), rule)))
-            parts = [part for each in rules for part in each.parts]
-            context.directives = this.links
-            after = nearest(before[k], box, parts, context, boxes.allowed, nearer)
-            if after is None or (k in this.keeps and after == now):
-                continue
-            changed, far = distance(before[k], after)
-            # A hundredth of the bounds is no reason for another link.
-            at, links = (others[0] + changed, round(others[1] + far, 2)), (*this.links[:k], after, *this.links[k + 1 :])
-            if best is not None and at >= best.far:
-                continue
-            still = next((a for a in asked if not _holds(a, links, context)), None)
-            plan = _Plan(at, count, links, {**this.keeps, k: rules}, still)
-            if still is None:
-                best = plan
-            else:
-                heapq.heappush(queue, plan)
-    return best
+            if not queue:
+                return False
+            this = heapq.heappop(queue).made()
+            broken = next((a for a in wanted if not self._holds(a, this.context)), None)
+            kept, still = broken is None, broken or still
+        self._plan = this
+        self._kept.append(asked)
+        return True
+
+    def _changes(self, this: _Plan, n: int, only: int | None) -> list[_Change]:
+        """The changes by which one link keeps a line that is still broken."""
+        links = range(len(self._decided)) if only is None else (only,)
+        alike, fields = set[Any](), self._fields.setdefault(n, {})
+        found: list[_Change] = []
+        for k in links:
+            if k not in this.keeps:
+                box = self._boxes.capped(k)
+                key = id(box), box.key(self._decided[k]) if self._alike else None
+                if key[1] is None or key not in alike:  # another link would change by as much
+                    alike.add(key)
+                    for change in self._change(this, k, (n,)):
+                        found.append(change)
+                        fields[k] = change.far[0] - this.far[0]
+        taken = [k for k in links if k in this.keeps]
+        for k in taken:
+            found += self._change(this, k, tuple(dict.fromkeys((*this.keeps[k], n))))
+        fewest = min([change.far[0] for change in found], default=math.inf)
+        for k in taken:  # another link takes what this one keeps, if fewer fields change then
+            more = max(
+                [min([x for j, x in self._fields.get(m, {}).items() if j != k], default=0) for m in this.keeps[k]]
+            )
+            found += [change for change in self._change(this, k, (n,)) if change.far[0] + more < fewest]
+        return found
+
+    def _change(self, this: _Plan, k: int, numbers: tuple[int, ...]) -> list[_Change]:
+        """The nearest change by which a link keeps these lines, if there is one."""
+        self._count += 1
+        before, now, box = self._decided[k], this.context.directives[k], self._boxes.capped(k)
+        parts = [part for n in numbers for part in self._lines[n].parts]
+        after = nearest(before, box, parts, this.context, self._boxes.allowed)
+        if after is None or after == now:
+            return []
+        was, is_now = (0, 0.0) if now is before else distance(before, now), distance(before, after)
+        # A hundredth of the bounds is no reason for another link.
+        far = this.far[0] - was[0] + is_now[0], round(this.far[1] - was[1] + is_now[1], 2)
+        return [_Change(far, self._count, this, k, after, numbers)]
 
 
-def _replaced(before: Directive, after: Directive, broken: Sequence[Invariant]) -> Directive:
+def _replaced(before: Directive, after: Directive, broken: Iterable[Invariant]) -> Directive:
     because = "; ".join([rule.text for rule in broken])
     was = f"{NAME_OF[before.representation]} at {before.rate_hz:g} Hz"
     return after._replace(destination=before.destination, reason=f"{MARK}{because} (decided {was}: {before.reason})")
