@@ -473,7 +473,19 @@ def _difficulty() -> Tables:
 def _fine_network() -> Tables:
     import fine_network
 
-    return fine_network.tables(WORK, ROOT / "runs/bench")
+    return fine_network.tables(WORK, ROOT / "runs/bench", ROOT / "docs/results/fine_network.png")
+
+
+def _fine_times() -> Tables:
+    import fine_network
+
+    return {"fine_times": fine_network.times()}
+
+
+def _fine_flights() -> Tables:
+    import fine_network
+
+    return {"fine_flights": fine_network.flights()}
 
 
 def _survey() -> Tables:
@@ -732,7 +744,9 @@ FIGURES: dict[str, Figure] = {
     "ranking_by_torch": Figure(20, _ranking_by_torch),
     "handshakes": Figure(5, _handshakes),
     "requests": Figure(5, _requests),
-    "fine_network": Figure(25, _fine_network, timed=True),
+    "fine_times": Figure(1, _fine_times, timed=True),
+    "fine_network": Figure(15, _fine_network),
+    "fine_flights": Figure(20, _fine_flights),
     "fusion_methods": Figure(25, _fusion_methods),
     "paper_seeds": Figure(30, _paper_seeds),
     "held_out": Figure(30, _held_out),
