@@ -58,12 +58,12 @@ def make(
     workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per core.", min=1)] = None,
 ) -> None:
     """Render the splits. Finished scenes are kept, and an interrupted run continues."""
-    from sortie.perception.benchmark.dataset import SIZES, Benchmark, make_split
+    from sortie.perception.benchmark.dataset import MOST, SIZES, Benchmark, make_split
 
     bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value)))
     with user_errors(), stages() as report:
         for name in dict.fromkeys(s.value for s in split) if split else SIZES:
-            count = min(scenes or SIZES[name][0], SIZES[name][0])
+            count = min(scenes or SIZES[name][0], MOST[name])
             make_split(bench, name, out_dir, scenes=count, workers=workers, progress=partial(report, f"{name} scenes"))
     folder = bench.folder(out_dir)
     table = Table("split", "scenes", "fleet-frames", title=f"seed {seed}, {density.value}, ±{range_.value} m")
@@ -84,10 +84,10 @@ def show(
     """Draw a frame: five drones' views, their bird's-eye images, and who sees which car. Needs the extra `report`."""
     with user_errors():
         from sortie.perception.benchmark.contact_sheet import draw, save
-        from sortie.perception.benchmark.dataset import SIZES, Benchmark
+        from sortie.perception.benchmark.dataset import MOST, SIZES, Benchmark
 
         bench = Benchmark.at(folder)
-        count, frames = SIZES[split.value]
+        count, (_, frames) = MOST[split.value], SIZES[split.value]
         if index >= count:
             raise ValueError(f"scene is {index}, must be 0 to {count - 1} in the {split.value} split")
         if frame >= frames:

@@ -91,7 +91,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_train(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = Seen()
     stand_in(monkeypatch, "sortie.perception.benchmark.dataset", Benchmark=tuple_of)
-    stand_in(monkeypatch, "sortie.perception.network.detector", shipped=lambda fusion: here / f"{fusion}.own")
+    names = {"shipped": lambda fusion: here / f"{fusion}.own", "named_weights": lambda path: here / path}
+    stand_in(monkeypatch, "sortie.perception.network.detector", **names)
     stand_in(monkeypatch, "sortie.perception.network.fusion.registry", FUSIONS={"none": 1, "late": 2, "disconet": 3})
     stand_in(monkeypatch, "sortie.perception.network.model", ModelConfig=tuple_of)
     stand_in(monkeypatch, "sortie.perception.training.recipe", Recipe=dict)
@@ -100,7 +101,7 @@ def test_train(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("late.own", "w"):
         (here / name).touch()
     options = {
-        "steps": 11, "scenes": 12, "seed": 13, "peak-lr": 0.25, "cell-dropout": 0.5, "unsent": "zero", "fusion": "late",
+        "steps": 11, "batch": 6, "scenes": 12, "seed": 13, "peak-lr": 0.25, "cell-dropout": 0.5, "unsent": "zero", "fusion": "late",
         "exchange": "signed", "decoder": "deep", "grid": "fine", "varied": 0.75, "precision": "bfloat16", "range": "51.2",
         "bench-seed": 14, "bench": "b", "warm-start": "late", "minutes": 1.5, "device": "cpu", "out": "o",
     }  # fmt: skip
@@ -110,14 +111,14 @@ def test_train(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (out, config, bench[0]) == (Path("o"), (51.2, "late", "signed", "deep", "fine"), 14)
     assert bench[1]["geometry"].half_extent_m == 51.2
     assert recipe == {
-        "steps": 11, "seed": 13, "scenes": 12, "peak_lr": 0.25, "cell_dropout": 0.5, "unsent": "zero", "varied": 0.75,
+        "steps": 11, "batch": 6, "seed": 13, "scenes": 12, "peak_lr": 0.25, "cell_dropout": 0.5, "unsent": "zero", "varied": 0.75,
         "precision": "bfloat16", "warm_start": "late.own",
     }  # fmt: skip
     assert seen.kwargs == {
         "root": Path("b"), "warm_start": here / "late.own", "minutes": 1.5, "resume": False, "device": "cpu", "scalars": None,
     }  # fmt: skip
     assert command("train", "--warm-start", "w") == 2
-    assert (seen.kwargs["warm_start"], seen.args[1]["warm_start"]) == (Path("w"), "w")
+    assert (seen.kwargs["warm_start"], seen.args[1]["warm_start"]) == (here / "w", "w")
     assert command("train") == 2
     assert seen.args[2] == (102.4, "disconet", "rectified", "shallow", "coarse")
     assert (seen.kwargs["warm_start"], seen.args[1]["warm_start"], seen.kwargs["resume"]) == (None, "", True)
@@ -189,7 +190,7 @@ def test_fit(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     made, moments, split = Seen({"cells": 77, "unexplained": {1: 0.5, 20: 0.0625}}), Seen(), Seen()
     stand_in(monkeypatch, "sortie.perception.benchmark.dataset", Benchmark=tuple_of, load_frames=None, make_split=split)
     stand_in(monkeypatch, "sortie.perception.network.checkpoint", load_weights=lambda path: net)
-    stand_in(monkeypatch, "sortie.perception.network.detector", SHIPPED_WEIGHTS=Path("shipped/net"))
+    stand_in(monkeypatch, "sortie.perception.network.detector", named_weights=lambda path: path or Path("shipped/net"))
     stand_in(monkeypatch, "sortie.perception.training.codebook", CodebookRecipe=tuple_of, make_codebook=made)
     stand_in(monkeypatch, "sortie.perception.training.boxes_alone", boxes_alone=None, moments_of=None)
     stand_in(monkeypatch, "sortie.perception.training", box_errors=None)
@@ -225,9 +226,16 @@ def test_bench(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     sizes = {"train": (100, 10), "validation": (30, 1), "tau": (4, 1), "test": (80, 5)}
     split, effects, counted = Seen([]), Seen([]), Seen()
     bench = Seen(SimpleNamespace(folder=lambda out: out / "made"))
-    stand_in(monkeypatch, "sortie.perception.benchmark.dataset", SIZES=sizes, Benchmark=bench, make_split=split)
+    stand_in(
+        monkeypatch,
+        "sortie.perception.benchmark.dataset",
+        MOST={"train": 300, "validation": 30, "tau": 4, "test": 80},
+        SIZES=sizes,
+        Benchmark=bench,
+        make_split=split,
+    )
     stand_in(monkeypatch, "sortie.perception.benchmark.survey", by_style=None, survey=counted)
-    stand_in(monkeypatch, "sortie.perception.network.detector", SHIPPED_WEIGHTS=Path("shipped/net"))
+    stand_in(monkeypatch, "sortie.perception.network.detector", named_weights=lambda path: path or Path("shipped/net"))
     stand_in(monkeypatch, "sortie.perception.evaluation.difficulty_effects", measure=effects)
     files = {"splits": {"tau": {"a": {"frames": 5}, "b": {"frames": 7}}}}
     monkeypatch.setattr("sortie.sim.cli.bench.read", lambda folder: files)
@@ -244,6 +252,8 @@ def test_bench(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert [(args[1], given["scenes"]) for args, given in split.calls[2:]] == [
         (name, n) for name, (n, _) in sizes.items()
     ]
+    assert command("bench", "make", "--split", "train", "--split", "tau", "--scenes", "150") == 0
+    assert [given["scenes"] for _, given in split.calls[-2:]] == [150, 4], "the train split goes on"
     assert command("bench", "survey", *common, "--scenes", "2") == 2
     seed, difficulty, geometry = bench.args
     assert (seed, difficulty.density, geometry.half_extent_m) == (3, "dense", 51.2)
@@ -553,7 +563,7 @@ def paper_modules(monkeypatch: pytest.MonkeyPatch) -> dict[str, Seen]:
     import sortie.sim.studies as studies
 
     monkeypatch.setattr(studies, "paper", sys.modules["sortie.sim.studies.paper"], raising=False)
-    stand_in(monkeypatch, "sortie.perception.network.detector", SHIPPED_WEIGHTS=Path("shipped/net"))
+    stand_in(monkeypatch, "sortie.perception.network.detector", named_weights=lambda path: path or Path("shipped/net"))
     return seen
 
 
