@@ -473,7 +473,13 @@ def _difficulty() -> Tables:
 def _fine_network() -> Tables:
     import fine_network
 
-    return fine_network.tables(WORK, ROOT / "runs/bench", ROOT / "docs/results/fine_network.png")
+    return fine_network.tables(ROOT / "runs/bench", ROOT / "docs/results/fine_network.png")
+
+
+def _fine_fleets() -> Tables:
+    import fine_network
+
+    return {"fine_fleets": fine_network.other_fleets(WORK / "fine_fleets")}
 
 
 def _fine_times() -> Tables:
@@ -745,7 +751,8 @@ FIGURES: dict[str, Figure] = {
     "handshakes": Figure(5, _handshakes),
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
-    "fine_network": Figure(15, _fine_network),
+    "fine_network": Figure(7, _fine_network),
+    "fine_fleets": Figure(5, _fine_fleets),
     "fine_flights": Figure(20, _fine_flights),
     "fusion_methods": Figure(25, _fusion_methods),
     "paper_seeds": Figure(30, _paper_seeds),

@@ -37,7 +37,8 @@ from representations import TAU, Row, difference
 from stored import Column, Table
 
 from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_split
-from sortie.perception.evaluation.difficulty_effects import Effect, moves
+from sortie.perception.benchmark.survey import survey
+from sortie.perception.evaluation.difficulty_effects import SEED, Effect, ParameterShift, moves
 from sortie.perception.evaluation.difficulty_effects import measure as difficulty_effects
 from sortie.perception.geometry import CELLS
 from sortie.perception.network.checkpoint import load_weights
@@ -99,21 +100,31 @@ def _way(network: str, row: Row, rows: Sequence[Row]) -> list[object]:
 
 
 def other_fleets(store: Path) -> Table:
-    """Sharing all, lower and with other headings."""
+    """Sharing all, lower and with other headings, and which cars any of five drones can see.
+
+    Args: `store`, folder of finished scenes.
+    """
     chosen = [m for m in moves() if (m.parameter, m.value) in OTHER_FLEETS]
+    seen = [_seen(move) for move in chosen]
     rows: list[list[object]] = []
     for name, weights in NETWORKS.items():
         found = difficulty_effects(weights, store, scenes=FLEET_SCENES, workers=2, rows=chosen)
-        rows += [_fleet(name, effect) for effect in found]
+        rows += [[name, *_fleet(effect), share] for effect, share in zip(found, seen, strict=True)]
     columns = [Column("network"), Column("parameter"), Column("moved to"), *(Column(n, ".3f") for n in ("AP alone", "AP sharing all"))]  # fmt: skip
-    columns.append(Column("change", "+.3f"))
-    about = f"{FLEET_SCENES} scenes of seed 7's test layouts, one fleet-frame of five egos each. Change: of AP sharing all against the network's first row, paired by scene."
+    columns += [Column("change", "+.3f"), Column("cars that any drone sees", ".0f", " %", 100)]
+    about = f"{FLEET_SCENES} scenes of seed {SEED}'s test layouts, one fleet-frame of five egos each. Change: of AP sharing all against the network's first row, paired by scene."
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
 
-def _fleet(network: str, effect: Effect) -> list[object]:
+def _fleet(effect: Effect) -> list[object]:
     change = None if effect.change is None else (effect.change.delta, effect.change.low, effect.change.high)
-    return [network, effect.move.parameter, effect.move.value, effect.gain.ap_a, effect.gain.ap_b, change]
+    return [effect.move.parameter, effect.move.value, effect.gain.ap_a, effect.gain.ap_b, change]
+
+
+def _seen(move: ParameterShift) -> float:
+    """The share of cars that any of five drones sees, by straight lines."""
+    counts = [survey(Benchmark(SEED, move.difficulty), "test", k) for k in range(FLEET_SCENES)]
+    return float(np.average([c.fleet for c in counts], weights=[c.cars for c in counts]))
 
 
 def flights() -> Table:
@@ -237,11 +248,8 @@ def flight_speed(weights: Path) -> float:
     return scenario.duration_s / (time.perf_counter() - begin)
 
 
-def tables(work: Path, root: Path, picture: Path) -> dict[str, Table]:
-    """AP on still frames. Args: `work`, folder of finished scenes; `root`, folder of benchmarks; `picture`, file of the plot."""
+def tables(root: Path, picture: Path) -> dict[str, Table]:
+    """AP on still frames. Args: `root`, folder of benchmarks; `picture`, file of the plot."""
     shared = ways(root)
     draw(shared, picture)
-    return {
-        "fine_ways": shared,
-        "fine_fleets": other_fleets(work / "fine_fleets"),
-    }
+    return {"fine_ways": shared}
