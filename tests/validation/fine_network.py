@@ -174,7 +174,7 @@ def draw(table: Table, path: Path) -> None:
     """AP over the bytes that an ego receives, by network, from the table of `ways`."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 4.6), layout="constrained")
+    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
     axes = figure.subplots()
     for network, colour in (("default", "#7a7d85"), ("fine", "#1d6f80")):
         rows = {str(label): (kilobytes, ap) for name, label, kilobytes, ap, *_ in table.rows if name == network}
@@ -184,23 +184,16 @@ def draw(table: Table, path: Path) -> None:
             x, (ap, low, high) = [v[0] for v in chosen], np.array([v[1] for v in chosen]).T
             label = f"{network}: {kind}"
             axes.errorbar(x, ap, yerr=[ap - low, high - ap], color=colour, marker=marker, capsize=2, label=label)
-        for label, (x, (ap, low, high)) in rows.items():
-            if "poses matched" in label:
-                axes.errorbar(
-                    x,
-                    ap,
-                    [[ap - low], [high - ap]],
-                    color=colour,
-                    marker="*",
-                    ms=11,
-                    capsize=2,
-                    label=f"{network}: {label}",
-                )
+        for label, marker in ((f"{BOXES}, poses matched", "D"), (f"{WHOLE}, poses matched", "*")):
+            if label in rows:
+                x, (ap, low, high) = rows[label]
+                style = {"color": "#d08a1d", "marker": marker, "ms": 9, "capsize": 2}
+                axes.errorbar(x, ap, [[ap - low], [high - ap]], label=f"{network}: {label}", **style)
     axes.set_xscale("log")
     axes.set_xlabel("content that an ego receives in a frame from four peers, kB (logarithmic)")
     axes.set_ylabel("AP@0.5")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7, ncols=2, loc="lower right")
+    figure.legend(fontsize=8, ncols=3, loc="outside lower center")
     figure.savefig(path, dpi=110)
 
 
