@@ -92,7 +92,7 @@ class _Encoded:
     in_part: dict[Part, Future[Tensor]] = field(default_factory=dict)
     """The head's output from the cells that a budget lets through alone, for late fusion of shared maps."""
     coded: dict[Part, Future[Tensor]] = field(default_factory=dict)
-    """The features as receivers read them from the codes of those cells."""
+    """The features as receivers read them from the codes of those cells, as they are fused."""
 
 
 Known = Mapping[Capture, _Encoded]
@@ -142,7 +142,7 @@ class TorchDetector:
         self._renderer = Renderer(scene, seed, replication)
         self._kept: OrderedDict[Capture, _Encoded] = OrderedDict()
         self.kept_captures = KEPT_CAPTURES
-        """Encoded captures that are kept, 1.5 MB each or so."""
+        """Encoded captures that are kept: 1.5 MB each or so, and 5 MB of a fine network."""
         self._pool = ThreadPoolExecutor(
             torch.get_num_threads(), "detector", initializer=torch.set_num_threads, initargs=(1,)
         )
@@ -342,7 +342,7 @@ class TorchDetector:
             self._place(known[s.capture].in_part[_part(s)].result(), at) for s, at in zip(maps, places, strict=True)
         ]
         seen += [boxes_at_fusion(source) for source in late]
-        own = known[ego].boxes
+        own = known[ego].boxes if ego.looked else None
         seen.append(Boxes.empty() if own is None else own.result())
         believed = [*places, *(source.pose for source in late), ego.est_pose]
         fitted: list[Pose] = [
@@ -391,8 +391,7 @@ class TorchDetector:
         def read() -> Tensor:
             return codebook.read(kept.features.result(), length, self._sent(share, known)[0])
 
-        features = self._task(read)
-        kept.coded[part] = self._spread(features) if self._shares == "features" else features
+        kept.coded[part] = self._spread(self._task(read))
 
     @cached_property
     def _codebook(self) -> Codebook:
@@ -450,23 +449,23 @@ class TorchDetector:
 
     def _head_in_part(self, share: Share, known: Known) -> None:
         """The head's output from the cells that were sent, computed once per capture and budget."""
-        kept = known[share.capture]
-        if _part(share) in kept.in_part:
+        kept, part = known[share.capture], _part(share)
+        if part in kept.in_part:
             return
 
         out = kept.out  # as it stands: a task waits for none behind it
-        is_coded = share.representation == "codes"
 
         def head() -> Tensor:
-            features = (kept.coded[_part(share)] if is_coded else kept.features).result()
+            if share.representation == "codes":
+                return self._head(kept.coded[part].result()[None])
             sent = self._sent(share, known)
-            if out is not None and bool(sent.all()) and not is_coded:
+            if out is not None and bool(sent.all()):
                 return out.result()
             with self._autocast():
-                maps: Tensor = self._net.spread((features * sent)[None]).float()
+                maps: Tensor = self._net.spread((kept.features.result() * sent)[None]).float()
             return self._head(maps)
 
-        kept.in_part[_part(share)] = self._task(head)
+        kept.in_part[part] = self._task(head)
 
 
 def _part(share: Share) -> Part:

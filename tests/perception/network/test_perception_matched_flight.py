@@ -24,31 +24,53 @@ def believing(capture: Capture, pose: tuple[float, float, float]) -> Capture:
     return capture._replace(est_position_m=(x, y, capture.est_position_m[2]), est_yaw_rad=yaw)
 
 
-@pytest.mark.parametrize("representation", ["features", "detections", "uncertain_boxes"])
-def test_it_fuses_as_if_drones_had_believed_the_corrected_poses(representation: str) -> None:
-    scene = SceneModel(Scene(), None, (-50, -50, 50, 50))
+def erring() -> list[Capture]:
+    """Three drones with pose errors."""
     rng = np.random.default_rng(2)
-    fleet = [
+    return [
         believing(c, tuple((np.array(c.est_pose) + rng.normal(0, [0.3, 0.3, 0.004])).tolist()))
         for c in cross(10.0, 20.0, 0.3)[:3]
     ]
 
-    def found(captures: list[Capture], match: bool) -> np.ndarray:
-        detector = TorchDetector(scene, Perception(match_poses=match), 1, FINE)
-        ego, *peers = captures
-        (boxes,) = detector.detect([(ego, [Share(c, representation, 1.0, None, 1.0) for c in peers])])
-        return np.column_stack([boxes.table(), boxes.score])
 
-    plain = TorchDetector(scene, Perception(), 1, FINE)
-    alone = plain.detect([(c, ()) for c in fleet])
+def found(scene: SceneModel, captures: list[Capture], match: bool, representation: str) -> np.ndarray:
+    """Boxes and scores of the first drone, which hears the others."""
+    detector = TorchDetector(scene, Perception(match_poses=match), 1, FINE)
+    ego, *peers = captures
+    (boxes,) = detector.detect([(ego, [Share(c, representation, 1.0, None, 1.0) for c in peers])])
+    return np.column_stack([boxes.table(), boxes.score])
+
+
+@pytest.mark.parametrize("looked", [True, False])
+@pytest.mark.parametrize("representation", ["features", "detections", "uncertain_boxes"])
+def test_it_fuses_as_if_drones_had_believed_the_corrected_poses(representation: str, looked: bool) -> None:
+    """A drone without a look of its own, as a ground station is, corrects those that it hears."""
+    scene, fleet = SceneModel(Scene(), None, (-50, -50, 50, 50)), erring()
+    alone = TorchDetector(scene, Perception(), 1, FINE).detect([(c, ()) for c in fleet])
     assert min(map(len, alone)) > 5
+    fleet[0] = fleet[0]._replace(looked=looked)
     order = [1, 2, 0]  # peers first, as the detector has them: the sums are the same to the last digit
-    fitted = matched_poses([fleet[k].est_pose for k in order], [sure(alone[k]).xy_m for k in order])
+    seen = [sure(alone[k]).xy_m[: None if fleet[k].looked else 0] for k in order]
+    fitted = matched_poses([fleet[k].est_pose for k in order], seen)
     corrected = [believing(fleet[k], tuple(fitted[order.index(k)].tolist())) for k in range(3)]
-    wanted, got, plainly = found(corrected, match=False), found(fleet, match=True), found(fleet, match=False)
+    wanted, got = found(scene, corrected, False, representation), found(scene, fleet, True, representation)
     np.testing.assert_allclose(got, wanted, atol=0.01)
     assert len(got) > 5
-    assert np.abs(got[:5, :2] - plainly[:5, :2]).max() > 0.02
+    assert np.abs(got[:5, :2] - found(scene, fleet, False, representation)[:5, :2]).max() > 0.02
+
+
+def test_maps_that_came_as_codes_are_matched_by_the_boxes_in_them() -> None:
+    """Codes of full length are nearly the features: so are the poses that fit."""
+    scene, fleet = SceneModel(Scene(), None, (-50, -50, 50, 50)), erring()
+    features, codes = (found(scene, fleet, True, way)[:20] for way in ("features", "codes"))
+    plain = found(scene, fleet, False, "codes")[:20]
+
+    def off_m(others: np.ndarray) -> float:
+        away = np.linalg.norm(features[:, None, :2] - others[None, :, :2], axis=2).min(axis=1)
+        return float(np.median(away))
+
+    assert off_m(codes) < 0.1
+    assert off_m(plain) > 2 * off_m(codes)
 
 
 def test_a_drone_that_hears_nobody_keeps_its_pose() -> None:
