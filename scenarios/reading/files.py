@@ -148,9 +148,8 @@ def found_beside(scenario: Scenario, folder: Path) -> Scenario:
 
 
 def placed(name: str, folder: Path) -> str:
-    """A file's name as it is where that leads to a file or a folder (a shipped trace among them), else below `folder`."""
-    here = located(Path(name))
-    return name if os.path.exists(here) or not os.path.exists(folder / name) else str(folder / name)
+    """A file's name below `folder` where only that leads to a file or a folder; else as it is, which a shipped file may have too."""
+    return name if os.path.exists(name) or not os.path.exists(folder / name) else str(folder / name)
 
 
 def value_at(field: str, sections: Any) -> Any:

@@ -97,10 +97,14 @@ def test_what_is_here_goes_first(folder: Path, monkeypatch: pytest.MonkeyPatch) 
     (folder.parent / "drones.csv").unlink()
 
 
-def test_a_shipped_trace_is_one_that_is_here(tmp_path: Path) -> None:
-    (tmp_path / "paper_120s").mkdir()
-    (tmp_path / "paper_120s/links.csv").touch()
-    assert placed("paper_120s/links.csv", tmp_path) == "paper_120s/links.csv"
+@pytest.mark.parametrize("name", ["paper_120s/links.csv", "disconet.safetensors"])
+def test_a_file_beside_the_scenario_goes_before_a_shipped_one_of_its_name(tmp_path: Path, name: str) -> None:
+    assert placed(name, tmp_path) == name
+    assert located(Path(name)).is_file(), "it is shipped"
+    own = tmp_path / name
+    own.parent.mkdir(exist_ok=True)
+    own.touch()
+    assert placed(name, tmp_path) == str(own)
     assert load("paper_context").radio.trace is not None
 
 

@@ -20,7 +20,6 @@ from sortie.scenarios.reading.files import (
     found_beside,
     models_with_params,
     named_files,
-    placed,
     with_files,
     without_brackets,
 )
@@ -183,15 +182,6 @@ def test_a_parameter_s_file_is_found_beside_the_scenario(tmp_path: Path) -> None
     found = found_beside(made, tmp_path).radio
     assert found.link == f"{tmp_path}/own.py:Link"
     assert found.link_params == {"table": f"{tmp_path}/table.csv", "word": "table", "k": 2}
-
-
-def test_a_shipped_trace_is_where_it_is_named(tmp_path: Path) -> None:
-    """Also where a file of that name lies beside the scenario."""
-    name = "paper_120s/drones.csv"
-    (tmp_path / "paper_120s").mkdir()
-    (tmp_path / name).write_text("t_s\n0\n")
-    assert placed(name, tmp_path) == name
-    assert placed("paper_120s/nothing.csv", tmp_path) == "paper_120s/nothing.csv"
 
 
 def test_parameters_are_no_sections() -> None:
