@@ -16,6 +16,7 @@ from sortie.perception.geometry import USUAL, Cameras
 from sortie.policies.contract import Descriptor
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.traces import located
 
 
 class Equipment(NamedTuple):
@@ -43,7 +44,7 @@ def codebooks(scenario: Scenario) -> tuple[str, ...]:
     """
     common = scenario.perception.codebook
     return tuple(
-        "" if n.codebook is None or n.codebook == common else codebook_digest(Path(n.codebook))
+        "" if n.codebook is None or n.codebook == common else codebook_digest(located(Path(n.codebook)))
         for n in scenario.networks
     )
 

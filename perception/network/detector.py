@@ -401,7 +401,7 @@ class TorchDetector:
             InputError: a codebook that is missing, or of another network, or that has no codes of this length.
         """
         named = self._config.codebook
-        path = beside(self._weights, CODEBOOK) if named is None else Path(named)
+        path = beside(self._weights, CODEBOOK) if named is None else located(Path(named))
         found = load_codebook(path, self._loaded)
         if self._config.code_bytes > found.longest:
             raise InputError(

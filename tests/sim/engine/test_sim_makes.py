@@ -11,6 +11,7 @@ from sim_examples import PATIENT
 
 import sortie
 from sortie.fleet.coverage import unpack_grid
+from sortie.fleet.plane import codebooks
 from sortie.perception.errors import InputError
 from sortie.perception.files import codebook_digest
 from sortie.perception.surrogate.model import SHIPPED, load, save
@@ -19,6 +20,7 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, Representation
 from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.traces import located
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.bag import descriptors
 from sortie.sim.results.outcome import outcome
@@ -84,6 +86,12 @@ def test_a_policy_that_knows_sends_boxes_there_and_they_are_joined() -> None:
     assert all(rungs[pair] == {"detections"} for pair in ((0, 2), (1, 2), (2, 0), (2, 1)))
     assert {(0, 2, "detections"), (2, 0, "detections")} <= fused(record)
     assert not any(why == "other_feature_space" for *_, why in sent(record))
+
+
+def test_a_make_may_name_a_shipped_codebook_without_its_folder() -> None:
+    book = Path("fine.codebook.safetensors")
+    named = codebooks(fleet(f", codebook: {book}", "perception.detector=none"))
+    assert named == ("", "", codebook_digest(located(book)))
 
 
 def test_codes_of_another_codebook_are_refused_and_a_policy_that_knows_sends_boxes(tmp_path: Path) -> None:
