@@ -122,6 +122,7 @@ def card(name: str, facts: dict[str, Any]) -> str:
     command = (
         f"sortie fit codebook --weights {facts['weights']} --out {name} --stages {facts['stages']} "
         f"--scenes {facts['scenes']} --iterations {facts['iterations']} --seed {facts['seed']}"
+        + (f" --bench-seed {bench['seed']}" if bench["seed"] else "")
     )
     whole = payload_bytes(1)
     rows = "\n".join(f"| {k} | {whole / k:.0f} | {100 * left:.1f} % |" for k, left in facts["unexplained"].items())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -107,7 +108,7 @@ def fit_errors(
             from sortie.perception.surrogate.errors import moments
 
             found = moments(path, "fit", towns)
-            made = {"command": f"sortie fit errors surrogate --towns {towns}", "boxes_of": path.name}
+            drawn = {"towns": towns}
         else:
             from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
             from sortie.perception.network.checkpoint import load_weights
@@ -118,10 +119,14 @@ def fit_errors(
             split = make_split(Benchmark(bench_seed, geometry=net.config.geometry), "validation", bench_dir)
             frames = load_frames(split)
             found = moments_of(frames, boxes_alone(net, frames, Perception().score_threshold))
-            made = {"command": f"sortie fit errors torch --bench-seed {bench_seed}", "boxes_of": path.name}
+            drawn = {"bench-seed": bench_seed}
         model = box_errors.fit(found)
         fitted = box_errors.calibration(model, found)
-        write_text(target, errors_text(model, made | {"boxes": fitted.boxes}))
+        given = {"weights": weights, "out": out_file} | drawn
+        flags = [part for k, v in given.items() if v is not None for part in (f"--{k}", str(v))]
+        command = shlex.join(["sortie", "fit", "errors", boxes.value, *flags])
+        made = {"command": command, "boxes_of": path.name, "boxes": fitted.boxes}
+        write_text(target, errors_text(model, made))
     out.print(
         f"{fitted.boxes} boxes: {100 * fitted.within[0]:.1f} % of the errors within one standard deviation, "
         f"{100 * fitted.within[1]:.1f} % within two; {100 * model.common:.0f} % of a variance is common to several drones"

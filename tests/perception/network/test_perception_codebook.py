@@ -26,7 +26,7 @@ from sortie.perception.network.codebook import (
 from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector
 from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.training.codebook import CodebookRecipe, fit
+from sortie.perception.training.codebook import CodebookRecipe, card, fit
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene
 
@@ -109,6 +109,16 @@ def test_the_file_is_read_as_it_was_written_and_belongs_to_its_network(tmp_path:
         load_codebook(tmp_path / "none", net)
 
 
+@pytest.mark.parametrize(("seed", "told"), [(0, "--seed 4`."), (7, "--seed 4 --bench-seed 7`.")])
+def test_a_codebook_s_card_names_the_command_that_repeats_it(seed: int, told: str) -> None:
+    facts = {
+        "weights": "w.safetensors", "benchmark": {"key": "k", "seed": seed, "density": "default"}, "stages": 2, "scenes": 3,
+        "iterations": 5, "seed": 4, "cells": 77, "unexplained": {1: 0.5},
+    }  # fmt: skip
+    command = "sortie fit codebook --weights w.safetensors --out c.safetensors --stages 2 --scenes 3 --iterations 5"
+    assert f"Made by `{command} {told}" in card("c.safetensors", facts)
+
+
 def test_the_shipped_codebook_belongs_to_the_shipped_network_and_has_every_length() -> None:
     codebook = load_codebook(beside(SHIPPED_WEIGHTS, CODEBOOK), load_weights(SHIPPED_WEIGHTS))
     assert codebook.longest == 20
@@ -120,7 +130,7 @@ def test_a_shipped_codebook_may_be_named_without_its_folder() -> None:
     """As its network: here another network's, so that it is found and refused."""
     scene, (ego, peer) = SceneModel(Scene(), None, (-50, -50, 50, 50)), cross(0.0, 0.0, 0.3)[:2]
     detector = TorchDetector(scene, Perception(codebook="fine.codebook.safetensors"), 1)
-    with pytest.raises(InputError, match="fine.codebook.safetensors: fitted to another encoder than the weights'"):
+    with pytest.raises(InputError, match=r"fine\.codebook\.safetensors: fitted to another encoder than the weights'"):
         detector.detect([(ego, [Share(peer, "codes", 0.1, None, 1.0)])])
 
 

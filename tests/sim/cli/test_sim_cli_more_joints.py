@@ -21,6 +21,7 @@ from sim_examples import BASE
 
 import sortie
 from sortie.perception.evaluation.condition import Sharing
+from sortie.perception.uncertainty import BoxErrors
 from sortie.policies.contract import PolicyError
 from sortie.policies.verification.invariants import Invariant
 from sortie.scenarios.intervals import Estimate
@@ -220,6 +221,37 @@ def test_fit(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     assert command("fit", "errors", "torch", "--weights", "w", "--out", "o", "--bench-seed", "8", "--bench", "b") == 2
     assert split.args == ((8, {"geometry": "its grid"}), "validation", Path("b"))
     assert len(moments.calls) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "told", "kept"),
+    [
+        (("torch",), "torch --bench-seed 0", "shipped/net.errors.json"),
+        (
+            ("torch", "--weights", "my w", "--bench-seed", "8"),
+            "torch --weights 'my w' --bench-seed 8",
+            "my w.errors.json",
+        ),
+        (("surrogate", "--weights", "w", "--out", "o", "--towns", "9"), "surrogate --weights w --out o --towns 9", "o"),
+    ],
+)
+def test_a_file_of_box_errors_names_the_command_that_repeats_it(
+    here: Path, monkeypatch: pytest.MonkeyPatch, given: tuple[str, ...], told: str, kept: str
+) -> None:
+    net, fitted = SimpleNamespace(config=SimpleNamespace(geometry="")), SimpleNamespace(boxes=7, within=(0.7, 0.9))
+    model = BoxErrors((0.0,) * 5, (0.0,) * 5, 0.25)
+    box_errors = SimpleNamespace(fit=lambda found: model, calibration=lambda model, found: fitted)
+    found = Seen(["boxes"])
+    stand_in(
+        monkeypatch, "sortie.perception.benchmark.dataset", Benchmark=tuple_of, load_frames=found, make_split=found
+    )
+    stand_in(monkeypatch, "sortie.perception.network.checkpoint", load_weights=lambda path: net)
+    stand_in(monkeypatch, "sortie.perception.network.detector", named_weights=lambda path: path or Path("shipped/net"))
+    stand_in(monkeypatch, "sortie.perception.training.boxes_alone", boxes_alone=found, moments_of=found)
+    stand_in(monkeypatch, "sortie.perception.training", box_errors=box_errors)
+    stand_in(monkeypatch, "sortie.perception.surrogate.errors", moments=found)
+    assert command("fit", "errors", *given) == 0
+    assert json.loads((here / kept).read_text())["made"]["command"] == f"sortie fit errors {told}"
 
 
 def test_bench(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
