@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
+from sortie.perception.classes import PERSON
 from sortie.perception.types import Boxes
 
 Floats = NDArray[np.float64]
@@ -62,8 +63,8 @@ def matched_poses(poses: ArrayLike, places_m: Sequence[NDArray[np.floating]]) ->
 
 
 def sure(boxes: Boxes) -> Boxes:
-    """The boxes that are matched."""
-    return boxes.take(boxes.score >= MIN_SCORE)
+    """The boxes that are matched: of vehicles, so that no person is taken for the car beside it."""
+    return boxes.take((boxes.score >= MIN_SCORE) & (boxes.kind != PERSON))
 
 
 def _pairs(a: KDTree, b: KDTree) -> tuple[Floats, Floats]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sortie.perception.classes import CAR, PERSON, TRUCK
 from sortie.perception.pose_matching import (
     BOX_SIGMA_M,
     GATE_M,
@@ -81,9 +82,11 @@ def test_nothing_is_corrected_where_nothing_is_matched() -> None:
     assert np.array_equal(moved[:, :2], np.array(poses)[:, :2]), "one pair, which agrees"
 
 
-def test_weak_boxes_are_not_matched() -> None:
-    boxes = Boxes(CARS[:2], np.ones((2, 2)), np.zeros(2), np.array([0.31, 0.29]))
-    assert sure(boxes).xy_m.tolist() == [CARS[0].tolist()]
+def test_weak_boxes_and_people_are_not_matched() -> None:
+    """A detector of one's own may find people; a truck is a car to the network."""
+    kind = np.array([CAR, CAR, TRUCK, PERSON], np.int8)
+    boxes = Boxes(CARS[:4], np.ones((4, 2)), np.zeros(4), np.array([0.31, 0.29, 0.5, 0.9]), kind=kind)
+    assert sure(boxes).xy_m.tolist() == CARS[[0, 2]].tolist()
 
 
 def test_boxes_move_with_their_drones_pose() -> None:
