@@ -18,7 +18,7 @@ from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.evaluation.results import TAU
 from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference, compare
-from sortie.perception.network.checkpoint import read_facts, save_weights
+from sortie.perception.network.checkpoint import read_config, read_facts, save_weights
 from sortie.perception.network.model import CarNet
 from sortie.perception.training.learn import EGOS
 from sortie.perception.training.recipe import command, of_benchmark
@@ -71,10 +71,10 @@ def validate_all(
 
 
 def history(weights: Path | None) -> list[dict[str, Any]]:
-    """The training runs that the weights say they come from; none for None."""
-    if weights is None:
-        return []
-    runs: list[dict[str, Any]] = read_facts(weights).get("runs", [])
+    """The training runs that the weights say they come from, the last one with the network that it made; none for None."""
+    runs: list[dict[str, Any]] = [] if weights is None else read_facts(weights).get("runs", [])
+    if weights is not None and runs:
+        runs[-1]["model"] = asdict(read_config(weights))
     return runs
 
 
@@ -98,7 +98,7 @@ def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
             (
                 (
                     f"{k}",
-                    f"`{command(r, model, bench['seed'], out)}`",
+                    f"`{command(r, r.get('model', model), bench['seed'], out)}`",
                     f"{r['done']}",
                     f"{r['loss']:.3f}",
                     f"{r['minutes']:.0f}",

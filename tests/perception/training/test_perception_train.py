@@ -23,7 +23,7 @@ from sortie.perception.training import train as training
 from sortie.perception.training.learn import Thinning, draw_batch, gradients, local_cars
 from sortie.perception.training.recipe import Recipe, command
 from sortie.perception.training.train import learning_rate, train
-from sortie.perception.training.validation import card
+from sortie.perception.training.validation import card, history, publish
 from sortie.scenarios.streams import stream
 
 CPU = torch.device("cpu")
@@ -190,6 +190,22 @@ def test_a_run_cut_off_and_resumed_ends_where_the_whole_one_does(tmp_path: Path)
     assert (path.parent / "loss.csv").read_text().startswith("step,loss,lr,ap_single,ap_full\n2,")
     assert not list(tmp_path.glob("**/*.part"))
     json.dumps(facts)
+
+
+def test_a_card_names_each_run_with_the_network_that_it_made(tmp_path: Path) -> None:
+    """Not the last one's: a deep network of another fusion began from a shallow one."""
+    net, bench, done = CarNet(), Benchmark(), {"done": 5, "loss": 1.0, "minutes": 2.0}
+    publish(net, tmp_path / "first.safetensors", bench, [asdict(Recipe(steps=5)) | done], [])
+    runs = [*history(tmp_path / "first.safetensors"), asdict(Recipe(steps=7, warm_start="first.safetensors")) | done]
+    deep = CarNet(ModelConfig(fusion="fcooper", decoder="deep"))
+    publish(deep, tmp_path / "second.safetensors", bench, runs, [])
+    runs = [*history(tmp_path / "second.safetensors"), asdict(Recipe(warm_start="second.safetensors")) | done]
+    publish(net, tmp_path / "third.safetensors", bench, runs, [])
+    told = (tmp_path / "third.md").read_text()
+    flags = "--steps 7 --warm-start first.safetensors --fusion fcooper --decoder deep"
+    assert "`sortie train --steps 5 --out first.safetensors`" in told
+    assert f"`sortie train {flags} --out second.safetensors`" in told
+    assert "`sortie train --warm-start second.safetensors --out third.safetensors`" in told
 
 
 def test_a_warm_start_takes_what_fits_and_names_the_rest(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
