@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import update_wrapper
 from numbers import Integral
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -15,6 +16,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.classes import TargetClass
 from sortie.perception.errors import InputError
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
@@ -144,7 +146,8 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
         if not isinstance(made, Boxes):
             raise PluginError(f"detector {found.name}: {what} returns {made!r:.60}, must be Boxes")
         n = len(made)
-        for column, shape in (("xy_m", (n, 2)), ("size_m", (n, 2)), ("yaw_rad", (n,)), ("score", (n,))):
+        columns = {"xy_m": (n, 2), "size_m": (n, 2)} | dict.fromkeys(("yaw_rad", "score", "car", "kind"), (n,))
+        for column, shape in columns.items():
             value = real_array(getattr(made, column))
             if value is None or np.asarray(getattr(made, column)).dtype.kind == "O":
                 raise PluginError(
@@ -156,6 +159,10 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
                 )
             if not np.isfinite(value).all():
                 raise PluginError(f"detector {found.name}: {what} returns {column} that is not finite")
+        whole = np.asarray(made.kind)
+        if n and (whole.dtype.kind not in "iu" or not np.isin(whole, list(TargetClass)).all()):
+            must = f"must be whole numbers from 0 to {max(TargetClass)}"
+            raise PluginError(f"detector {found.name}: {what} returns kind {made.kind!r:.60}, {must}")
         return made
 
     def apart(jobs: Jobs) -> list[tuple[Capture, list[Share]]]:
@@ -165,13 +172,18 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
             (ego, [s._replace(**{n: deepcopy(getattr(s, n)) for n in names}) for s in shares]) for ego, shares in jobs
         ]
 
-    def checked(jobs: Jobs, several: Any) -> list[Boxes]:
-        whole = isinstance(several, Sequence) and len(several) == len(jobs)
+    def checked(several: Any, count: int, what: str = "detect") -> list[Boxes]:
+        whole = isinstance(several, Sequence) and len(several) == count
         if not whole or not all(isinstance(each, Boxes) for each in several):
+            each_of = "egos" if what == "truth_many" else "jobs"
             raise PluginError(
-                f"detector {found.name}: detect returns {several!r:.60}, must be Boxes for each of the jobs"
+                f"detector {found.name}: {what} returns {several!r:.60}, must be Boxes for each of the {each_of}"
             )
-        return [boxes(each, "detect") for each in several]
+        return [boxes(each, what) for each in several]
+
+    def listed(method: Callable[..., Any], *args: Any) -> Any:
+        """What a method returns or yields, so that it fails here."""
+        return checked_call("detector", update_wrapper(lambda: list(method(*args)), method))
 
     def counted(capture: Capture, roi: Disc | None) -> int:
         number = count(capture, roi)
@@ -180,7 +192,7 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
             raise PluginError(f"detector {found.name}: count_boxes returns {number!r:.60}, {must}")
         return int(number)
 
-    found.detect = lambda jobs: checked(jobs, detect(apart(jobs)))
+    found.detect = lambda jobs: checked(detect(apart(jobs)), len(jobs))
     found.truth = lambda t_s, ego: boxes(truth(t_s, ego), "truth")
     found.count_boxes = counted
     if isinstance(made, DetectsAhead):
@@ -188,12 +200,15 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
 
         def begun(jobs: Jobs) -> Callable[[], list[Boxes]]:
             finish = begin(apart(jobs))
-            return lambda: checked(jobs, checked_call("detector", finish))
+            return lambda: checked(checked_call("detector", finish), len(jobs))
 
         found.begin = begun
     if isinstance(made, DetectsMany):
-        many = found.detect_many
-        found.detect_many = lambda moments: many([apart(jobs) for jobs in moments])
+        many, truths = made.detect_many, made.truth_many
+        found.detect_many = lambda moments: checked(
+            listed(many, [apart(jobs) for jobs in moments]), sum(map(len, moments)), "detect_many"
+        )
+        found.truth_many = lambda t_s, egos: checked(listed(truths, t_s, egos), len(egos), "truth_many")
     detector: Detector = found
     return detector
 

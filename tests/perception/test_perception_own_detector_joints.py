@@ -22,6 +22,13 @@ CODE = """
 import numpy as np
 from sortie.perception.types import Boxes
 
+KINDS = {
+    "one kind": {"kind": np.zeros(1, np.int8)},
+    "kind 3": {"kind": np.array([0, 3])},
+    "half a kind": {"kind": np.array([0.5, 1.0])},
+    "one car": {"car": np.zeros(1, np.int32)},
+}
+
 
 class Ahead:
     def __init__(self, scene, config, seed, replication, *, what="right"):
@@ -38,10 +45,13 @@ class Ahead:
         return [Boxes.empty() for _ in jobs]
 
     def detect_many(self, moments):
-        return [boxes for jobs in moments for boxes in self.spoil(jobs)]
+        if self.what == "yields":
+            return (1 / 0 for _ in moments)
+        found = [boxes for jobs in moments for boxes in self.spoil(jobs)]
+        return found[1:] if self.what == "few" else found
 
     def truth_many(self, t_s, egos):
-        return []
+        return [None for _ in egos]
 
     calibration = "none"
 
@@ -54,6 +64,8 @@ class Ahead:
                 found[0] = Boxes(np.array([[np.inf, 0.0]]), np.ones((1, 2)), np.zeros(1), np.ones(1))
             if self.what == "half":
                 found[0] = Boxes(np.array([[np.nan, 0.0], [1.0, 0.0]]), np.ones((2, 2)), np.zeros(2), np.ones(2))
+            if self.what in KINDS:
+                found[0] = Boxes(np.zeros((2, 2)), np.ones((2, 2)), np.zeros(2), np.ones(2), **KINDS[self.what])
             return found[1:] if self.what == "short" else found
 
         return finish
@@ -100,12 +112,28 @@ def test_it_is_given_scene_section_seed_replication_and_its_parameters(made: Cal
         ("short", "must be Boxes for each of the jobs"),
         ("infinite", "xy_m that is not finite"),
         ("half", "xy_m that is not finite"),
+        ("one kind", r"detect returns kind of shape \(1,\), must be \(2,\)"),
+        ("kind 3", r"detect returns kind array\(\[0, 3\]\), must be whole numbers from 0 to 2"),
+        ("half a kind", "must be whole numbers from 0 to 2"),
+        ("one car", r"detect returns car of shape \(1,\), must be \(2,\)"),
     ],
 )
 def test_what_it_computes_in_the_background_is_checked(made: Callable[[str], Any], what: str, message: str) -> None:
     finish = made(what).begin([(capture(), [])])
     with pytest.raises(PluginError, match=message):
         finish()
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [("few", r"detect_many returns \[\], must be Boxes for each of the jobs"), ("yields", "division by zero")],
+)
+def test_what_it_computes_of_many_moments_is_checked(made: Callable[[str], Any], what: str, message: str) -> None:
+    found = made(what)
+    with pytest.raises(PluginError, match=message):
+        found.detect_many([[(capture(), [])]])
+    with pytest.raises(PluginError, match=r"truth_many returns \[None\], must be Boxes for each of the egos"):
+        found.truth_many([5.0], [capture()])
 
 
 @pytest.mark.parametrize("how", ["detect", "begin", "detect_many"])
