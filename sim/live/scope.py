@@ -43,6 +43,7 @@ UNUSED = (
     "perception.max_age_s",
     "perception.motion_compensation",
     "perception.join",
+    "perception.match_poses",
     "perception.common_errors",
     "perception.score_threshold",
     "perception.cells_by",

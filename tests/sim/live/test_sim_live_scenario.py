@@ -337,6 +337,7 @@ CHANGED = {
     "perception.motion_compensation": "false",
     "perception.join": "nms",
     "perception.codebook": "other.safetensors",
+    "perception.match_poses": "true",
     "perception.common_errors": "unknown",
     "perception.score_threshold": "0.5",
     "perception.cells_by": "norm",
