@@ -11,6 +11,7 @@ from perception_examples import cross
 from sortie.perception.errors import InputError
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.pose_matching import matched_poses, sure
+from sortie.perception.recordings.detector import RecordedDetector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Capture, Share
@@ -88,3 +89,5 @@ def test_the_surrogate_and_recordings_refuse_it() -> None:
         InputError, match=r"perception.match_poses is true: .* was calibrated without it, must be false"
     ):
         SurrogateDetector(scene, Perception(detector="surrogate", match_poses=True), 1)
+    with pytest.raises(InputError, match=r"perception\.match_poses is true, must be false for a recording"):
+        RecordedDetector(Perception(detector="recorded", recording="seen.npz", match_poses=True))
