@@ -73,10 +73,12 @@ def test_a_handshake_goes_by_the_whole_map_of_a_peer_that_sent_codes_of_some_cel
     read = {_part(share): ready(whole * some)}
     known = {ego: SimpleNamespace(maps=ready(own)), sender: SimpleNamespace(maps=ready(whole), coded=read)}
     with torch.inference_mode():
-        codes, cells = (
-            Codes()._fuse(ego, [share._replace(representation=what)], [], {}, known)  # type: ignore[arg-type]
+        detector = Codes()
+        both = (
+            detector._peer(known, share._replace(representation=what), sender.est_pose)  # type: ignore[arg-type]
             for what in ("codes", "features")
         )
+        codes, cells = (detector._fuse(ego, ego.est_pose, [peer], known) for peer in both)  # type: ignore[arg-type]
         with_own = fused_map(net, POSE, own, [Peer(POSE, 1.0, whole * some, some)], "masked")
         as_sent = fused_map(net, POSE, own, [Peer(POSE, 1.0, whole, some)], "masked")
     assert codes is not None
