@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -128,7 +129,8 @@ def run_sortie(
         own = loaded(scenario)
         parts = build(scenario, policies, seed, replication, detector_of)
         files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited during the flight
-        fly(parts, each_second, observer)
+        with _older_objects_kept():
+            fly(parts, each_second, observer)
         record = _collect(parts, policies, name, seed, replication)
         metrics = own_metrics(own, record)
     wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
@@ -306,6 +308,16 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
     if scorer is not None:
         scorer.flush()
     each_second(parts.env.now)
+
+
+@contextmanager
+def _older_objects_kept() -> Iterator[None]:
+    """Spare Python's search for cyclic garbage what was there before the flight: mostly modules, which stay for good."""
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def _collect(parts: Parts, policies: PolicyPlan, policy: str, seed: int, replication: int) -> SortieRecord:

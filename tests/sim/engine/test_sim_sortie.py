@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 from collections.abc import Callable
@@ -106,6 +107,16 @@ def test_an_observer_changes_nothing(base: SortieRecord) -> None:
 
 
 # --- the clock -----------------------------------------------------------------------------------
+
+
+def test_the_search_for_garbage_spares_older_objects_in_flight_alone() -> None:
+    spared: list[int] = []
+    run_sortie(
+        example("duration_s=0.2", "mission.phases=[{at_s: 0, phase: search}]"),
+        progress=lambda _: spared.append(gc.get_freeze_count()),
+    )
+    assert min(spared) > 0
+    assert gc.get_freeze_count() == 0
 
 
 def test_the_end_is_exclusive(base: SortieRecord) -> None:
