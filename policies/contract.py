@@ -318,6 +318,12 @@ def nothing(source: int, destination: int, reason: str) -> Directive:
     return Directive(source, destination, reason=reason)
 
 
+@lru_cache(maxsize=1 << 10)
+def nothing_to_all(source: int, destinations: tuple[int, ...], reason: str) -> tuple[Directive, ...]:
+    """`nothing` for each of several destinations."""
+    return tuple([nothing(source, destination, reason) for destination in destinations])
+
+
 class Policy(Protocol):
     """Any callable of this shape is a policy."""
 

@@ -10,7 +10,7 @@ from sortie.policies.contract import (
     Representation,
     TaskPhase,
     boxes_across_networks,
-    nothing,
+    nothing_to_all,
 )
 from sortie.policies.geometry import peers_by_overlap
 
@@ -58,14 +58,14 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
         why += f", track: ROI {roi.radius_m:.0f} m"
     ego, chosen = view.ego, peers_by_overlap(view)[:TOP_PEERS]
     link_rho = rho if rung == FEATURES else 0.0
-    directives = []
-    for peer in view.peers:
-        if peer not in chosen:
-            directives.append(nothing(ego, peer, NOT_CHOSEN))
-        elif (goodput_mbps := me.goodput_to(peer)) < MIN_GOODPUT_MBPS:
+    peers = view.peers
+    directives = list(nothing_to_all(ego, peers, NOT_CHOSEN))
+    for peer in chosen:
+        if (goodput_mbps := me.goodput_to(peer)) < MIN_GOODPUT_MBPS:
             weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.2g} < {MIN_GOODPUT_MBPS:g} Mb/s"
             low = min(rung, DETECTIONS)
-            directives.append(Directive(ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak))
+            directive = Directive(ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak)
         else:
-            directives.append(Directive(ego, peer, rung, link_rho, roi, rate_hz, reason=why))
+            directive = Directive(ego, peer, rung, link_rho, roi, rate_hz, reason=why)
+        directives[peers.index(peer)] = directive
     return directives
