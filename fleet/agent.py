@@ -176,7 +176,8 @@ class Agent:
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
         self._links: dict[int, _OutgoingLink] = {}
-        self._asked_of: dict[int, Directive] = {}  # what the policy answered last, by peer; it was checked
+        self._answer: Sequence[Directive] = ()  # what the policy answered last; it was checked
+        self._asked_of: dict[int, Directive] = {}  # the same by peer
         self._ids: NDArray[np.int64] | None = None  # `memory.ids` as it was then
         table, row = memory.table, memory.row
         self._heard_s = table.heard_s[row]
@@ -347,7 +348,7 @@ class Agent:
         directives = self._policy(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns
         is_heard = view is heard
-        changed = differing(self._asked_of, directives, view) if is_heard and self._ids is memory.ids else None
+        changed = differing(self._answer, directives, view) if is_heard and self._ids is memory.ids else None
         if changed is None:
             self._check(directives, view)
             self._asked_of = {d.destination: d for d in directives}
@@ -356,6 +357,7 @@ class Agent:
         else:
             peers = sorted({*self._overdue(ages, now_s), *[d.destination for d in changed]})
             self._asked_of.update([(d.destination, d) for d in changed])
+        self._answer = tuple(directives)
         asked_of = self._asked_of
         for peer in peers:
             link = links.get(peer)

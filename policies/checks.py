@@ -6,7 +6,8 @@ import math
 import operator
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import compress
 from typing import Any
 
 from sortie.policies.contract import (
@@ -46,13 +47,11 @@ def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
         seen.add(d.destination)
 
 
-def differing(
-    before: Mapping[int, Directive], directives: Sequence[Directive], view: FleetView
-) -> list[Directive] | None:
+def differing(before: Sequence[Directive], directives: Sequence[Directive], view: FleetView) -> list[Directive] | None:
     """Those of a policy's directives that are other objects than in its answer before; most of the time it repeats itself.
 
     Args:
-        before: the answer before, by destination, which was checked by a view of the same peers.
+        before: the answer before, which was checked by a view of the same peers.
         directives: the answer now.
         view: that it was given to.
 
@@ -61,12 +60,11 @@ def differing(
     """
     if (type(directives) is not tuple and type(directives) is not list) or len(before) != len(directives):
         return None
-    if all(map(operator.is_, directives, before.values())):
-        return []
-    kept = set(map(id, before.values()))
-    changed = [d for d in directives if id(d) not in kept]
-    is_whole = _is_plainly_valid(changed, view) and {d.destination for d in directives} == before.keys()
-    return changed if is_whole else None
+    moved = list(map(operator.is_not, directives, before))
+    changed, were = list(compress(directives, moved)), {d.destination: d for d in compress(before, moved)}
+    if not _is_plainly_valid(changed, view) or {d.destination for d in changed} != were.keys():
+        return None
+    return [d for d in changed if d is not were[d.destination]]  # others have only another place in the answer
 
 
 def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
