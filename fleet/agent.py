@@ -42,6 +42,7 @@ from sortie.policies.contract import (
     nothing,
 )
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
+from sortie.policies.geometry import places_loop
 from sortie.policies.verification.enforced import Cap, Steps
 
 _FRESH = LinkHealth.FRESH
@@ -183,6 +184,7 @@ class Agent:
         self._heard_s = table.heard_s[row]
         self._busy, self._at_rest, self._blamed = table.busy[row], table.at_rest[row], table.blamed[row]
         self._find_overdue = loops().overdue
+        places_loop()  # policies may rank peers
         self._alert = False  # whether it knows of a person in its region
         self._last_own: Descriptor | None = None  # published or not
         self._roster = Roster(0, (self.drone,))

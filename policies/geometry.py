@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cache
+from itertools import chain
 from math import hypot
+from typing import Any
+
+import numpy as np
 
 from sortie.policies.contract import Descriptor, FleetView
-from sortie.scenarios.disc import disc_overlap, rank_by_overlap
+from sortie.scenarios.disc import AGENT_IDS, disc_overlap
 
 
 def footprint_overlap(a: Descriptor, b: Descriptor) -> float:
@@ -22,14 +27,22 @@ def peers_by_overlap(view: FleetView, receiver: int | None = None) -> list[int]:
         receiver: the drone whose peers are ranked; None is the ego.
     """
     of = view.ego if receiver is None else receiver
-    me = view.descriptors.get(of)
-    if me is None:
+    known = view.descriptors
+    if of not in known:
         return []
-    radius_m, (x_m, y_m, _) = me.footprint_radius_m, me.position_m
-    overlap = {}
-    for p, peer in view.descriptors.items():  # written out: a policy spends most of its time here
-        if p != of:
-            px_m, py_m, _ = peer.position_m
-            away_m, other_m = hypot(x_m - px_m, y_m - py_m), peer.footprint_radius_m
-            overlap[p] = disc_overlap(away_m, radius_m, other_m) if away_m < radius_m + other_m else 0.0
-    return rank_by_overlap(of, overlap)
+    ids, each = list(known), known.values()
+    position_m = np.fromiter(chain.from_iterable([d.position_m for d in each]), np.float64)
+    radius_m = np.array([d.footprint_radius_m for d in each], np.float64)
+    places = places_loop()(ids.index(of), np.array(ids), position_m, radius_m)
+    places.sort()
+    ranked: list[int] = ((of + places) % AGENT_IDS).tolist()
+    return ranked
+
+
+@cache
+def places_loop() -> Any:
+    """The compiled loop, imported and made ready at its first use: before a flight, for decisions may have little time."""
+    from sortie.policies.overlap_loops import places
+
+    places(0, np.zeros(1, np.int64), np.zeros(3), np.zeros(1))
+    return places
