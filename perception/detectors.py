@@ -159,10 +159,11 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
                 )
             if not np.isfinite(value).all():
                 raise PluginError(f"detector {found.name}: {what} returns {column} that is not finite")
-        whole = np.asarray(made.kind)
-        if n and (whole.dtype.kind not in "iu" or not np.isin(whole, list(TargetClass)).all()):
-            must = f"must be whole numbers from 0 to {max(TargetClass)}"
-            raise PluginError(f"detector {found.name}: {what} returns kind {made.kind!r:.60}, {must}")
+        for column, low, high in (("kind", 0, max(TargetClass)), ("car", -1, 2**31 - 1)):
+            value = np.asarray(getattr(made, column))
+            if value.dtype.kind not in "iu" or not ((value >= low) & (value <= high)).all():
+                must = f"must be whole numbers from {low} to {high}"
+                raise PluginError(f"detector {found.name}: {what} returns {column} {value!r:.60}, {must}")
         return made
 
     def apart(jobs: Jobs) -> list[tuple[Capture, list[Share]]]:

@@ -48,10 +48,9 @@ from sortie.perception.uncertainty import BoxErrors, load_errors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import CELL_NAMES
 from sortie.scenarios.schema import Perception
-from sortie.scenarios.traces import located
+from sortie.scenarios.traces import NETWORKS, located
 
-WEIGHTS = Path(__file__).parent / "weights"
-SHIPPED_WEIGHTS = WEIGHTS / "disconet.safetensors"
+SHIPPED_WEIGHTS = NETWORKS / "disconet.safetensors"
 KEPT_CAPTURES = 64
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")
@@ -62,14 +61,14 @@ __all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "nam
 def shipped(fusion: str) -> Path:
     """The weights that a fusion flies with when the scenario names none: DiscoNet's unless others are shipped for it."""
     own = fusion not in FUSIONS or FUSIONS[fusion].shares != "features"
-    return SHIPPED_WEIGHTS if own else WEIGHTS / f"{fusion}.safetensors"
+    return SHIPPED_WEIGHTS if own else NETWORKS / f"{fusion}.safetensors"
 
 
 def named_weights(weights: Path | None) -> Path:
     """The file of a network: DiscoNet's shipped one for None; a shipped one may be named without its folder.
 
     Example:
-        >>> named_weights(None).name, named_weights(Path("fine.safetensors")).parent == WEIGHTS
+        >>> named_weights(None).name, named_weights(Path("fine.safetensors")).parent == NETWORKS
         ('disconet.safetensors', True)
     """
     return SHIPPED_WEIGHTS if weights is None else located(weights)

@@ -137,11 +137,13 @@ def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
         else "Full sharing only: no cells were dropped, so what a starved budget does is a property of the fusion."
     )
     varied, heights, headings = "", "55–65 m", "within a few degrees of each other"
+    beyond = "other altitudes, peers that look another way"
     if last["varied"]:
         low, high = VARIED.altitude_m
+        beyond = "other altitudes"
         heights, headings = f"{low:g}–{high:g} m", f"that differ by {VARIED.yaw_sigma_deg:g}° (standard deviation)"
         varied = (
-            f" In {100 * last['varied']:.0f} % of the steps the frames are of as many varied scenes: dense traffic, fleets "
+            f" In {100 * last['varied']:.0f} % of the steps the frames are of {last['scenes']} varied scenes: dense traffic, fleets "
             f"{heights} up, headings {headings}."
         )
     scenes, per_scene = SIZES["validation"]
@@ -164,5 +166,5 @@ drone's *estimated* pose, so its heading error moves every far box: 0.5° is 0.7
 inside the ego's square counts, whether anyone can see it or not.
 
 **Made for** five drones 17–23 m apart, {heights} up, headings {headings}, banks of a few degrees, towns of
-this generator. **Not made for** other altitudes, peers that look another way, real images.
+this generator. **Not made for** {beyond}, real images.
 """

@@ -6,7 +6,8 @@ and the best is the highest rate × success rate, where success above 0.9 counts
 loss beats a slow one with none) and below 0.1 as none. (D. Smithies and F. Fietkau's Minstrel in Linux's mac80211;
 intervals and weights as there.) A frame that a collision lost counts as lost, as it does for a real sender.
 
-`Air` asks at the begin of its frames alone: where they are longer than an interval, they are the interval.
+`Air` updates the statistics only at the beginning of its frames. If a frame is longer than an interval, they are updated
+once a frame.
 
 Left out: the chain of slower rates that a frame falls back on within its retries, so that a rate that is suddenly too
 high costs whole samples here.

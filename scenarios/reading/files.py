@@ -148,8 +148,9 @@ def found_beside(scenario: Scenario, folder: Path) -> Scenario:
 
 
 def placed(name: str, folder: Path) -> str:
-    """A file's name below `folder` where only that leads to a file or a folder; else as it is, which a shipped file may have too."""
-    return name if os.path.exists(name) or not os.path.exists(folder / name) else str(folder / name)
+    """The name as it is if it leads somewhere from here; else below `folder` if it leads somewhere there; else as it is: it may
+    name a shipped file."""
+    return name if not name or os.path.exists(name) or not os.path.exists(folder / name) else str(folder / name)
 
 
 def value_at(field: str, sections: Any) -> Any:

@@ -125,7 +125,7 @@ class Perception(Section):
     )
     match_poses: bool = Field(
         False,
-        description="Receivers correct the poses of all drones they hear, and their own, by what both see, before they fuse (the torch detector's).",
+        description="Receivers correct the poses of all drones that they hear, and their own, by the cars that these have in common, before they fuse (the torch detector's).",
     )
     common_errors: Literal["fitted", "unknown"] = Field(
         "fitted",

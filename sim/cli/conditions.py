@@ -49,7 +49,7 @@ def compare_conditions(
         if c.flown_share < 1.0
     }:
         least = ", ".join(f"{name} ({percent(share)} of drone-seconds flown)" for name, share in gone.items())
-        out.print(f"drones left the air in {least}: AP is of those that fly")
+        out.print(f"not all drones flew all the time in {least}: AP is of those that fly")
     rows = summarise(cells)
     fixed = best_fixed(rows)
     flown = [p for p in policies if p in FIXED]

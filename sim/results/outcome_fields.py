@@ -84,7 +84,7 @@ class TrackingOutcome(TypedDict):
 class MissionOutcome(TypedDict):
     flown_share: Annotated[
         float,
-        "Share of drone-seconds flown, 0 … 1: 1 where all fly from begin to end. Ground stations do not count.",
+        "Share of drone-seconds flown, 0 … 1: 1 where all fly from beginning to end. Ground stations do not count.",
         SHARE,
     ]
     region_observed_share: Annotated[

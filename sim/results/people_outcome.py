@@ -36,7 +36,6 @@ def people_outcome(record: SortieRecord) -> dict[str, float | None]:
     fleet = record.scenario.fleet
     there = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, n))
     flying = there & [fleet.station(drone) is None for drone in range(n)]
-    looking = there & [drone not in fleet.without_camera for drone in range(n)]
     people_m = _people(record.tables["people"], len(t_s), len(perception.people))
     discs = Regions(record.tables["mission"], record.scenario.mission).at(
         np.repeat(t_s, n), np.tile(range(n), len(t_s))
@@ -48,7 +47,7 @@ def people_outcome(record: SortieRecord) -> dict[str, float | None]:
     without = flying & ~np.isnan(discs[..., 2]) & ~present
     width_s = np.diff(t_s, append=record.scenario.duration_s)
     return {
-        "ap_2m": None if perception.thermal is None else _average_precision(record, t_s, looking, people_m),
+        "ap_2m": None if perception.thermal is None else _average_precision(record, t_s, flying, people_m),
         **dict(zip(("located_share", "located_alone_share"), _located(record), strict=True)),
         "in_region_drone_s": _drone_s(present, width_s),
         "unknown_share": _share(present & ~known, present, width_s),
@@ -65,7 +64,8 @@ def _located(record: SortieRecord) -> tuple[float | None, float | None]:
     t_s, drone, x_m, y_m = (truths[c].to_numpy() for c in ("t_s", "drone", "x_m", "y_m"))
     disc = Regions(record.tables["mission"], record.scenario.mission).at(t_s, drone)
     scored = set(zip(fusions["t_s"].to_pylist(), fusions["drone"].to_pylist(), strict=True))
-    flies = np.array([key in scored for key in zip(t_s.tolist(), drone.tolist(), strict=True)], bool)
+    pairs = list(zip(t_s.tolist(), drone.tolist(), strict=True))
+    flies = np.array([key in scored and record.scenario.fleet.station(key[1]) is None for key in pairs], bool)
     sought = flies & ((x_m - disc[:, 0]) ** 2 + (y_m - disc[:, 1]) ** 2 <= disc[:, 2] ** 2)
     here_m = np.column_stack([x_m, y_m])[sought]
     keys = list(zip(t_s[sought].tolist(), drone[sought].tolist(), strict=True))

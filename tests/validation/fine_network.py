@@ -42,7 +42,7 @@ from sortie.perception.evaluation.difficulty_effects import SEED, Effect, Parame
 from sortie.perception.evaluation.difficulty_effects import measure as difficulty_effects
 from sortie.perception.geometry import CELLS
 from sortie.perception.network.checkpoint import load_weights
-from sortie.perception.network.detector import SHIPPED_WEIGHTS, WEIGHTS
+from sortie.perception.network.detector import SHIPPED_WEIGHTS, named_weights
 from sortie.perception.network.fused import Peer, fused_map
 from sortie.perception.network.inference import folded
 from sortie.perception.network.memory import keep_freed
@@ -53,7 +53,7 @@ from sortie.scenarios.reading.load import load
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 
-NETWORKS = {"default": SHIPPED_WEIGHTS, "fine": WEIGHTS / "fine.safetensors"}
+NETWORKS = {"default": SHIPPED_WEIGHTS, "fine": named_weights(Path("fine.safetensors"))}
 BENCH_SEED, SCENES = 8, 120
 RHO, CODE_BYTES = (0.02, 0.05, 0.25, 1.0), (10,)
 LEFT_OUT = ("tracks", "detections, suppressed", "uncertain boxes", "uncertain boxes, anything in common", "raw images")
