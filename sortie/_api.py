@@ -160,15 +160,17 @@ class Comparison:
         import pyarrow as pa
 
         from sortie._run import numbers
-        from sortie.sim.results.outcome_fields import COUNTS
+        from sortie.sim.results.outcome_fields import lacking
 
         rows = [
             {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, **dict(numbers(s.outcome))}
             for s in self.sorties
         ]
         names = list(dict.fromkeys(name for row in rows for name in row))
-        none = {name: 0 if name.startswith(COUNTS) else None for name in names}
-        return pa.table({name: [row.get(name, none[name]) for row in rows] for name in names})
+        fleets = [len(s.outcome["battery"]) for s in self.sorties]
+        return pa.table(
+            {name: [row.get(name, lacking(name, n)) for row, n in zip(rows, fleets, strict=True)] for name in names}
+        )
 
     def summary(self) -> Summary:
         """The policies side by side, and why their figures differ, as `sortie compare` prints it.

@@ -30,7 +30,7 @@ from sortie.sim.folders import RunError
 from sortie.sim.identity import codes_here, file_digest
 from sortie.sim.process import own_process
 from sortie.sim.results.outcome import outcome
-from sortie.sim.results.outcome_fields import COUNTS
+from sortie.sim.results.outcome_fields import lacking
 from sortie.sim.results.record import SortieRecord
 
 Task = tuple[int, str]
@@ -164,7 +164,7 @@ def number(result: dict[str, Any], name: str) -> float | None:
     try:
         value = metric(result, name)
     except KeyError:
-        return 0.0 if name.startswith(COUNTS) else None
+        return lacking(name, len(result.get("battery", ())))
     return float(value) if value is not None and math.isfinite(value) else None
 
 

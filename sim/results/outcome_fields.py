@@ -367,6 +367,17 @@ def is_zero_count(name: str, drones: int) -> bool:
     return name.startswith(COUNTS[:-1]) and key in open_keys(drones, 0, (), traced=False)[section]
 
 
+def lacking(name: str, drones: int) -> int | None:
+    """What a run of so many drones has of a number that its outcome lacks: 0 of a count, also of a policy that did not
+    decide there; else None.
+
+    Example:
+        >>> lacking("distrusted_by.1", 2), lacking("distrusted_by.7", 2), lacking("policies.decisions.silence", 2)
+        (0, None, 0)
+    """
+    return 0 if is_zero_count(name, drones) or name.startswith(COUNTS[-1]) else None
+
+
 def open_keys(
     drones: int, phases: int, policies: Collection[str], *, traced: bool, metrics: Collection[str] = ()
 ) -> dict[str, Collection[str]]:

@@ -300,10 +300,10 @@ def test_a_count_that_a_run_does_not_have_is_zero() -> None:
     }
     names = (
         "payload_fates.delivered", "payload_fates.lost/no_link", "policies.decisions.silence", "distrusted_by.0",
-        "descriptor_drops.forged", "a.b",
+        "distrusted_by.7", "descriptor_drops.forged", "a.b",
     )  # fmt: skip
     result |= {"distrusted_by": {}, "descriptor_drops": {}}
-    assert [number(result, name) for name in names] == [3.0, 0.0, 0.0, 0.0, 0.0, None]
+    assert [number(result, name) for name in names] == [3.0, 0.0, 0.0, 0.0, None, 0.0, None], "there is no drone 7"
 
 
 BUDGETS = CAMPAIGN.replace(
