@@ -165,8 +165,8 @@ class TorchDetector:
         known = self._encode([c for c in seen if c.looked])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
         look = {s.capture for s in shared if s.is_detected}
-        fused = self._config.match_poses
-        alone = [e for e, shares in jobs if fused or not any(self._is_fused(s) and s.weight > 0.0 for s in shares)]
+        match = self._config.match_poses
+        alone = [e for e, shares in jobs if match or not any(self._is_fused(s) and s.weight > 0.0 for s in shares)]
         look |= {ego for ego in alone if ego.looked}
         for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
             if capture in look:
@@ -176,7 +176,7 @@ class TorchDetector:
         for share in shared:
             if share.representation == "codes":
                 self._read_codes(share, known)
-        if self._shares == "boxes" or self._config.match_poses:
+        if self._shares == "boxes" or match:
             for share in shared:
                 if share.is_map:
                     self._head_in_part(share, known)
@@ -349,7 +349,7 @@ class TorchDetector:
         ]
         moved = [
             replace(source, boxes=source.boxes.moved(source.pose, pose), pose=pose)
-            for source, pose in zip(late, fitted[len(maps) :], strict=False)
+            for source, pose in zip(late, fitted[len(maps) : -1], strict=True)
         ]
         return fitted[-1], fitted[: len(maps)], moved
 

@@ -191,7 +191,7 @@ class Align(nn.Module):
         x += self.turn(torch.stack([turn.sin(), turn.cos()], dim=-1))[:, None]
         out: Tensor = self.out(F.relu(x, inplace=True))
         out += said
-        return out * (said.sum(dim=-1, keepdim=True) > 0.0)  # all are at least 0, and `any` takes five times as long
+        return out * (said.sum(dim=-1, keepdim=True) > 0.0)  # all are at least 0; `any` takes longer
 
 
 class ShallowTrunk(nn.Module):
