@@ -368,14 +368,15 @@ def is_zero_count(name: str, drones: int) -> bool:
 
 
 def lacking(name: str, drones: int) -> int | None:
-    """What a run of so many drones has of a number that its outcome lacks: 0 of a count, also of a policy that did not
-    decide there; else None.
+    """What a run of so many drones has of a number that another run has and its own outcome lacks: 0 of a count, but for
+    one of a drone that is not there; else None.
 
     Example:
         >>> lacking("distrusted_by.1", 2), lacking("distrusted_by.7", 2), lacking("policies.decisions.silence", 2)
         (0, None, 0)
     """
-    return 0 if is_zero_count(name, drones) or name.startswith(COUNTS[-1]) else None
+    of_nobody = name.startswith("distrusted_by.") and not is_zero_count(name, drones)
+    return 0 if name.startswith(COUNTS) and not of_nobody else None
 
 
 def open_keys(
