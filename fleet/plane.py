@@ -16,7 +16,7 @@ from sortie.perception.geometry import USUAL, Cameras
 from sortie.policies.contract import Descriptor
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import Scenario
-from sortie.scenarios.traces import located
+from sortie.scenarios.shipped import located
 
 
 class Equipment(NamedTuple):

@@ -17,9 +17,6 @@ from numpy.typing import NDArray
 from sortie.perception.budget import CODEBOOK_BYTES
 from sortie.perception.errors import InputError
 
-CODEBOOK, ERRORS = ".codebook.safetensors", ".errors.json"
-"""What the names of codebooks and of the errors of boxes end in."""
-
 _MOST_DEFLATED = 1040
 """Deflate makes at most so many bytes of one, and a little more at a stream's begin and end."""
 
@@ -68,18 +65,6 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         stream.seek(0)
         with np.load(stream, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-
-
-def beside(weights: Path, suffix: str) -> Path:
-    """Where what belongs to a weights file, or to a calibration, lies.
-
-    Args: `suffix`: `CODEBOOK` or `ERRORS`.
-
-    Example:
-        >>> beside(Path("runs/train/disconet.safetensors"), ERRORS).as_posix()
-        'runs/train/disconet.errors.json'
-    """
-    return weights.with_name(weights.name.removesuffix(".safetensors") + suffix)
 
 
 def codebook_digest(path: Path) -> str:

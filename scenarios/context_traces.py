@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from sortie.scenarios.shipped import TRACES
 from sortie.scenarios.streams import stream
-from sortie.scenarios.traces import SHIPPED
 
-PAPER_120S = SHIPPED / "paper_120s"
+PAPER_120S = TRACES / "paper_120s"
 DRONES, DURATION_S = 4, 120
 PHASE_CHANGE_S, LINK_DROP_S = 45, 60
 TIRED, CUT_OFF = 1, 2

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.shipped import located
 
 Array = npt.NDArray[np.float64]
 Bounds = tuple[float, float]
@@ -23,10 +24,6 @@ Bounds = tuple[float, float]
 TIME_S: Bounds = (0.0, 86_400.0)
 DRONE: Bounds = (0.0, 254.0)
 MAX_ROWS = 5_000_000
-SHIPPED = Path(__file__).parent / "library" / "traces"
-"""The library's traces, which scenarios name by their path below it."""
-NETWORKS = Path(__file__).parents[1] / "perception" / "network" / "weights"
-"""The shipped networks, which scenarios and commands name likewise."""
 
 
 class TraceError(SortieError):
@@ -83,12 +80,6 @@ def read_columns(path: Path, bounds: Mapping[str, Bounds], required: Iterable[st
             raise TraceError(f"{path}: {name} in row {row} is {values[row - 1]:g}, must be within {low:g} … {high:g}")
         columns[name] = values
     return columns
-
-
-def located(path: Path) -> Path:
-    """The path itself where it leads to a file, else the shipped trace or network of that name where there is one."""
-    # os.path: a name that is too long is no file, where pathlib raises
-    return next((p for p in (path, SHIPPED / path, NETWORKS / path) if os.path.isfile(p)), path)
 
 
 def check_whole(path: Path, name: str, values: Array) -> None:

@@ -18,7 +18,7 @@ from sortie.scenarios.plugins.reference import file_of, is_file, package_of
 from sortie.scenarios.plugins.user_code import imported_files, imported_packages
 from sortie.scenarios.reading.files import ensure_files, named_files, named_models
 from sortie.scenarios.schema import Scenario
-from sortie.scenarios.traces import located
+from sortie.scenarios.shipped import located
 
 DISTRIBUTION = "sortie-sim"
 RELEASE = version(DISTRIBUTION)

@@ -24,7 +24,6 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception import budget
 from sortie.perception.errors import InputError
-from sortie.perception.files import CODEBOOK, ERRORS, beside
 from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import EgoSources, Pose, SourceBoxes, boxes_at_fusion, joined_many, sendable, source_of
@@ -48,9 +47,8 @@ from sortie.perception.uncertainty import BoxErrors, load_errors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import CELL_NAMES
 from sortie.scenarios.schema import Perception
-from sortie.scenarios.traces import NETWORKS, located
+from sortie.scenarios.shipped import CODEBOOK, ERRORS, NETWORKS, SHIPPED_WEIGHTS, beside, located
 
-SHIPPED_WEIGHTS = NETWORKS / "disconet.safetensors"
 KEPT_CAPTURES = 64
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")

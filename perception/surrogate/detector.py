@@ -13,7 +13,6 @@ from scipy.special import ndtri
 
 from sortie.perception import budget
 from sortie.perception.errors import InputError
-from sortie.perception.files import ERRORS, beside
 from sortie.perception.geometry import FULL
 from sortie.perception.joining import EgoSources, joined_many, source_of
 from sortie.perception.lateness import weighed
@@ -39,6 +38,7 @@ from sortie.perception.types import Boxes, Capture, Share
 from sortie.perception.uncertainty import BoxErrors, load_errors
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
+from sortie.scenarios.shipped import ERRORS, beside, calibration_of
 
 Job = tuple[Capture, Sequence[Share]]
 BATCH = 400
@@ -65,7 +65,7 @@ class SurrogateDetector:
         config: the scenario's `perception` section.
         seed, replication: key its draws. The draws for a drone, a moment and a car do not depend on what was sent, so
             policies flown on one seed get the same draws.
-        weights: a calibration's file; None takes the shipped one.
+        weights: a calibration's file, or a network's with its calibration beside it; None takes the shipped one.
 
     Raises:
         InputError: a calibration that is missing or broken, or of another fusion than `perception.fusion`.
@@ -77,7 +77,7 @@ class SurrogateDetector:
     def __init__(
         self, scene: SceneModel, config: Perception, seed: int, weights: Path | None = None, replication: int = 0
     ) -> None:
-        path = SHIPPED if weights is None else weights
+        path = SHIPPED if weights is None else calibration_of(weights)
         self._set(scene, config, load(path), seed, replication, scene.config.seed, path)
 
     @classmethod

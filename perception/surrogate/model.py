@@ -29,6 +29,7 @@ from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.draws import BANDS
 from sortie.perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from sortie.perception.surrogate.features import LOOK_COVARIATES, beside
+from sortie.scenarios.shipped import CALIBRATION, SHIPPED_WEIGHTS, calibration_of
 
 Singles = NDArray[np.float32]
 FORMAT = 6
@@ -44,7 +45,7 @@ NETS: dict[str, tuple[int, int]] = {
     "alarms": (len(ALARM_COVARIATES), BANDS),
 }
 """Inputs and outputs of each network."""
-SHIPPED = Path(__file__).parent / "weights" / "surrogate.safetensors"
+SHIPPED = calibration_of(SHIPPED_WEIGHTS)
 
 
 SPREAD = (-3.5, 2.0)
@@ -257,7 +258,9 @@ def load(path: Path) -> Parameters:
     except SafetensorError as error:
         raise InputError(f"{path}: no safetensors file: {error}") from error
     if "surrogate" not in metadata:
-        raise InputError(f"{path}: holds no calibration; `sortie calibrate` makes one")
+        raise InputError(
+            f"{path}: holds no calibration, and {path.stem}{CALIBRATION} is not beside it; `sortie calibrate` makes one"
+        )
     try:
         card = json.loads(metadata["surrogate"])
     except json.JSONDecodeError as error:

@@ -21,7 +21,7 @@ from sortie.scenarios.reading.nodes import plain as plain_value
 from sortie.scenarios.reading.strict_yaml import read_yaml
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import ModelName
-from sortie.scenarios.traces import located
+from sortie.scenarios.shipped import companions, located
 
 FIELDS = ("fleet.trace", "radio.trace", "perception.weights", "perception.codebook", "perception.recording")
 """Fields that name a file; so do the weights and the codebook of a make."""
@@ -110,8 +110,10 @@ def builtin(field: str) -> tuple[str, ...]:
 
 
 def named_files(sections: dict[str, Any]) -> list[str]:
-    """Every file that a scenario's plain sections name, as it is written there."""
-    return [_split(holder[key])[0] for holder, key in _places(sections)]
+    """Every file that a scenario's plain sections name, as it is written there, and those that belong to weights among them."""
+    named = [(key, _split(holder[key])[0]) for holder, key in _places(sections)]
+    beside = [str(path) for key, name in named if key == "weights" for path in companions(Path(name))]
+    return [name for _, name in named] + beside
 
 
 def with_files(sections: dict[str, Any], place: Callable[[str], str], folder: Path = HERE) -> dict[str, Any]:

@@ -78,7 +78,7 @@ class Perception(Section):
     )
     weights: str | None = Field(
         None,
-        description="A safetensors file: the network's, or the surrogate's calibration; left out, the shipped one. `fine.safetensors` names the second network that is shipped.",
+        description="A safetensors file: a network's. The surrogate takes the calibration beside it (`NAME.surrogate.safetensors`), or the file if it is one. Left out, the shipped network; `fine.safetensors` names the second shipped one.",
     )
     codebook: str | None = Field(
         None,

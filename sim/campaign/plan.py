@@ -34,7 +34,7 @@ from sortie.scenarios.reading.load import loads
 from sortie.scenarios.reading.nodes import ScenarioError, as_node, assign, plain
 from sortie.scenarios.schema import Perception
 from sortie.scenarios.schema.campaign import PARAMS, Campaign
-from sortie.scenarios.traces import located
+from sortie.scenarios.shipped import located
 from sortie.sim.campaign.spread import TAIL, Floats, design, drawn_fields, grid, quantile
 from sortie.sim.campaign.work import task_key
 from sortie.sim.engine.pilot import named_policy

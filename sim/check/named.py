@@ -10,7 +10,7 @@ from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plugins.reference import installed, is_file, resolve
 from sortie.scenarios.reading.files import models_with_params, named_files
 from sortie.scenarios.schema import Scenario
-from sortie.scenarios.traces import located
+from sortie.scenarios.shipped import located
 
 
 def not_there(scenario: Scenario) -> list[str]:

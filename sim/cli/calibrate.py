@@ -26,7 +26,11 @@ if TYPE_CHECKING:
 def calibrate(
     context: typer.Context,
     out_file: Annotated[
-        Path, typer.Option("--out", help="File for the calibration (safetensors); its card is written beside it.")
+        Path,
+        typer.Option(
+            "--out",
+            help="File for the calibration (safetensors), its card is written beside it. The surrogate finds `NET.surrogate.safetensors` where a flight names `NET.safetensors`.",
+        ),
     ] = Path("runs/calibrate/surrogate.safetensors"),
     weights: Annotated[Path | None, typer.Option(help="The detector's weights; default: the shipped ones.")] = None,
     scenes: Annotated[int, typer.Option(help="Number of scenes to fit to.", min=2)] = 44,

@@ -44,10 +44,10 @@ def fit_codebook(
 ) -> None:
     """Fit a codebook to a network's features: cells become codes of one byte a stage. Takes about two minutes."""
     from sortie.perception.benchmark.dataset import Benchmark  # here: torch takes a second to import
-    from sortie.perception.files import CODEBOOK, beside
     from sortie.perception.network.checkpoint import load_weights
     from sortie.perception.network.detector import named_weights
     from sortie.perception.training.codebook import CodebookRecipe, make_codebook
+    from sortie.scenarios.shipped import CODEBOOK, beside
 
     path = named_weights(weights)
     target = out_file or beside(path, CODEBOOK)
@@ -89,15 +89,16 @@ def fit_errors(
         refuse(context, ("bench_seed", "bench_dir"), "sortie fit errors torch")
     else:
         refuse(context, ("towns",), "sortie fit errors surrogate")
-    from sortie.perception.files import ERRORS, beside
     from sortie.perception.training import box_errors
     from sortie.perception.uncertainty import errors_text
+    from sortie.scenarios.shipped import ERRORS, beside
 
     with user_errors():
         if boxes is Boxes.surrogate:
             from sortie.perception.surrogate.model import SHIPPED
+            from sortie.scenarios.shipped import calibration_of
 
-            path = weights or SHIPPED
+            path = SHIPPED if weights is None else calibration_of(weights)
         else:
             from sortie.perception.network.detector import named_weights
 

@@ -14,7 +14,7 @@ from sortie.policies.contract import Policy
 from sortie.policies.registry import within_budget
 from sortie.scenarios.reading.files import named_files, named_models, placed, with_files
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
-from sortie.scenarios.traces import located
+from sortie.scenarios.shipped import located
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import file_digests
 from sortie.sim.campaign.work import RunResult, fly_function, task_key

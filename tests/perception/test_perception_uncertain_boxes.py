@@ -11,7 +11,6 @@ from perception_examples import cross
 
 from sortie.perception.budget import content_bytes
 from sortie.perception.errors import InputError
-from sortie.perception.files import ERRORS, beside
 from sortie.perception.intersection import intersect, inverse
 from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
 from sortie.perception.lateness import MOVING, SPEED_MPS
@@ -21,6 +20,7 @@ from sortie.perception.training.box_errors import Errors, calibration, common, e
 from sortie.perception.types import Boxes, Share
 from sortie.perception.uncertainty import BoxErrors, errors_text, load_errors, terms
 from sortie.scenarios.schema import Perception, Scene
+from sortie.scenarios.shipped import ERRORS, beside
 
 HERE = (0.0, 0.0, 0.0)
 FLAT = BoxErrors((np.log(0.6), 0, 0, 0, 0), (np.log(0.3), 0, 0, 0, 0), common=0.2)

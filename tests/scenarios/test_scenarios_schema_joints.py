@@ -34,7 +34,8 @@ from sortie.scenarios.schema import Expectation, Mission, Perception, PolicySect
 from sortie.scenarios.schema.base import models_of_the_past
 from sortie.scenarios.schema.campaign import Campaign
 from sortie.scenarios.schema.movement import FlightGroup
-from sortie.scenarios.traces import TraceError, check_increasing, located, read_columns
+from sortie.scenarios.shipped import located
+from sortie.scenarios.traces import TraceError, check_increasing, read_columns
 
 
 def scenario(text: str) -> Scenario:

@@ -12,7 +12,8 @@ from sortie.scenarios import context_traces as ct
 from sortie.scenarios.reading.campaign import load_campaign
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.reading.nodes import ScenarioError
-from sortie.scenarios.traces import TraceError, located, read_columns
+from sortie.scenarios.shipped import located
+from sortie.scenarios.traces import TraceError, read_columns
 
 
 def rows(name: str) -> list[dict[str, str]]:
@@ -58,10 +59,10 @@ def test_the_files_are_what_their_maker_writes(name: str) -> None:
 
 
 def test_a_shipped_trace_is_found_by_its_name() -> None:
-    path = located(ct.PAPER_120S.relative_to(ct.SHIPPED) / "links.csv")
+    path = located(ct.PAPER_120S.relative_to(ct.TRACES) / "links.csv")
     assert path == ct.PAPER_120S / "links.csv"
     with pytest.raises(TraceError, match="no such trace"):
-        read_columns(ct.SHIPPED / "nowhere.csv", {})
+        read_columns(ct.TRACES / "nowhere.csv", {})
 
 
 def test_drone_1_falls_through_both_thresholds() -> None:

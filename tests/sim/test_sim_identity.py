@@ -222,6 +222,18 @@ def test_own_weights_are_named_with_their_digest(tmp_path: Path) -> None:
     assert outcome(run_sortie(flown))["own_files"] == {str(weights): identity.file_digest(weights)[:16]}
 
 
+def test_another_calibration_beside_the_same_weights_is_another_sortie(tmp_path: Path) -> None:
+    weights, fitted = tmp_path / "mine.safetensors", tmp_path / "mine.surrogate.safetensors"
+    weights.touch()
+    fitted.write_bytes(CALIBRATION.read_bytes())
+    flown = example("duration_s=1", "perception.detector=surrogate", f"perception.weights={weights}")
+    before = identity.own_files(flown)
+    fitted.touch()
+    assert identity.own_files(flown) == before
+    fitted.write_bytes(b"another")
+    assert identity.own_files(flown) != before
+
+
 def test_a_folder_is_named_with_one_digest_of_its_files(tmp_path: Path) -> None:
     recording = tmp_path / "seen.zarr"
     recording.mkdir()

@@ -22,7 +22,6 @@ from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, 
 from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.evaluation.evaluate import Settings, exchanges, frame_keys, match_all
 from sortie.perception.evaluation.instrument import CarNetView
-from sortie.perception.files import CODEBOOK, ERRORS, beside
 from sortie.perception.geometry import CELLS, Geometry
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import EgoSources, Rule, joined_many, source_of
@@ -40,6 +39,7 @@ from sortie.perception.types import Capture, Share
 from sortie.perception.uncertainty import BoxErrors, load_errors
 from sortie.scenarios.intervals import percentile_interval, resamples
 from sortie.scenarios.schema import Perception
+from sortie.scenarios.shipped import CODEBOOK, ERRORS, beside
 
 PLAN = Path(__file__).with_name("representations.toml")
 TAU = Perception().score_threshold

@@ -14,7 +14,7 @@ from sortie.perception.budget import cells_in, content_bytes
 from sortie.perception.errors import InputError
 from sortie.perception.evaluation.contract import Exchange
 from sortie.perception.evaluation.instrument import CarNetView
-from sortie.perception.files import CODEBOOK, beside, codebook_digest
+from sortie.perception.files import codebook_digest
 from sortie.perception.network.checkpoint import load_weights, save_weights
 from sortie.perception.network.codebook import (
     ENTRIES,
@@ -29,6 +29,7 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.training.codebook import CodebookRecipe, card, fit
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene
+from sortie.scenarios.shipped import CODEBOOK, beside
 
 
 def drawn(stages: int = 3, seed: int = 0, *, rectified: bool = False) -> Codebook:

@@ -46,6 +46,7 @@ def jobs_at(t_s: float) -> list[DetectorJob]:
             DetectorJob(ego, maps, "zero", "confidence", "zeros"),
             DetectorJob(ego, maps, "masked", "norm", "norm"),
             DetectorJob(ego, boxes, "masked", "confidence", B, disc=DISC),
+            DetectorJob(ego, boxes, "masked", "confidence", "averaged", "average"),
         ]
     return out
 
@@ -60,7 +61,7 @@ def found(job: DetectorJob, draw: int, eyes: Eyes) -> tuple[Boxes, Boxes]:
 @pytest.fixture(scope="module")
 def judged() -> Iterator[tuple[CalibrationVerdict, Both]]:
     """The verdict over two replications where the other detector is the second of them, and what both found, by hand. The
-    other one has every car as well, by boxes that are too weak to count."""
+    other one has every car as well, by boxes that are too weak to count; where boxes are averaged none such are run."""
     eyes = Eyes(TOWN)
     runs, both = [], Both()
     for scene, t_s in enumerate((5.0, 9.0, 14.0)):
@@ -68,7 +69,8 @@ def judged() -> Iterator[tuple[CalibrationVerdict, Both]]:
         for job in jobs:
             draws = [found(job, draw, eyes) for draw in (0, 1)]
             mine, truth = draws[1]
-            answers.append(Boxes.join([mine, replace(truth, score=np.full_like(truth.score, 0.09))]))
+            weak = [replace(truth, score=np.full_like(truth.score, 0.09))] if job.join == "nms" else []
+            answers.append(Boxes.join([mine, *weak]))
             for name, disc in ((job.condition, None), (job.condition + IN_DISC, job.disc)):
                 if name.endswith(IN_DISC) and job.disc is None:
                     continue
@@ -87,7 +89,7 @@ def test_every_condition_is_judged_under_its_own_rules_and_in_its_own_disc(
 ) -> None:
     verdict, both = judged
     assert {v.condition for v in verdict.levels} == set(both)
-    assert {A + IN_DISC, B + IN_DISC, "maps", "zeros", "norm"} < set(both)
+    assert {A + IN_DISC, B + IN_DISC, "maps", "zeros", "norm", "averaged"} < set(both)
     for v in verdict.levels:
         theirs, ours = both[v.condition]
         torch, surrogate = average_precision(theirs), average_precision(ours)

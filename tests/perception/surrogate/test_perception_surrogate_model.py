@@ -65,7 +65,7 @@ def broken(path: Path, card: object = CARD, **changes: np.ndarray | None) -> Pat
 @pytest.mark.parametrize(
     ("card", "changes", "says"),
     [
-        (None, {}, "holds no calibration; `sortie calibrate` makes one"),
+        (None, {}, "holds no calibration, and c.surrogate.safetensors is not beside it; `sortie calibrate` makes one"),
         ("{", {}, "its card is no JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1)"),
         ({**CARD, "format": 7}, {}, f"format is 7, must be {FORMAT}; calibrate again"),
         ({**CARD, "fusion": 3}, {}, "card.fusion is 3, must be text"),

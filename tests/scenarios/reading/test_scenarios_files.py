@@ -16,7 +16,7 @@ from sortie.scenarios.reading.files import (
     without_brackets,
 )
 from sortie.scenarios.reading.load import ScenarioError, build, load, loads
-from sortie.scenarios.traces import SHIPPED, located
+from sortie.scenarios.shipped import TRACES, located
 
 TEXT = """
 name: own
@@ -113,9 +113,9 @@ def test_a_file_of_one_s_own_goes_before_a_shipped_one_of_its_name(
 ) -> None:
     name = Path("paper_120s/links.csv")
     monkeypatch.chdir(tmp_path)
-    assert located(name) == SHIPPED / name
+    assert located(name) == TRACES / name
     name.parent.mkdir()
-    assert located(name) == SHIPPED / name  # a folder is no trace
+    assert located(name) == TRACES / name  # a folder is no trace
     name.touch()
     assert located(name) == name
 

@@ -555,10 +555,10 @@ def other_codebook(path):  # type: ignore[no-untyped-def]
     """The shipped codebook with its entries in another order, so that a code's bytes mean coarser cells."""
     from dataclasses import replace
 
-    from sortie.perception.files import CODEBOOK, beside
     from sortie.perception.network.checkpoint import load_weights
     from sortie.perception.network.codebook import load_codebook, save_codebook
     from sortie.perception.network.detector import SHIPPED_WEIGHTS
+    from sortie.scenarios.shipped import CODEBOOK, beside
 
     codebook = load_codebook(beside(SHIPPED_WEIGHTS, CODEBOOK), load_weights(SHIPPED_WEIGHTS))
     save_codebook(replace(codebook, stages=codebook.stages.flip(0)), path, {})

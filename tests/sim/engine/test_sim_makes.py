@@ -20,7 +20,7 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, Representation
 from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Scenario
-from sortie.scenarios.traces import located
+from sortie.scenarios.shipped import located
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.bag import descriptors
 from sortie.sim.results.outcome import outcome
