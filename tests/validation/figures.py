@@ -29,6 +29,7 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Policy, Representation
 from sortie.scenarios.intervals import SHARE, mean_interval
 from sortie.scenarios.reading.load import load, load_conditions
+from sortie.scenarios.shipped import SHIPPED_WEIGHTS
 from sortie.sim.folders import write_text
 
 PICTURES = ROOT / "docs/validation"
@@ -47,6 +48,8 @@ class Figure:
     """None where a command writes its own tables and pages."""
     timed: bool = False
     """Times of this host are measured; the page names it."""
+    network: bool = False
+    """What the default network, or its surrogate, finds is measured; the page names it."""
 
 
 # --- by the scripts beside this one -----------------------------------------------------------------
@@ -94,7 +97,6 @@ def _fusion_age() -> Tables:
     import fusion_age
 
     from sortie.perception.network.checkpoint import load_weights
-    from sortie.perception.network.detector import SHIPPED_WEIGHTS
 
     rows = fusion_age.measure(load_weights(SHIPPED_WEIGHTS), scenes=16, frames=2)
     return {
@@ -120,7 +122,6 @@ def _fusion_methods() -> Tables:
 
     from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
     from sortie.perception.network.checkpoint import load_weights
-    from sortie.perception.network.detector import SHIPPED_WEIGHTS
 
     files = {"disconet": SHIPPED_WEIGHTS}
     for method in ("fcooper", "where2comm", "v2vnet"):
@@ -455,7 +456,6 @@ def _points(name: str, form: str = "+.1f") -> Iterator[Column]:
 
 def _difficulty() -> Tables:
     from sortie.perception.evaluation.difficulty_effects import SEED, measure
-    from sortie.perception.network.detector import SHIPPED_WEIGHTS
 
     rows = [
         [
@@ -710,44 +710,44 @@ def speed_table(benchmarks: Sequence[Mapping[str, Any]]) -> Table:
 
 FIGURES: dict[str, Figure] = {
     "hysteresis": Figure(0.2, _hysteresis),
-    "mixed_fleet": Figure(1, _mixed_fleet),
+    "mixed_fleet": Figure(1, _mixed_fleet, network=True),
     "overhead": Figure(0.5, _overhead, timed=True),
     "energy": Figure(0.5, _energy),
     "flight": Figure(0.5, _flight),
     "survey": Figure(1, _survey),
     "views_cost": Figure(0.5, _views_cost, timed=True),
     "disagreement": Figure(2, _disagreement),
-    "learned_example": Figure(10, _learned_example),
-    "compare": Figure(2, _compare),
-    "coverage": Figure(0.5, _coverage),
-    "price": Figure(0.2, _price, timed=True),
+    "learned_example": Figure(10, _learned_example, network=True),
+    "compare": Figure(2, _compare, network=True),
+    "coverage": Figure(0.5, _coverage, network=True),
+    "price": Figure(0.2, _price, timed=True, network=True),
     "half_width": Figure(1, _half_width),
-    "worked_over_silence": Figure(2, _worked_over_silence),
-    "viewpoints": Figure(2, _viewpoints),
-    "join_rules": Figure(4, _join_rules),
-    "where_boxes_average": Figure(3, _where_boxes_average),
+    "worked_over_silence": Figure(2, _worked_over_silence, network=True),
+    "viewpoints": Figure(2, _viewpoints, network=True),
+    "join_rules": Figure(4, _join_rules, network=True),
+    "where_boxes_average": Figure(3, _where_boxes_average, network=True),
     "live": Figure(3.5, _live, timed=True),
-    "track_prediction": Figure(4, _track_prediction),
+    "track_prediction": Figure(4, _track_prediction, network=True),
     "radio_scale": Figure(3, _radio_scale, timed=True),
-    "liars": Figure(4, _liars),
-    "context_forms": Figure(4, _context_forms),
-    "fusion_age": Figure(4, _fusion_age),
-    "late_shares": Figure(2, _late_shares),
-    "representations": Figure(4, _representations),
+    "liars": Figure(4, _liars, network=True),
+    "context_forms": Figure(4, _context_forms, network=True),
+    "fusion_age": Figure(4, _fusion_age, network=True),
+    "late_shares": Figure(2, _late_shares, network=True),
+    "representations": Figure(4, _representations, network=True),
     "link": Figure(5, _link),
     "ns3": Figure(15, _ns3, timed=True),
     "ns3_drawn": Figure(5, _ns3_drawn, timed=True),
-    "transport": Figure(6, _transport),
+    "transport": Figure(6, _transport, network=True),
     "paper": Figure(8, _paper),
-    "conditions_first": Figure(8, _conditions_first),
-    "inference_libraries": Figure(2, _inference_libraries, timed=True),
+    "conditions_first": Figure(8, _conditions_first, network=True),
+    "inference_libraries": Figure(2, _inference_libraries, timed=True, network=True),
     "campaign_scale": Figure(10, _campaign_scale, timed=True),
     "speed": Figure(12, _speed, timed=True),
-    "difficulty": Figure(12, _difficulty),
-    "surrogate_in_flight": Figure(45, _surrogate_in_flight),
-    "arms": Figure(20, _arms),
-    "ranking": Figure(10, _ranking, timed=True),
-    "ranking_by_torch": Figure(20, _ranking_by_torch),
+    "difficulty": Figure(12, _difficulty, network=True),
+    "surrogate_in_flight": Figure(45, _surrogate_in_flight, network=True),
+    "arms": Figure(20, _arms, network=True),
+    "ranking": Figure(10, _ranking, timed=True, network=True),
+    "ranking_by_torch": Figure(20, _ranking_by_torch, network=True),
     "handshakes": Figure(5, _handshakes),
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
@@ -756,7 +756,7 @@ FIGURES: dict[str, Figure] = {
     "fine_flights": Figure(20, _fine_flights),
     "fusion_methods": Figure(25, _fusion_methods),
     "paper_seeds": Figure(30, _paper_seeds),
-    "held_out": Figure(30, _held_out),
+    "held_out": Figure(30, _held_out, network=True),
     "study": Figure(60, _study),
     "doses": Figure(45, _doses),
 }
@@ -871,7 +871,8 @@ def main() -> None:
         begin_s = time.monotonic()
         found = FIGURES[name].measure()
         if found is not None:
-            save(name, found, _host() if FIGURES[name].timed else "")
+            network = SHIPPED_WEIGHTS.name if FIGURES[name].network else ""
+            save(name, found, _host() if FIGURES[name].timed else "", network)
         sys.stdout.write(f"{name} measured in {(time.monotonic() - begin_s) / 60:.1f} min\n")
         sys.stdout.flush()
     for page in render():

@@ -1,7 +1,7 @@
 """Measured tables: as they are stored in docs/results/tables, and as Markdown on the pages.
 
 A file NAME.json holds what `make figures FIGURE=NAME` measured: its tables in full precision, the version of Sortie that
-measured them, the day, and the hardware where times are measured. A page shows a table between `<!-- TABLE:begin -->`
+measured them, the day, the network where its accuracy counts, and the hardware where times are measured. A page shows a table between `<!-- TABLE:begin -->`
 and `<!-- TABLE:end -->`.
 """
 
@@ -92,10 +92,16 @@ def points(difference: Difference) -> tuple[float, float, float]:
     return difference.delta, difference.low, difference.high
 
 
-def save(name: str, tables: Mapping[str, Table | str], hardware: str = "", folder: Path = FOLDER) -> None:
-    """Store what was measured just now; a table that a command printed as Markdown is kept as text."""
+def save(
+    name: str, tables: Mapping[str, Table | str], hardware: str = "", network: str = "", folder: Path = FOLDER
+) -> None:
+    """Store what was measured just now; a table that a command printed as Markdown is kept as text.
+
+    Args: `hardware`: where times are measured. `network`: the weights by which a table's accuracy was measured.
+    """
     made = {"sortie": code_version(), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
-    store(name, tables, made | ({"hardware": hardware} if hardware else {}), folder)
+    more = {"network": network, "hardware": hardware}
+    store(name, tables, made | {key: value for key, value in more.items() if value}, folder)
 
 
 def store(name: str, tables: Mapping[str, Table | str], made: Mapping[str, str], folder: Path = FOLDER) -> None:
@@ -128,7 +134,10 @@ def sections(name: str, folder: Path = FOLDER) -> dict[str, str]:
     """
     stored = json.loads((folder / f"{name}.json").read_text("utf-8"))
     hardware = f", on {stored['hardware']}" if "hardware" in stored else ""
-    made = f"*Made by `make figures FIGURE={name}` with Sortie {stored['sortie']}, {stored['date']}{hardware}.*"
+    network = f", network `{stored['network']}`" if "network" in stored else ""
+    made = (
+        f"*Made by `make figures FIGURE={name}` with Sortie {stored['sortie']}, {stored['date']}{network}{hardware}.*"
+    )
     found = {}
     for title, one in stored["tables"].items():
         if isinstance(one, list):
