@@ -50,6 +50,9 @@ from sortie.scenarios.schema import Perception
 from sortie.scenarios.shipped import CODEBOOK, ERRORS, NETWORKS, SHIPPED_WEIGHTS, beside, located
 
 KEPT_CAPTURES = 64
+LEAST_READ = 0.2
+"""The share of a map's cells, of those in its region, from which it is read alone. On the validation split, reading a quarter
+gains 1 to 3 points of AP, reading a tenth loses."""
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")
 
@@ -174,10 +177,9 @@ class TorchDetector:
         for share in shared:
             if share.representation == "codes":
                 self._read_codes(share, known)
-        if self._shares == "boxes" or match:
-            for share in shared:
-                if share.is_map:
-                    self._head_in_part(share, known)
+        for share in shared:
+            if share.is_map and (self._shares == "boxes" or match or self._is_read(share)):
+                self._head_in_part(share, known)
         now = {ego.drone: ego for ego, _ in jobs}
         # a copy: later requests queue behind these tasks, and no task may wait for them
         known = {capture: replace(kept) for capture, kept in known.items()}
@@ -307,12 +309,20 @@ class TorchDetector:
     def _is_fused(self, share: Share) -> bool:
         return self._shares == "features" and share.is_map
 
+    def _is_read(self, share: Share) -> bool:
+        """Whether the boxes of a map that came are found in it alone as well: enough of it is there."""
+        if not self._config.read_maps or self._shares != "features":
+            return False
+        pose = share.capture.est_pose
+        whole, came = (budget.cells_sent(rho, share.roi, *pose) for rho in (1.0, share.rho))
+        return share.representation == "raw" or came - len(share.missing) >= LEAST_READ * whole
+
     def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
         maps = [s for s in shares if self._is_fused(s) and s.weight > 0.0]
         boxed = [s for s in shares if not self._is_fused(s) and s.weight > 0.0]
         silent = self._silent(ego, maps, now) if maps or ego.looked else []
-        late = [self._source(s, now, known) for s in boxed]
+        late = [self._source(s, self._map_pose(s, now), known) for s in boxed]
         place, places = ego.est_pose, [self._map_pose(s, now) for s in maps]
         if self._config.match_poses:
             place, places, late = self._matched(ego, maps, places, late, known)
@@ -326,7 +336,8 @@ class TorchDetector:
             own = alone.result().moved(ego.est_pose, place)
         else:
             own = self._place(self._head(known[ego].maps.result()[None]), place)
-        sources = EgoSources.of(ego, shares, own, bool(maps) and out is not None, late)
+        read = [self._source(s, at, known) for s, at in zip(maps, places, strict=True) if self._is_read(s)]
+        sources = EgoSources.of(ego, shares, own, bool(maps) and out is not None, [*late, *read], len(read))
         if any(s.covariance_m2 is not None for s in late):
             sources = sources._replace(errors=self._own_errors)
         return joined_many([sources], self._config.join, self._config.common_share)[0]
@@ -425,10 +436,11 @@ class TorchDetector:
         capture = share.capture if self._config.motion_compensation else now.get(share.capture.drone, share.capture)
         return capture.est_pose
 
-    def _source(self, share: Share, now: Mapping[int, Capture], known: Known) -> SourceBoxes:
-        """The boxes that a share adds: those that were sent or, in late fusion, those detected in the cells that were sent."""
+    def _source(self, share: Share, lies: Pose, known: Known) -> SourceBoxes:
+        """The boxes that a share adds: those that were sent, or those detected in the cells that were sent, of a map that lies
+        there."""
         if share.is_map:
-            lies, part = self._map_pose(share, now), _part(share)
+            part = _part(share)
             out = known[share.capture].in_part[part].result()
             cut = share.representation != "raw" and _is_ranked(share)
             boxes = self._sendable(self._place(out, lies))

@@ -47,8 +47,9 @@ class RecordedDetector:
     def __init__(self, config: Perception) -> None:
         if config.absent_peers != "excluded":
             raise InputError(f"perception.absent_peers is {config.absent_peers!r}, must be excluded for a recording")
-        if config.match_poses:
-            raise InputError("perception.match_poses is true, must be false for a recording")
+        for option in ("match_poses", "read_maps"):
+            if getattr(config, option):
+                raise InputError(f"perception.{option} is true, must be false for a recording")
         self._recording = rec = open_recording(Path(config.recording or ""))
         self._config = config
         self._fuse = None if config.recorded_fusion is None else resolve("recorded_fusion", config.recorded_fusion)

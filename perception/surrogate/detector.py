@@ -116,8 +116,9 @@ class SurrogateDetector:
             raise InputError(
                 f"perception.absent_peers is {config.absent_peers!r}: {name} was calibrated without them, must be excluded"
             )
-        if config.match_poses:
-            raise InputError(f"perception.match_poses is true: {name} was calibrated without it, must be false")
+        for option in ("match_poses", "read_maps"):
+            if getattr(config, option):
+                raise InputError(f"perception.{option} is true: {name} was calibrated without it, must be false")
         if config.serve != "grid":
             raise InputError(f"perception.serve is {config.serve!r}: {name} was calibrated without it, must be grid")
         self.parameters, self.calibration, self._path = parameters, parameters.id, path

@@ -123,6 +123,10 @@ class Perception(Section):
         "average",
         description="How boxes of several drones become one list: of those that overlap, their weighted mean (average), or only the best (nms).",
     )
+    read_maps: bool = Field(
+        False,
+        description="Receivers also detect in each received map by itself, and join these boxes with those of the fused maps (the torch detector's).",
+    )
     match_poses: bool = Field(
         False,
         description="Receivers correct the poses of all drones that they hear, and their own, by the cars that these have in common, before they fuse (the torch detector's).",

@@ -44,6 +44,7 @@ UNUSED = (
     "perception.motion_compensation",
     "perception.join",
     "perception.match_poses",
+    "perception.read_maps",
     "perception.common_errors",
     "perception.score_threshold",
     "perception.cells_by",

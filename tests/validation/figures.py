@@ -476,6 +476,12 @@ def _fine_network() -> Tables:
     return fine_network.tables(ROOT / "runs/bench", ROOT / "docs/results/fine_network.png")
 
 
+def _read_maps() -> Tables:
+    import read_maps
+
+    return read_maps.tables()
+
+
 def _fine_fleets() -> Tables:
     import fine_network
 
@@ -752,6 +758,7 @@ FIGURES: dict[str, Figure] = {
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
     "fine_network": Figure(7, _fine_network),
+    "read_maps": Figure(12, _read_maps),
     "fine_fleets": Figure(5, _fine_fleets),
     "fine_flights": Figure(20, _fine_flights),
     "fusion_methods": Figure(25, _fusion_methods),

@@ -83,11 +83,10 @@ def test_a_drone_that_hears_nobody_keeps_its_pose() -> None:
     np.testing.assert_array_equal(matched.table(), plain.table())
 
 
-def test_the_surrogate_and_recordings_refuse_it() -> None:
-    scene = SceneModel(Scene(), None, (-50, -50, 50, 50))
-    with pytest.raises(
-        InputError, match=r"perception.match_poses is true: .* was calibrated without it, must be false"
-    ):
-        SurrogateDetector(scene, Perception(detector="surrogate", match_poses=True), 1)
-    with pytest.raises(InputError, match=r"perception\.match_poses is true, must be false for a recording"):
-        RecordedDetector(Perception(detector="recorded", recording="seen.npz", match_poses=True))
+@pytest.mark.parametrize("option", ["match_poses", "read_maps"])
+def test_the_surrogate_and_recordings_refuse_it(option: str) -> None:
+    scene, on = SceneModel(Scene(), None, (-50, -50, 50, 50)), {option: True}
+    with pytest.raises(InputError, match=rf"perception.{option} is true: .* was calibrated without it, must be false"):
+        SurrogateDetector(scene, Perception(detector="surrogate", **on), 1)
+    with pytest.raises(InputError, match=rf"perception\.{option} is true, must be false for a recording"):
+        RecordedDetector(Perception(detector="recorded", recording="seen.npz", **on))
