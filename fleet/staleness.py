@@ -43,11 +43,11 @@ def cap_by_age(directive: Directive, link: LinkHealth, age_s: float | None) -> D
         return Directive(
             directive.source, directive.destination, duty_percent=directive.duty_percent, reason=f"detached: {age}"
         )
-    if directive.representation <= Representation.DETECTIONS and directive.rate_hz <= DEGRADED_RATE_HZ:
-        return directive
     more = directive.representation > Representation.DETECTIONS  # also boxes with uncertainty: they lose it
+    if not more and directive.rate_hz <= DEGRADED_RATE_HZ:
+        return directive
     return directive._replace(
-        representation=min(directive.representation, Representation.DETECTIONS),
+        representation=Representation.DETECTIONS if more else directive.representation,
         rho=0.0 if more else directive.rho,
         rate_hz=min(directive.rate_hz, DEGRADED_RATE_HZ),
         reason=f"degraded: {age}",

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from sortie.policies.contract import Descriptor, Directive, FleetView
 from sortie.policies.verification.invariants import (
@@ -23,10 +24,11 @@ from sortie.policies.verification.invariants import (
     Number,
     walk,
 )
+from sortie.policies.verification.links import AT, Link, as_link
 from sortie.policies.verification.words import DECISIONS, WORDS
 from sortie.scenarios.plain_sum import plain_sum
 
-Ask = Callable[["Context", Directive], Any]
+Ask = Callable[["Context", Link], Any]
 """The value of an expression in a context, for one link."""
 Compare = Callable[[Any, Any], Any]
 _COMPARE: dict[str, Compare] = {
@@ -35,11 +37,6 @@ _COMPARE: dict[str, Compare] = {
 _ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {"+": operator.add, "-": operator.sub, "*": operator.mul}
 _OPPOSITE = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "==": "!=", "!=": "=="}
 _MIRRORED = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "==": "==", "!=": "!="}
-READ: dict[str, Callable[[Directive], Any]] = {word: cast(Any, field.raw) for word, field in DECISIONS.items()} | {
-    word: operator.itemgetter(Directive._fields.index(word))
-    for word in ("rho", "rate_hz", "deadline_s", "fusion_weight")
-}
-"""The value of a directive's field, as lines compare it."""
 _MOST_WAYS = 64
 """A part with more alternatives is not taken apart: the shield then changes single fields of it."""
 
@@ -47,23 +44,21 @@ _MOST_WAYS = 64
 class Context:
     """What lines are judged on. Values that depend on the view or on a peer alone are worked out once."""
 
-    __slots__ = ("_witness", "directives", "fresh", "known", "me", "view")
+    __slots__ = ("_witness", "fresh", "known", "links", "me", "view")
 
-    def __init__(
-        self, view: FleetView, me: Descriptor, directives: Sequence[Directive], fresh: Mapping[int, Directive]
-    ) -> None:
-        self.view, self.me, self.directives, self.fresh = view, me, directives, fresh
+    def __init__(self, view: FleetView, me: Descriptor, links: Sequence[Link], fresh: Mapping[int, Link]) -> None:
+        self.view, self.me, self.links, self.fresh = view, me, links, fresh
         self.known: dict[Any, Any] = {}
         self._witness: dict[Ask, int | None] = {}
 
-    def having(self, k: int, directive: Directive) -> Context:
-        """The same with another directive for link k."""
-        links = (*self.directives[:k], directive, *self.directives[k + 1 :])
-        found, mine = Context(self.view, self.me, links, self.fresh), directive.destination
+    def having(self, k: int, link: Link) -> Context:
+        """The same with another link k."""
+        links = (*self.links[:k], link, *self.links[k + 1 :])
+        found, mine = Context(self.view, self.me, links, self.fresh), link.destination
         found.known = self.known
         for condition, witness in self._witness.items():
             if witness is None or witness == mine:
-                if condition(self, directive):
+                if condition(self, link):
                     found._witness[condition] = mine
                 elif witness is None:
                     found._witness[condition] = None
@@ -74,23 +69,23 @@ class Context:
     def others(self, condition: Ask, mine: int) -> bool:
         """Whether a link to another peer than `mine` satisfies a condition."""
         if condition not in self._witness:
-            self._witness[condition] = next((d.destination for d in self.directives if condition(self, d)), None)
+            self._witness[condition] = next((x.destination for x in self.links if condition(self, x)), None)
         witness = self._witness[condition]
         if witness != mine:
             return witness is not None
-        return any(d.destination != mine and condition(self, d) for d in self.directives)
+        return any(x.destination != mine and condition(self, x) for x in self.links)
 
 
 class Claim(NamedTuple):
     """A comparison, or a word that is true or false."""
 
     holds: Ask
-    fields: tuple[str, ...]
-    """The fields of the link's own directive that it depends on."""
+    fields: tuple[int, ...]
+    """The places of the fields of the link itself that it depends on."""
     compare: Compare | None = None
     """Of a claim about one field: how the field compares with `value`."""
     value: Ask | None = None
-    """Of a claim about one field: the other side, which depends on no field of the link's directive."""
+    """Of a claim about one field: the other side, which depends on no field of the link."""
     gap: Ask | None = None
     """Of a comparison of several fields: left side less right side."""
 
@@ -111,22 +106,27 @@ class Part(NamedTuple):
     """Whether it depends on other links' directives."""
 
 
-class Rule(NamedTuple):
-    """One line."""
+@dataclass(frozen=True, eq=False)
+class Rule:
+    """One line. A condition that depends on directives is within the parts."""
 
     invariant: Invariant
-    when: Ask | None
-    """The condition, if it depends on no directive; a condition that does is within the parts."""
-    when_of_peer: bool
+    when_of_view: Ask | None
+    """What of the condition is the same for all links."""
+    when_of_peer: Ask | None
+    """What of the condition depends on the link's peer."""
     parts: tuple[Part, ...]
+    sides: tuple[Ask, ...]
+    """The other side of each part that bounds a field."""
     of_link: bool
     of_links: bool
     """Whether one link alone does not decide it."""
 
-    def holds(self, context: Context, link: Directive) -> bool:
+    def holds(self, context: Context, link: Link) -> bool:
         """Whether the line holds for a link, or for all of them if it is about all."""
-        if self.when is not None and not self.when(context, link):
-            return True
+        for when in (self.when_of_view, self.when_of_peer):
+            if when is not None and not when(context, link):
+                return True
         return all(part.holds(context, link) for part in self.parts)
 
 
@@ -138,11 +138,13 @@ def compiled(invariant: Invariant) -> Rule:
     apart = tuple(node for node in conditions if not _depends(node))
     within = tuple(node for node in conditions if _depends(node))
     found = tuple(_part(node, within) for node in parts)
+    of_view, of_peer = ([node for node in apart if _is_of_peer(node) == wanted] for wanted in (False, True))
     return Rule(
         invariant,
-        _ask(Logic("and", apart)) if apart else None,
-        any(_is_of_peer(node) for node in apart),
+        _ask(Logic("and", tuple(of_view))) if of_view else None,
+        _ask(Logic("and", tuple(of_peer))) if of_peer else None,
         found,
+        tuple([part.bound.value for part in found if part.bound is not None and part.bound.value is not None]),
         invariant.of_link,
         not invariant.of_link or any(part.of_links for part in found),
     )
@@ -197,7 +199,7 @@ def _ways(node: Node, wanted: bool) -> tuple[tuple[Claim, ...], ...]:
 
 
 def _claim_of(node: Node, wanted: bool) -> Claim:
-    fields = tuple(dict.fromkeys(n.word for n in walk(node) if isinstance(n, Name) and n.word in DECISIONS))
+    fields = tuple(dict.fromkeys(AT[n.word] for n in walk(node) if isinstance(n, Name) and n.word in DECISIONS))
     if isinstance(node, Name):
         holds = _ask(node) if wanted else _not(_ask(node))
         return Claim(holds, fields, operator.eq, lambda _, __: float(wanted)) if fields else Claim(holds, ())
@@ -205,7 +207,7 @@ def _claim_of(node: Node, wanted: bool) -> Claim:
         sign = node.sign if wanted else _OPPOSITE[node.sign]
         holds = _binary(sign, node.left, node.right)
         for side, other, how in ((node.left, node.right, sign), (node.right, node.left, _MIRRORED[sign])):
-            if isinstance(side, Name) and fields == (side.word,) and not _depends(other):
+            if isinstance(side, Name) and fields == (AT.get(side.word),) and not _depends(other):
                 return Claim(holds, fields, _COMPARE[how], _ask(other))
         return Claim(holds, fields, gap=_binary("-", node.left, node.right))
     return Claim(_ask(node) if wanted else _not(_ask(node)), fields)
@@ -247,14 +249,14 @@ def _ask(node: Node) -> Ask:
 
 def _word(word: str) -> Ask:
     if word in DECISIONS:
-        read = READ[word]
-        return lambda _, link: read(link)
+        at = AT[word]
+        return lambda _, link: link[at]
     found = WORDS[word]
     if found.raw is not None:
         of_peer = found.raw
         return lambda context, link: of_peer(context, link.destination)
 
-    def ask(context: Context, _: Directive) -> Any:
+    def ask(context: Context, _: Link) -> Any:
         known = context.known
         if word not in known:
             known[word] = found.value(context)  # type: ignore[arg-type]
@@ -264,9 +266,9 @@ def _word(word: str) -> Ask:
 
 
 def _fresh(field: Ask) -> Ask:
-    def ask(context: Context, link: Directive) -> Any:
+    def ask(context: Context, link: Link) -> Any:
         known = context.fresh.get(link.destination)
-        return field(context, Directive(link.source, link.destination) if known is None else known)
+        return field(context, as_link(Directive(-1, link.destination)) if known is None else known)
 
     return ask
 
@@ -290,8 +292,8 @@ def _logic(word: str, parts: tuple[Ask, ...]) -> Ask:
 def _binary(sign: str, left: Node, right: Node) -> Ask:
     compare = _COMPARE.get(sign)
     if compare is not None and isinstance(left, Name) and left.word in DECISIONS and isinstance(right, Number):
-        read, bound = READ[left.word], right.value
-        return lambda _, link: compare(read(link), bound)
+        at, bound = AT[left.word], right.value
+        return lambda _, link: compare(link[at], bound)
     a = _ask(left)
     if compare is not None and isinstance(right, Number):
         value = right.value
@@ -301,7 +303,7 @@ def _binary(sign: str, left: Node, right: Node) -> Ask:
         return lambda context, link: compare(a(context, link), b(context, link))
     if sign == "/":
 
-        def divide(context: Context, link: Directive) -> Any:
+        def divide(context: Context, link: Link) -> Any:
             below = b(context, link)
             return float("inf") if below == 0 else a(context, link) / below
 
@@ -311,15 +313,15 @@ def _binary(sign: str, left: Node, right: Node) -> Ask:
 
 
 def _over_links(function: str, body: Ask) -> Ask:
-    # The link's own directive may be another one than is listed: one that is tried in its place.
+    # The link may be another one than is listed: one that is tried in its place.
     if function == "any_link":
         others = _other_links(body)
         return lambda context, link: body(context, link) or others(context, link)
     if function == "every_link":
-        return lambda context, _: all(body(context, d) for d in context.directives)
+        return lambda context, _: all(body(context, d) for d in context.links)
     if function == "count_links":
-        return lambda context, _: sum([1 if body(context, d) else 0 for d in context.directives])
-    return lambda context, _: plain_sum([body(context, d) for d in context.directives])
+        return lambda context, _: sum([1 if body(context, d) else 0 for d in context.links])
+    return lambda context, _: plain_sum([body(context, d) for d in context.links])
 
 
 def _other_links(body: Ask) -> Ask:

@@ -26,6 +26,7 @@ import ast
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from sortie.policies.contract import Directive, FleetView, Representation
@@ -216,6 +217,7 @@ def parse(text: str) -> tuple[Invariant, ...]:
     return tuple(found)
 
 
+@lru_cache(maxsize=256)  # equal lines are one object: a shield looks its lines up at every decision
 def _parse_line(line: str) -> Invariant:
     when = None
     requirement = line

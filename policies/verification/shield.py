@@ -16,13 +16,17 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
+from itertools import repeat
 from typing import Any, NamedTuple
 
 from sortie.policies.checks import check_directives
-from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, FleetView, Policy, Representation
-from sortie.policies.verification.compiled import Context, Rule, compiled
+from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetView, Policy, Representation
+from sortie.policies.verification.boxes import Box, box_of
+from sortie.policies.verification.compiled import Context, Part, Rule, compiled
 from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, Recent, just_heard
-from sortie.policies.verification.nearest import Box, Far, distance, nearest
+from sortie.policies.verification.links import Far, Link, as_directive, as_link, distance
+from sortie.policies.verification.nearest import nearest
 from sortie.policies.verification.words import CHANGES
 from sortie.scenarios.representation import LEVELS, NAME_OF
 
@@ -114,44 +118,64 @@ def enforce(
     me = view.me
     if me is None or not rules or not decided:
         return list(decided)
-    known = {d.destination: d for d in fresh}
-    context, lines = Context(view, me, decided, known), [compiled(rule) for rule in rules]
+    lines = _compiled(tuple(rules))
+    known = {d.destination: as_link(d) for d in fresh}
+    was = [as_link(d) for d in decided]
+    context = Context(view, me, was, known)
     boxes = _Boxes([line for line in lines if not line.of_links], context, decided, cap)
-    directives, all_kept = _keep_alone(context, decided, boxes)
+    directives, links, all_kept = _keep_alone(context, decided, boxes)
     several = [line for line in lines if line.of_links]
     if several:
         if any(line.of_link for line in several):
             boxes = _Boxes([line for line in lines if line.of_link], context, decided, cap)
-        together = _Together(Context(view, me, directives, known), decided, several, boxes)
+        together = _Together(Context(view, me, links, known), was, several, boxes)
         all_kept = together.keep_all() and all_kept
-        directives = together.directives()
+        links = together.change(directives, decided)
     if not all_kept:
-        context = Context(view, me, tuple(directives), known)
-        for k, directive in enumerate(directives):
-            lost = [line.invariant for line in lines if not line.holds(context, directive)]
-            directives[k] = _not_replaced(directive, lost) if lost else directive
+        context = Context(view, me, links, known)
+        for k, link in enumerate(links):
+            lost = [line.invariant for line in lines if not line.holds(context, link)]
+            directives[k] = _not_replaced(directives[k], lost) if lost else directives[k]
     return directives
 
 
-def _keep_alone(context: Context, decided: Sequence[Directive], boxes: _Boxes) -> tuple[list[Directive], bool]:
-    """The links, those changed that break a line about one link; and whether all of these lines are kept."""
-    links, all_kept = list(decided), True
-    for k, directive in enumerate(decided):
+@lru_cache(maxsize=64)
+def _compiled(rules: tuple[Invariant, ...]) -> tuple[Rule, ...]:
+    return tuple([compiled(rule) for rule in rules])
+
+
+def _keep_alone(
+    context: Context, decided: Sequence[Directive], boxes: _Boxes
+) -> tuple[list[Directive], list[Link], bool]:
+    """The directives, those changed that break a line about one link; as links too; and whether all of these lines are kept."""
+    directives, links, all_kept = list(decided), list(context.links), True
+    region = context.me.region
+    seen: dict[Any, tuple[tuple[int, ...], dict[Box, Link | None]]] = {}
+    for k, link in enumerate(context.links):
         box = boxes.of[k]
-        key = box.key(directive) or k
-        if key not in box.broken_by:
-            box.broken_by[key] = box.broken(context, directive)
-        broken = box.broken_by[key]
+        key = box, box.key(link) or k
+        known = seen.get(key)
+        if known is None:
+            known = seen[key] = box.broken(context, link), {}
+        broken, nearest_to = known
         if broken:
             within = boxes.capped(k)
-            if key not in within.nearest_to:
-                within.nearest_to[key] = nearest(directive, within, (), context, boxes.allowed)
-            after = within.nearest_to[key]
+            if within not in nearest_to:
+                nearest_to[within] = boxes.nearest(k, within, (), context)
+            after = nearest_to[within]
             if after is None:
                 all_kept = False
-            else:
-                links[k] = _replaced(directive, after, broken)
-    return links, all_kept
+                continue
+            if after.destination != link.destination:
+                after = Link(*after[:-1], link.destination)
+            directives[k] = _replaced(decided[k], link, after, region, _texts(box, broken))
+            links[k] = after
+    return directives, links, all_kept
+
+
+@lru_cache(maxsize=1024)
+def _texts(box: Box, broken: tuple[int, ...]) -> str:
+    return "; ".join([box.rules[n].invariant.text for n in sorted(set(broken))])
 
 
 class _Boxes:
@@ -159,35 +183,54 @@ class _Boxes:
 
     def __init__(self, lines: Sequence[Rule], context: Context, decided: Sequence[Directive], cap: Cap | None) -> None:
         self._decided, self._context, self._cap = decided, context, cap
-        self._lines = [r for r in lines if r.when is None or r.when_of_peer or r.when(context, decided[0])]
+        some = context.links[0]
+        self._lines = [r for r in lines if r.when_of_view is None or r.when_of_view(context, some)]
         self._boxes: dict[Any, Box] = {}
-        asked = [r.when for r in self._lines if r.when is not None and r.when_of_peer]
-        self.of = [self._box(tuple([bool(when(context, d)) for when in asked]), None) for d in decided]
+        asked = [r.when_of_peer for r in self._lines if r.when_of_peer is not None]
+        answers = [map(bool, map(when, repeat(context), context.links)) for when in asked]
+        self._applies = list(zip(*answers, strict=True)) if asked else [()] * len(context.links)
+        self.of = [self._box(applies, None) for applies in self._applies]
 
     def capped(self, k: int) -> Box:
         """A link's box within what it is allowed at most."""
-        box = self.of[k]
         if self._cap is None:
-            return box
+            return self.of[k]
         link = self._decided[k]
-        most = self._cap(_FULLEST._replace(source=link.source, destination=link.destination))
-        return self._box(box.applies, (most.representation, most.rate_hz))
+        full = Directive(link.source, link.destination, Representation.RAW, 1.0, None, _MOST_HZ)
+        most = self._cap(full)
+        if most is full:
+            return self.of[k]
+        return self._box(self._applies[k], (float(LEVELS[most.representation]), most.rate_hz))
 
-    def _box(self, applies: tuple[bool, ...], most: tuple[Representation, float] | None) -> Box:
+    def _box(self, applies: tuple[bool, ...], most: tuple[float, float] | None) -> Box:
         key = applies, most
         if key not in self._boxes:
             answers = iter(applies)
-            rules = [r for r in self._lines if not (r.when is not None and r.when_of_peer) or next(answers)]
-            bounds = None if most is None else {"representation": float(LEVELS[most[0]]), "rate_hz": most[1]}
-            self._boxes[key] = Box(rules, applies, self._context, self._decided[0], bounds)
+            rules = tuple([r for r in self._lines if r.when_of_peer is None or next(answers)])
+            some = self._context.links[0]
+            self._boxes[key] = box_of(
+                rules, tuple([side(self._context, some) for r in rules for side in r.sides]), most
+            )
         return self._boxes[key]
 
-    def allowed(self, directive: Directive) -> bool:
-        """Whether a directive may replace another one."""
-        return self._cap is None or self._cap(directive) == directive
+    def nearest(self, k: int, box: Box, also: tuple[Part, ...], context: Context) -> Link | None:
+        """The link nearest to the decided one that keeps its lines and other parts, and is allowed."""
+        cap, before = self._cap, self._context.links[k]
+        if cap is None or box is self.of[k]:
+            return nearest(before, box, also, context, _any)
+
+        def allowed(link: Link) -> bool:
+            directive = as_directive(self._decided[k], before, link, context.me.region, "")
+            return cap(directive) == directive
+
+        return nearest(before, box, also, context, allowed)
 
 
-_FULLEST = Directive(-1, -1, Representation.RAW, rho=1.0, rate_hz=DIRECTIVE_BOUNDS["rate_hz"].high)
+def _any(_: Link) -> bool:
+    return True
+
+
+_MOST_HZ = DIRECTIVE_BOUNDS["rate_hz"].high
 
 
 _Asked = tuple[int, int | None]
@@ -213,7 +256,7 @@ class _Change(NamedTuple):
     number: int
     plan: _Plan
     link: int
-    after: Directive
+    after: Link
     lines: tuple[int, ...]
 
     def made(self) -> _Plan:
@@ -236,7 +279,7 @@ class _Together:
         boxes: what all lines about each link allow.
     """
 
-    def __init__(self, context: Context, decided: Sequence[Directive], lines: Sequence[Rule], boxes: _Boxes) -> None:
+    def __init__(self, context: Context, decided: Sequence[Link], lines: Sequence[Rule], boxes: _Boxes) -> None:
         self._start, self._decided, self._lines, self._boxes = context, decided, lines, boxes
         self._plan = _Plan((0, 0.0), context, {})
         self._count = self._further = 0
@@ -258,20 +301,23 @@ class _Together:
             left = [asked for asked in broken if not self._keep(asked)]
         return not left
 
-    def directives(self) -> list[Directive]:
-        """The links, with the reasons of their changes."""
-        links = list(self._start.directives)
+    def change(self, directives: list[Directive], decided: Sequence[Directive]) -> list[Link]:
+        """Replace the directives of the links that change, and return the links."""
+        links = list(self._start.links)
         for k, numbers in self._plan.keeps.items():
-            after = self._plan.context.directives[k]
-            if after != self._decided[k]:
-                broken = self._boxes.of[k].broken(self._start, self._decided[k])
-                because = dict.fromkeys([*broken, *[self._lines[n].invariant for n in numbers]])
-                links[k] = _replaced(self._decided[k], after, because)
+            was, after = self._decided[k], self._plan.context.links[k]
+            if after != was:
+                box = self._boxes.of[k]
+                broken = [box.rules[n] for n in sorted(set(box.broken(self._start, was)))]
+                because = dict.fromkeys([rule.invariant for rule in [*broken, *[self._lines[n] for n in numbers]]])
+                texts = "; ".join([invariant.text for invariant in because])
+                links[k] = after
+                directives[k] = _replaced(decided[k], was, after, self._start.me.region, texts)
         return links
 
     def _holds(self, asked: _Asked, context: Context) -> bool:
         n, k = asked
-        return self._lines[n].holds(context, context.directives[k or 0])
+        return self._lines[n].holds(context, context.links[k or 0])
 
     def _keep(self, asked: _Asked) -> bool:
         """Keep one more line by the nearest change that was found of the plan so far."""
@@ -324,9 +370,9 @@ class _Together:
     def _change(self, this: _Plan, k: int, numbers: tuple[int, ...]) -> list[_Change]:
         """The nearest change by which a link keeps these lines, if there is one."""
         self._count += 1
-        before, now, box = self._decided[k], this.context.directives[k], self._boxes.capped(k)
-        parts = [part for n in numbers for part in self._lines[n].parts]
-        after = nearest(before, box, parts, this.context, self._boxes.allowed)
+        before, now, box = self._decided[k], this.context.links[k], self._boxes.capped(k)
+        parts = tuple([part for n in numbers for part in self._lines[n].parts])
+        after = self._boxes.nearest(k, box, parts, this.context)
         if after is None or after == now:
             return []
         was, is_now = (0, 0.0) if now is before else distance(before, now), distance(before, after)
@@ -335,10 +381,9 @@ class _Together:
         return [_Change(far, self._count, this, k, after, numbers)]
 
 
-def _replaced(before: Directive, after: Directive, broken: Iterable[Invariant]) -> Directive:
-    because = "; ".join([rule.text for rule in broken])
-    was = f"{NAME_OF[before.representation]} at {before.rate_hz:g} Hz"
-    return after._replace(destination=before.destination, reason=f"{MARK}{because} (decided {was}: {before.reason})")
+def _replaced(before: Directive, was: Link, after: Link, region: Disc | None, texts: str) -> Directive:
+    decided = f"{NAME_OF[before.representation]} at {before.rate_hz:g} Hz: {before.reason}"
+    return as_directive(before, was, after, region, f"{MARK}{texts} (decided {decided})")
 
 
 def _not_replaced(before: Directive, broken: Sequence[Invariant]) -> Directive:

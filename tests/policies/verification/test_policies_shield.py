@@ -11,10 +11,10 @@ from policies_examples import fleet_of, planted
 
 from sortie.policies.catalogue.baselines import everyone, silence
 from sortie.policies.catalogue.worked import worked
-from sortie.policies.contract import Directive, FleetView, Policy, Representation, TaskPhase
+from sortie.policies.contract import Directive, Disc, FleetView, Policy, Representation, TaskPhase
 from sortie.policies.verification.conformance import conform, failing
 from sortie.policies.verification.invariants import InvariantError, just_heard, parse, violations
-from sortie.policies.verification.nearest import distance
+from sortie.policies.verification.links import as_link, distance
 from sortie.policies.verification.proof import prove
 from sortie.policies.verification.shield import MARK, enforce, interventions, shield
 from sortie.policies.verification.views import draw_views
@@ -193,7 +193,8 @@ def test_no_directive_that_keeps_the_lines_is_nearer(seed: int) -> None:
         # A lower rung takes the cells with it, and a raised link gets a rate: these changes are not the lines'.
         follows = after._replace(rho=before.rho if after.rho == 0 else after.rho)
         follows = follows._replace(rate_hz=before.rate_hz if before.rate_hz == 0 else follows.rate_hz)
-        assert min(distance(before, follows), distance(before, after)) <= min(distance(before, d) for d in keep), text
+        away = [distance(as_link(before), as_link(d)) for d in (follows, after, *keep)]
+        assert min(away[:2]) <= min(away[2:]), text
 
 
 def test_lowering_a_link_does_not_make_it_send() -> None:
@@ -208,3 +209,25 @@ def test_a_condition_on_the_directive_is_made_false_only_where_nothing_else_help
     assert (slower.representation, slower.rate_hz) == (Representation.TRACKS, 2.0)
     (silent,) = enforce(parse("when representation > none: rate_hz <= 2\nrate_hz >= 5"), view, [sends])
     assert (silent.representation, silent.rate_hz) == (Representation.NONE, 9.0)
+
+
+def test_what_a_shield_keeps_between_decisions_does_not_change_its_answers() -> None:
+    """The same lines, another charge, another peer that they are about, and back."""
+    rules = parse("rate_hz <= 10 * battery\nwhen peer_battery < 0.5: rho <= 0.1")
+    for own, low in [(0.5, 1), (0.3, 2), (0.5, 2), (0.5, 1)]:
+        view = fleet_of(3)
+        charge = {view.ego: own, low: 0.2, 3 - low: 0.9}
+        view = view._replace(descriptors={i: d._replace(battery_soc=charge[i]) for i, d in view.descriptors.items()})
+        decided = [Directive(view.ego, p, Representation.FEATURES, 0.4, rate_hz=9.0) for p in view.peers]
+        after = {d.destination: d for d in enforce(rules, view, decided)}
+        assert [after[p].rate_hz for p in (1, 2)] == [10 * own, 10 * own]
+        assert (after[low].rho, after[3 - low].rho) == (0.1, 0.4)
+
+
+def test_links_that_share_a_correction_keep_their_own_region_and_reason() -> None:
+    view = fleet_of(3)
+    discs = {p: Disc(1.0 * p, 0.0, 5.0) for p in view.peers}
+    decided = [Directive(view.ego, p, Representation.RAW, 0.4, discs[p], 9.0, reason=f"for {p}") for p in view.peers]
+    for d in enforce(parse("rate_hz <= 2"), view, decided):
+        assert (d.roi, d.rate_hz) == (discs[d.destination], 2.0)
+        assert d.reason.endswith(f"raw at 9 Hz: for {d.destination})")
