@@ -60,9 +60,9 @@ __all__ = ["SHIPPED_WEIGHTS", "Boxes", "Capture", "Share", "TorchDetector", "nam
 
 
 def shipped(fusion: str) -> Path:
-    """The weights that a fusion flies with when the scenario names none: DiscoNet's unless others are shipped for it."""
-    own = fusion not in FUSIONS or FUSIONS[fusion].shares != "features"
-    return SHIPPED_WEIGHTS if own else NETWORKS / f"{fusion}.safetensors"
+    """The weights that a fusion flies with when the scenario names none: the default network's unless others are shipped for it."""
+    others = fusion in FUSIONS and FUSIONS[fusion].shares == "features" and fusion != "disconet"
+    return NETWORKS / f"{fusion}.safetensors" if others else SHIPPED_WEIGHTS
 
 
 def named_weights(weights: Path | None) -> Path:

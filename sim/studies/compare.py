@@ -40,11 +40,12 @@ class Contender(NamedTuple):
     """Decides in place of the scenario's policy; None where the scenario names it."""
 
     def with_own_fusion(self) -> Contender:
-        """The same with the fusion that its method was published with, where it is a prior method."""
+        """The same with the fusion that its method was published with, where it is a prior method, and with that fusion's network;
+        these were trained alike."""
         fusion = None if self.function is not None else own_fusion(self.scenario.policy.name)
         if fusion is None:
             return self
-        perception = self.scenario.perception.model_copy(update={"fusion": fusion})
+        perception = self.scenario.perception.model_copy(update={"fusion": fusion, "weights": f"{fusion}.safetensors"})
         return self._replace(scenario=self.scenario.model_copy(update={"perception": perception}))
 
 

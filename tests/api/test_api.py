@@ -147,8 +147,8 @@ def test_a_notebook_flies_by_the_public_interface(name: str) -> None:
 
 def test_prior_methods_fly_with_their_own_fusion_when_asked() -> None:
     compared = sortie.compare("track_target", ["worked", "v2vnet-style"], SHORT, own_fusion=True)
-    flown = [s.record.scenario.perception.fusion for s in compared.sorties if s.record is not None]
-    assert flown == ["disconet", "v2vnet"]
+    flown = [s.record.scenario.perception for s in compared.sorties if s.record is not None]
+    assert [(p.fusion, p.weights) for p in flown] == [("disconet", None), ("v2vnet", "v2vnet.safetensors")]
 
 
 @pytest.mark.parametrize(

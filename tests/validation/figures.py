@@ -29,7 +29,7 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Policy, Representation
 from sortie.scenarios.intervals import SHARE, mean_interval
 from sortie.scenarios.reading.load import load, load_conditions
-from sortie.scenarios.shipped import SHIPPED_WEIGHTS
+from sortie.scenarios.shipped import NETWORKS, SHIPPED_WEIGHTS
 from sortie.sim.folders import write_text
 
 PICTURES = ROOT / "docs/validation"
@@ -123,7 +123,7 @@ def _fusion_methods() -> Tables:
     from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
     from sortie.perception.network.checkpoint import load_weights
 
-    files = {"disconet": SHIPPED_WEIGHTS}
+    files = {"disconet": NETWORKS / "disconet.safetensors"}  # trained as the others are
     for method in ("fcooper", "where2comm", "v2vnet"):
         files[method] = WORK / f"{method}.safetensors"
         _sortie(

@@ -15,6 +15,7 @@ from sortie.perception.network.fusion.when2com import When2com
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene
+from sortie.scenarios.shipped import NETWORKS
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +153,8 @@ def test_a_drone_without_a_look_fuses_its_peers_maps_alone(
     """One whole map seen from the place where it was made is that drone's own; nothing is rendered for the ego."""
     peer, other = fleet[1], fleet[2]
     blind = peer._replace(drone=0, looked=False)
-    detector = TorchDetector(scene, Perception(fusion=fusion), seed=1)
+    coarse = NETWORKS / f"{fusion}.safetensors"  # a fine network also corrects each map that it receives
+    detector = TorchDetector(scene, Perception(fusion=fusion), seed=1, weights=coarse)
     whole = Share(peer, "features", 1.0, None, 0.5)
     one, both, none, boxes, alone = detector.detect(
         [

@@ -33,6 +33,7 @@ from sortie.perception.study.doses import (
     verdicts,
 )  # fmt: skip
 from sortie.perception.study.run import SHIPPED
+from sortie.scenarios.shipped import NETWORKS
 
 PLANNED = read_plan()
 NO_BOXES = Matched(np.zeros(0), np.zeros(0, bool), 3)
@@ -74,7 +75,7 @@ def test_a_dose_is_put_into_every_condition_but_that_of_a_drone_alone() -> None:
 
 
 def test_equal_weights_give_silent_peers_four_fifths_where_all_reach_and_more_with_a_bonus() -> None:
-    net, data = load_weights(shipped("disconet")), fleet()
+    net, data = load_weights(COARSE), fleet()
     near = np.array([32 * CELLS + 32])  # in the middle of the first drone's square: all five reach it
     for bonus in (0.0, 0.35):
         view = CarNetInstrument(net, fusion_params={"temperature": math.inf, "silent_weight": bonus}).look(data, 0)
@@ -101,6 +102,8 @@ def test_the_weight_is_that_of_cells_with_cars_by_true_poses() -> None:
     assert cells.tolist()[0] == math.floor((102.4 + 5.0) / 3.2) * CELLS + math.floor((102.4 - 10.0) / 3.2)
 
 
+COARSE = NETWORKS / "disconet.safetensors"
+"""Cells are fused as they are sent."""
 SMALL_PLAN = replace(
     PLANNED,
     budgets=(0.05,),
@@ -110,7 +113,7 @@ SMALL_PLAN = replace(
 
 
 def test_all_doses_at_once_give_what_each_gives_alone() -> None:
-    net, data, key = load_weights(shipped("disconet")), fleet(), (0, 0)
+    net, data, key = load_weights(COARSE), fleet(), (0, 0)
     few = Settings(egos=1)
     found, weights = frame_of(SMALL_PLAN, CarNetInstrument(net), data, 0, key, few)
     for dose in SMALL_PLAN.dose:
