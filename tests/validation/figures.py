@@ -482,6 +482,12 @@ def _read_maps() -> Tables:
     return read_maps.tables()
 
 
+def _score_threshold() -> Tables:
+    import score_threshold
+
+    return {"score_threshold": score_threshold.table()}
+
+
 def _fine_fleets() -> Tables:
     import fine_network
 
@@ -759,6 +765,7 @@ FIGURES: dict[str, Figure] = {
     "fine_times": Figure(1, _fine_times, timed=True),
     "fine_network": Figure(7, _fine_network),
     "read_maps": Figure(12, _read_maps),
+    "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),
     "fine_flights": Figure(20, _fine_flights),
     "fusion_methods": Figure(25, _fusion_methods),
