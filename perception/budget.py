@@ -31,6 +31,8 @@ CLASS_BYTES = 1
 """The class of a detection, where the scenario has targets of several classes (`perception.classes`)."""
 TRACK_BYTES = 20
 """One track: x, y, vx, vy as float32, id, class and score packed in 4 B."""
+MOST_BOXES = 200
+"""A drone detects at most so many boxes in one look, the best ones."""
 MAX_TRACKS = 12
 INDEX_BITS = 12
 """One cell index: 4096 cells."""

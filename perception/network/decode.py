@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sortie.perception.budget import MOST_BOXES
 from sortie.perception.geometry import FULL, HEAD_PX, Geometry
 from sortie.perception.joining import NMS_IOU, Pose
 from sortie.perception.metrics.ap import suppress
@@ -15,7 +16,7 @@ REFERENCE_SIZE_M = (4.5, 1.85)
 """Length and width for which the size head says 0."""
 
 
-def decode(out: Tensor, threshold: float, geometry: Geometry = FULL, limit: int = 200) -> Tensor:
+def decode(out: Tensor, threshold: float, geometry: Geometry = FULL, limit: int = MOST_BOXES) -> Tensor:
     """One head output [7 or 8, 128, 128] → boxes [m, 6] in the ego's frame: x forward, y left, length, width, yaw, score.
 
     Peaks are local maxima of the heat map over 3 × 3 cells, at or above `threshold`, at most `limit`, best first. With

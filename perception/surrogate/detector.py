@@ -187,7 +187,7 @@ class SurrogateDetector:
         else:
             cars = self._scene.cars_near(capture.t_s, x, y, radius)
             part = np.pi * radius**2 / (2 * half) ** 2
-        return round(cars * self._found_alone + part * self._alarms_alone)
+        return min(round(cars * self._found_alone + part * self._alarms_alone), budget.MOST_BOXES)
 
     def camera_views(self, capture: Capture) -> NDArray[np.uint8]:
         """There are none.

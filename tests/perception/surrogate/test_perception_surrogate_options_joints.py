@@ -130,4 +130,4 @@ def test_as_many_boxes_are_sent_as_cars_are_found_and_false_positives_come_on_av
                 )
                 near &= (np.abs(ahead) < 102.4) & (np.abs(left) < 102.4)
                 part = budget.cells_sent(1.0, disc, 30.0, 10.0, 0.9) / 4096
-            assert made.count_boxes(ego, disc) == round(near.sum() * part_of[0] + part * part_of[1])
+            assert made.count_boxes(ego, disc) == min(round(near.sum() * part_of[0] + part * part_of[1]), 200)
