@@ -41,7 +41,7 @@ class Contender(NamedTuple):
 
     def with_own_fusion(self) -> Contender:
         """The same with the fusion that its method was published with, where it is a prior method, and with that fusion's network;
-        these were trained alike."""
+        all of these were trained on the same few frames."""
         fusion = None if self.function is not None else own_fusion(self.scenario.policy.name)
         if fusion is None:
             return self

@@ -28,7 +28,7 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture, Share
 from sortie.scenarios.schema import Perception
 
-NETWORKS = {"coarse": Path("disconet.safetensors"), "fine": Path("fine.safetensors")}
+NETWORKS = {"default": Path("disconet.safetensors"), "fine": Path("fine.safetensors")}
 BENCH_SEED, SCENES = 11, 60
 AREA_M = (-60.0, -60.0, 60.0, 60.0)
 THRESHOLDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)
