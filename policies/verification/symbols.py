@@ -298,7 +298,7 @@ class Ranged:
         return self._step("whole times", other)
 
     def __neg__(self) -> Any:
-        return self._step("times", -1.0)
+        return self._step("times", -1)  # keeps whole numbers whole
 
     def __pos__(self) -> Ranged:
         return self

@@ -219,6 +219,16 @@ STAND_INS = {
 }
 """Questions that a stand-in may answer otherwise than a real object."""
 
+RARE = "0.802 < soc * 1.945 < 0.8020001"
+"""Charges so few that only a search finds them."""
+RECOGNISED = {
+    "minus of a whole number": f"bad = isinstance(-int(first), int) and {RARE}",
+    "type of minus": f"bad = type(-int(first)) == int and {RARE}",
+    "pattern of minus": f"match -int(first):\n    case int():\n        bad = {RARE}",
+    "format of minus": f"try:\n    f'{{-int(first):d}}'\n    bad = {RARE}\nexcept ValueError:\n    pass",
+}
+"""What a stand-in must share with the real object, each before a fault in few views."""
+
 STATE = {
     "remembers the charge": "last = STATE.get('soc', 1.0)\nSTATE['soc'] = soc\nbad = last == 0.4",
     "counts calls": "STATE['n'] += 1\nbad = STATE['n'] % 1000003 == 0",
@@ -414,6 +424,8 @@ CORRECT = {
     "functools": "bad = functools.reduce(operator.add, [1, 2], 0) != 3 or soc < 0",
     "isinstance": "bad = not isinstance(soc, float) or not isinstance(first, int | float)",
     "by index": "bad = me[6] > 1",
+    "minus of a whole number": "bad = not isinstance(-int(soc * -100), int)",
+    "absolute whole number": "bad = not isinstance(abs(int(soc * 100) - 100), int)",
 }
 """Policies that keep the line and are provable."""
 
@@ -446,6 +458,7 @@ FAULTY: dict[str, str] = {
     **{f"whole: {n}": source(b) for n, b in WHOLE.items()},
     **{f"sliver: {n}": source(b) for n, b in SLIVERS.items()},
     **{f"stand-in: {n}": source(b) for n, b in STAND_INS.items()},
+    **{f"stand-in recognised: {n}": source(b) for n, b in RECOGNISED.items()},
     **{f"state: {n}": source(b) for n, b in STATE.items()},
     **{f"state: file with {n}": stateful(b) for n, b in STATE_FILES.items()},
     **{f"outside: {n}": source(b) for n, b in OUTSIDE.items()},
