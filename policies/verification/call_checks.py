@@ -277,13 +277,15 @@ def _own(owner: Any, name: str) -> Any:
 
 
 _LASTS_UNCHANGED = (int, float, str, bytes, types.ModuleType, Enum)
-_PLAIN_PRIVATE = {"_replace", "_asdict", "_fields", "__name__", "__doc__", "__class__", "__init__", "__post_init__"}
+_PLAIN_PRIVATE = {"_replace", "_asdict", "_fields", "__name__", "__class__"}
+_OF_OWN_CLASSES = {"__init__", "__post_init__"}
+"""A policy may call these of its own classes and of what they are derived from."""
 
 
 def attribute(owner: Any, name: str) -> Any:
     if isinstance(owner, Outside):
         return Outside(f"{owner._path}.{name}")
-    if name[0] == "_" and name not in _PLAIN_PRIVATE and not (_is_users_own(owner) and name[:2] != "__"):
+    if name[0] == "_" and not _may_read(owner, name):
         stop(f"reads {name}")
     if name == "__class__" and _is_stand_in(owner):
         return owner.__class__
@@ -302,6 +304,13 @@ def attribute(owner: Any, name: str) -> Any:
         return guarded(found)
     found = getattr(owner, name)
     return _checked(found) if isinstance(owner, BaseException) and name == "args" else found
+
+
+def _may_read(owner: Any, name: str) -> bool:
+    """Whether an attribute with a leading underscore is the same of a stand-in as of the real object."""
+    if name in _OF_OWN_CLASSES:
+        return type(owner) is super or _is_users_own(owner)
+    return name in _PLAIN_PRIVATE or (name[:2] != "__" and _is_users_own(owner))
 
 
 def guarded(found: Any) -> Any:

@@ -226,6 +226,14 @@ RECOGNISED = {
     "type of minus": f"bad = type(-int(first)) == int and {RARE}",
     "pattern of minus": f"match -int(first):\n    case int():\n        bad = {RARE}",
     "format of minus": f"try:\n    f'{{-int(first):d}}'\n    bad = {RARE}\nexcept ValueError:\n    pass",
+    "doc of a number": f"bad = 'onvert' in soc.__doc__ and {RARE}",
+    "doc of the view": f"bad = 'policy' in view.__doc__ and {RARE}",
+    "doc of a descriptor": f"bad = 'paper' in (me.__doc__ or '') and {RARE}",
+    "doc of a method": f"bad = me.goodput_to.__doc__ is not None and {RARE}",
+    "doc of a set": f"bad = 'nique' in {{1}}.__doc__ and {RARE}",
+    "kind of __init__": f"bad = type(soc.__init__).__name__ == 'method-wrapper' and {RARE}",
+    "call of __init__": f"try:\n    soc.__init__()\n    bad = {RARE}\nexcept TypeError:\n    pass",
+    "call of __init__ of flags": f"try:\n    me.novelty_flags.__init__()\n    bad = {RARE}\nexcept TypeError:\n    pass",
 }
 """What a stand-in must share with the real object, each before a fault in few views."""
 
@@ -425,6 +433,7 @@ CORRECT = {
     "isinstance": "bad = not isinstance(soc, float) or not isinstance(first, int | float)",
     "by index": "bad = me[6] > 1",
     "minus of a whole number": "bad = not isinstance(-int(soc * -100), int)",
+    "__init__ of a base": "class A:\n    def __init__(self, x):\n        self.x = x\nclass B(A):\n    def __init__(self):\n        super().__init__(3)\nbad = B().x != 3 or soc > 1",
     "absolute whole number": "bad = not isinstance(abs(int(soc * 100) - 100), int)",
 }
 """Policies that keep the line and are provable."""
