@@ -59,7 +59,7 @@ def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
     if isinstance(function, Outside):
         function._used()
     if isinstance(function, Written):
-        function = function.write
+        function = function._write
     why = cannot_call(function)
     if why is not None:
         reach(why[1:]) if why.startswith("!") else stop(why)
@@ -77,8 +77,10 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
             continue
         if (why := cannot_call(value)) is not None:
             reach(why[1:]) if why.startswith("!") else stop(why)
-        if calls_others(value) or (
-            reads_stored_text(value) and not (value is int and function is map and len(args) == 2)
+        if (
+            value is type
+            or calls_others(value)
+            or (reads_stored_text(value) and not (value is int and function is map and len(args) == 2))
         ):
             stop(f"hands on {getattr(value, '__qualname__', value)}")
     args, kwargs = ordered_for(function, args, kwargs)
@@ -90,6 +92,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     reads = reads_stored_text(function) and function is not int and type(owner) is not str  # of which below
     if has_text and (reads or not takes_ranges(function)):
         stop(f"gives a range to {getattr(function, '__qualname__', function)}")
+    if function in (functools.wraps, functools.update_wrapper) and any(map(_is_compiled, (*args, *kwargs.values()))):
+        stop("takes over the name of a function that is not its own")
     if has_text and function is int and len(args) + len(kwargs) > 1:
         stop("reads a number in the text of a range")
     if function in (isinstance, issubclass) and len(args) == 2 and (why := _cannot_ask(args[1])):
@@ -145,6 +149,11 @@ def _caught() -> None:
 
 
 assert on_behalf_of_the_policy.__name__ == FOR_USER  # noqa: S101
+
+
+def _is_compiled(value: Any) -> bool:
+    """Whether this is a function whose name or kind may be another than that of the real one."""
+    return callable(value) and not isinstance(value, type | types.FunctionType) and not _is_users_own(value)
 
 
 def _cannot_ask(kinds: Any) -> str | None:
@@ -214,15 +223,15 @@ def _example(value: Any) -> Any:
 
 
 def _text_of(write: Callable[[Any], str]) -> Callable[..., Any]:
-    def act(*args: Any) -> Any:
-        if len(args) != 1:
+    def act(*args: Any, **kwargs: Any) -> Any:
+        if len(args) != 1 or kwargs:
             return NotImplemented
         return args[0]._text() if isinstance(args[0], Text | Ranged) else _checked(write(args[0]))
 
     return act
 
 
-def _format(value: Any, spec: Any = "") -> Any:
+def _format(value: Any, spec: Any = "", /) -> Any:
     if _is_stand_in(spec) or (_is_stand_in(value) and spec[-1:] == "c"):
         stop(FORM_BY_VALUE)
     return value._text(spec) if isinstance(value, Text | Ranged) else _checked(format(value, spec))
@@ -277,7 +286,7 @@ def _own(owner: Any, name: str) -> Any:
 
 
 _LASTS_UNCHANGED = (int, float, str, bytes, types.ModuleType, Enum)
-_PLAIN_PRIVATE = {"_replace", "_asdict", "_fields", "__name__", "__class__"}
+_PLAIN_PRIVATE = {"_replace", "_asdict", "_fields", "__class__"}
 _OF_OWN_CLASSES = {"__init__", "__post_init__"}
 """A policy may call these of its own classes and of what they are derived from."""
 
@@ -287,10 +296,12 @@ def attribute(owner: Any, name: str) -> Any:
         return Outside(f"{owner._path}.{name}")
     if name[0] == "_" and not _may_read(owner, name):
         stop(f"reads {name}")
-    if name == "__class__" and _is_stand_in(owner):
-        return owner.__class__
+    if name == "__class__" and (kind := _type_of(owner)) is not NotImplemented:
+        return kind
     if isinstance(owner, types.ModuleType) and not is_users(owner.__name__):
         found = getattr(owner, name)
+        if any(found is kind for kind in _FUNCTIONS):
+            stop(KIND_OF_FUNCTION)
         if (
             isinstance(found, types.ModuleType)
             and found.__name__.partition(".")[0] not in PURE_MODULES
@@ -306,10 +317,20 @@ def attribute(owner: Any, name: str) -> Any:
     return _checked(found) if isinstance(owner, BaseException) and name == "args" else found
 
 
+_FUNCTIONS = (
+    types.FunctionType, types.MethodType, types.BuiltinFunctionType, types.MethodWrapperType, types.WrapperDescriptorType,
+    types.MethodDescriptorType, types.ClassMethodDescriptorType,
+)  # fmt: skip
+KIND_OF_FUNCTION = "asks what kind of function something is"
+"""Which a check or a stand-in's method is not: Python functions stand for compiled ones."""
+
+
 def _may_read(owner: Any, name: str) -> bool:
     """Whether an attribute with a leading underscore is the same of a stand-in as of the real object."""
     if name in _OF_OWN_CLASSES:
         return type(owner) is super or _is_users_own(owner)
+    if name == "__name__":
+        return isinstance(owner, type | types.ModuleType | types.FunctionType) or _is_users_own(owner)
     return name in _PLAIN_PRIVATE or (name[:2] != "__" and _is_users_own(owner))
 
 
@@ -339,6 +360,8 @@ def _each(iterable: Any) -> Any:
 
 
 def _type_of(*args: Any, **kwargs: Any) -> Any:
+    if len(args) == 1 and (_is_compiled(args[0]) or isinstance(args[0], types.FunctionType)):
+        stop(KIND_OF_FUNCTION)
     if len(args) == 1 and (_is_stand_in(args[0]) or isinstance(args[0], Unordered | UnorderedFrozen)):
         return args[0].__class__
     return NotImplemented
@@ -395,10 +418,10 @@ class Written:
     """A builtin that makes text, with the checks that a call by its name has."""
 
     def __init__(self, write: Any) -> None:
-        self.write = write
+        self._write = write
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return on_behalf_of_the_policy(self.write, args, kwargs)
+        return on_behalf_of_the_policy(self._write, args, kwargs)
 
 
 WRITTEN = {write.__name__: Written(write) for write in (repr, ascii, format, str)}

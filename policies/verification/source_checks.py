@@ -182,6 +182,8 @@ class Checks(ast.NodeTransformer):
     def visit_MatchClass(self, node: ast.MatchClass) -> ast.AST:
         if any(name[0] == "_" or name == "args" for name in node.kwd_attrs):
             raise SyntaxError("matches an attribute that a search cannot follow")
+        if not isinstance(node.cls, ast.Name):
+            raise SyntaxError("matches a class by a dotted name")  # which no check reads
         for pattern in (*node.patterns, *node.kwd_patterns):
             self.visit(pattern)
         return node

@@ -234,6 +234,15 @@ RECOGNISED = {
     "kind of __init__": f"bad = type(soc.__init__).__name__ == 'method-wrapper' and {RARE}",
     "call of __init__": f"try:\n    soc.__init__()\n    bad = {RARE}\nexcept TypeError:\n    pass",
     "call of __init__ of flags": f"try:\n    me.novelty_flags.__init__()\n    bad = {RARE}\nexcept TypeError:\n    pass",
+    "name of repr": f"try:\n    bad = repr.__name__ == 'repr' and {RARE}\nexcept AttributeError:\n    pass",
+    "type of format": f"bad = type(format).__name__.startswith('builtin') and {RARE}",
+    "type of ascii": f"bad = type(ascii) is type(len) and {RARE}",
+    "pattern of repr": f"import types\nmatch repr:\n    case types.BuiltinFunctionType():\n        bad = {RARE}",
+    "wraps repr": f"f = functools.wraps(repr)(lambda: 0)\nbad = f.__name__ == 'repr' and {RARE}",
+    "type handed on": f"bad = list(map(type, [soc]))[0] is float and {RARE}",
+    "method of a set": f"bad = {{1}}.union.__name__ == 'union' and {RARE}",
+    "format by keyword": f"try:\n    format(value=3)\nexcept TypeError:\n    bad = {RARE}",
+    "str by keyword": f"try:\n    str(object=3)\n    bad = {RARE}\nexcept TypeError:\n    pass",
 }
 """What a stand-in must share with the real object, each before a fault in few views."""
 
