@@ -140,6 +140,29 @@ def _made(kind: Any) -> Any:
     return kind
 
 
+_STAND_IN_NAMES = re.compile(
+    r"\b(Ranged|Solved|Text|Flags|TargetIds|Space|Unsearchable|InAnyOrder|DescriptorOfRanges|ViewOfRanges|Unordered\w*"
+    r"|Written|Outside|Unknown|_sum)\b|<locals>"
+)
+"""In the text of an error that real objects raise with another text."""
+
+
+def _shown() -> None:
+    """A policy can look at the present error."""
+    parts: list[Any] = [sys.exc_info()[1]]
+    while parts:
+        error = parts.pop()
+        if isinstance(error, BaseExceptionGroup):
+            parts += error.exceptions
+        elif error is not None:
+            last = error.__traceback__
+            while last is not None and last.tb_next is not None:
+                last = last.tb_next
+            home = "" if last is None else last.tb_frame.f_globals.get("__name__")
+            if home in STAND_INS or any(type(a) is str and _STAND_IN_NAMES.search(a) for a in error.args):
+                stop("looks at an error whose text is another one in flight")
+
+
 def _caught() -> None:
     error = sys.exc_info()[1]
     if isinstance(error, BaseExceptionGroup):
@@ -428,6 +451,6 @@ WRITTEN = {write.__name__: Written(write) for write in (repr, ascii, format, str
 CHECKS: dict[str, Any] = {
     "__called__": _called, "__same__": _same, "__text__": _text, "__written__": _written, "__percent__": _percent,
     "__own__": _own, "__attribute__": attribute, "__decorator__": _decorator, "__each__": _each, "__among__": _among,
-    "__unordered__": unordered, "__caught__": _caught, "__made__": _made,
+    "__unordered__": unordered, "__caught__": _caught, "__shown__": _shown, "__made__": _made,
 }  # fmt: skip
 """By the names under which `source_checks` calls them."""

@@ -23,7 +23,7 @@ def compiled(source: bytes, path: str) -> types.CodeType:
 
 RESERVED = {
     "__called__", "__same__", "__text__", "__written__", "__percent__", "__own__", "__attribute__", "__decorator__",
-    "__each__", "__among__", "__unordered__", "__caught__", "__made__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
+    "__each__", "__among__", "__unordered__", "__caught__", "__shown__", "__made__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
     "__qualname__", "__match_args__", "__del__", "__file__", "__spec__", "__loader__", "__cached__", "__path__", "__package__",
 }  # fmt: skip
 """The checks, and names by which a policy would say that it is another one, or find where it lies."""
@@ -123,7 +123,10 @@ class Checks(ast.NodeTransformer):
         return node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> Any:
-        return self._decorated(node)
+        found = self._decorated(node)
+        if node.name == "__exit__":
+            found.body.insert(0, _shown())
+        return found
 
     def visit_ClassDef(self, node: ast.ClassDef) -> Any:
         found = self._decorated(node)
@@ -134,7 +137,7 @@ class Checks(ast.NodeTransformer):
 
     def visit_ExceptHandler(self, node: ast.ExceptHandler) -> ast.AST:
         self.generic_visit(node)
-        node.body.insert(0, _caught())
+        node.body[:0] = [_caught()] if node.name is None else [_caught(), _shown()]
         return node
 
     def visit_Try(self, node: ast.Try) -> ast.AST:
@@ -151,7 +154,7 @@ class Checks(ast.NodeTransformer):
 
     def visit_With(self, node: ast.With) -> ast.AST:
         self.generic_visit(node)
-        node.body = [ast.Try(node.body, [], [], [_caught()])]
+        node.body = [ast.Try(node.body, [], [], [_caught(), _shown()])]
         return node
 
     def visit_Assign(self, node: ast.Assign) -> ast.AST:
@@ -226,3 +229,7 @@ def _unordered(value: ast.expr) -> ast.Call:
 
 def _caught() -> ast.Expr:
     return ast.Expr(ast.Call(_name("__caught__"), [], []))
+
+
+def _shown() -> ast.Expr:
+    return ast.Expr(ast.Call(_name("__shown__"), [], []))

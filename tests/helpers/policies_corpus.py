@@ -243,6 +243,19 @@ RECOGNISED = {
     "method of a set": f"bad = {{1}}.union.__name__ == 'union' and {RARE}",
     "format by keyword": f"try:\n    format(value=3)\nexcept TypeError:\n    bad = {RARE}",
     "str by keyword": f"try:\n    str(object=3)\n    bad = {RARE}\nexcept TypeError:\n    pass",
+    **{
+        f"error of {act}": f"try:\n    {act}\nexcept {kind} as error:\n    bad = {text!r} in str(error) and {RARE}"
+        for act, kind, text in (
+            ("soc[0]", "TypeError", "float"),
+            ("len(soc)", "TypeError", "float"),
+            ("soc + 'a'", "TypeError", "float"),
+            ("[x for x in soc]", "TypeError", "float"),
+            ("sorted([soc, 'a'])", "TypeError", "float"),
+            ("me.nothing_like_it", "AttributeError", "'Descriptor'"),
+            ("view.nothing_like_it", "AttributeError", "'FleetView'"),
+            ("me.battery_soc = 1", "AttributeError", "can't set"),
+        )
+    },
 }
 """What a stand-in must share with the real object, each before a fault in few views."""
 
