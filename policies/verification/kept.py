@@ -7,7 +7,9 @@ import contextlib
 import dataclasses
 import functools
 import inspect
+import operator
 import re
+import struct
 import types
 from collections.abc import Callable
 from decimal import Decimal
@@ -20,21 +22,21 @@ import numpy as np
 from sortie.policies.verification.pure import HEAP, home_of, is_own_cache
 from sortie.policies.verification.source_checks import RESERVED
 from sortie.policies.verification.symbols import Refused
-from sortie.scenarios.plugins.user_code import is_users
+from sortie.scenarios.plugins.user_code import is_users, modules_with
 
 _TUPLE_FIELD: Any = type(vars(NamedTuple("Named", [("x", int)]))["x"])
 _LEAVES = (
     int, str, bytes, bool, type(None), type(Ellipsis), type(NotImplemented), Fraction,
-    types.MethodDescriptorType, types.WrapperDescriptorType, types.GenericAlias, _TUPLE_FIELD,
-    type(vars(dataclasses).get("_HAS_DEFAULT_FACTORY")),
-    types.UnionType, types.GetSetDescriptorType, types.MemberDescriptorType, re.Pattern, np.generic, np.dtype, np.ufunc,
+    types.MethodDescriptorType, types.WrapperDescriptorType, _TUPLE_FIELD, types.CodeType,
+    type(vars(dataclasses).get("_HAS_DEFAULT_FACTORY")), type(dataclasses.MISSING),
+    types.GetSetDescriptorType, types.MemberDescriptorType, re.Pattern, np.generic, np.dtype, np.ufunc,
 )  # fmt: skip
 
 
 _PYTHONS_OWN = {
     "__name__", "__package__", "__loader__", "__spec__", "__file__", "__cached__", "__builtins__", "__path__",
-    "__annotations__", "__dataclass_fields__", "__dataclass_params__", "__match_args__", "__dict__", "__weakref__",
-    "__annotate__", "__annotate_func__", "__annotations_cache__", "__conditional_annotations__", "__firstlineno__",
+    "__dataclass_params__", "__match_args__", "__dict__", "__weakref__",
+    "__annotate__", "__annotate_func__", "__conditional_annotations__", "__firstlineno__",
     "__static_attributes__",
 }  # fmt: skip
 """Names that Python itself gives to a module or a class."""
@@ -43,29 +45,42 @@ _PYTHONS_OWN = {
 class Kept:
     """A policy's lasting objects as they were before its first decision."""
 
-    def __init__(self, roots: dict[str, Any]) -> None:
+    def __init__(self, roots: Callable[[], dict[str, Any]]) -> None:
         self._roots = roots
         self._before = self._now()
 
     def _now(self) -> dict[str, Any]:
-        return {name: fingerprint(value) for name, value in self._roots.items()}
+        return {name: fingerprint(value) for name, value in self._roots().items()}
 
     def changed(self) -> str:
         """What has changed since, in words; empty if nothing has."""
         now = self._now()
         if now == self._before:
             return ""
-        return next(f"changes {name}" for name in now if now[name] != self._before[name])
+        return next(f"changes {name}" for name in now if now[name] != self._before.get(name))
 
 
 def kept_by(function: Callable[..., Any], module: types.ModuleType) -> Kept:
     """The lasting objects of a policy: its modules' names, its defaults, its closure, its object's attributes.
 
+    Modules that only a function imports are imported now, so that they are watched from the first decision on.
+
     Raises:
-        Refused: one of them is of a kind that cannot be compared, such as an iterator.
+        Refused: one of them is of a kind that cannot be compared, such as an iterator, or a module does not load.
     """
-    roots = {name: value for name, value in vars(module).items() if name not in RESERVED}
-    return Kept({**roots, "the policy itself": function})
+    try:
+        modules = modules_with(module)
+    except Exception as error:
+        raise Refused(f"imports a module that does not load: {error}") from error
+
+    def roots() -> dict[str, Any]:
+        others = {f"the module {m.__name__.partition('.')[2]}": m for m in modules.values() if m is not module}
+        others.pop("the module ", None)  # their package, which holds no more than them
+        own = {name: value for name, value in vars(module).items() if name not in RESERVED}
+        alone = {n: v for n, v in own.items() if type(v) is not types.ModuleType or not is_users(v.__name__)}
+        return {**alone, "the policy itself": function, **others}
+
+    return Kept(roots)
 
 
 def fingerprint(value: Any) -> Any:
@@ -79,11 +94,13 @@ def fingerprint(value: Any) -> Any:
 
 def _fingerprint(value: Any, met: dict[int, int]) -> Any:
     kind = type(value)
-    if kind is float:
-        return "float", value.hex()
+    if kind is float:  # with the sign of NaN
+        return "float", struct.pack("d", value)
+    if kind is complex:
+        return "complex", struct.pack("dd", value.real, value.imag)
     if kind in _LEAVES or isinstance(value, np.generic | np.ufunc):
         return kind.__name__, value if not isinstance(value, np.generic) else value.tobytes()
-    if kind in (Decimal, range, complex):  # equal ones may differ: 1.0 and 1, -0 and 0, empty ranges
+    if kind in (Decimal, range):  # equal ones may differ: 1.0 and 1, -0 and 0, empty ranges
         return kind.__name__, repr(value)
     if id(value) in met:
         return "again", met[id(value)]
@@ -131,13 +148,15 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
             *(value.__defaults__ or ()),
             *(value.__kwdefaults__ or {}).values(),
             *(v for v in value.__dict__.values() if not isinstance(v, inspect.Signature)),
+            *([] if is_others else [value.__code__, value.__name__, value.__qualname__, value.__module__, value.__doc__]),
+            *([] if is_others else value.__annotations__.values()),
         ]
     elif isinstance(value, types.ModuleType):
         found = [v for n, v in vars(value).items() if n not in _PYTHONS_OWN] if is_users(value.__name__) else []
     elif isinstance(value, type):
         if issubclass(value, Flag) and is_users(home_of(value)):
             _fill_cache(value)
-        own = {n: v for n, v in vars(value).items() if _may_change(n, v)} if is_users(home_of(value)) else {}
+        own = {n: v for n, v in vars(value).items() if n not in _PYTHONS_OWN} if is_users(home_of(value)) else {}
         found = [*(x for item in own.items() for x in item), *(c for c in value.__mro__[1:] if is_users(home_of(c)))]
         found += [type(value)] if is_users(home_of(type(value))) else []
     elif isinstance(value, functools.partial):
@@ -147,7 +166,13 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
     elif isinstance(value, staticmethod | classmethod):
         found = [value.__func__]
     elif isinstance(value, property):
-        found = [value.fget, value.fset]
+        found = [value.fget, value.fset, value.fdel, value.__doc__]
+    elif isinstance(value, dataclasses.Field):
+        found = [value.type, value.default, value.default_factory, value.metadata]
+    elif isinstance(value, operator.itemgetter):
+        found = [value.__reduce__()]
+    elif isinstance(value, types.GenericAlias | types.UnionType) or home_of(type(value)) == "typing":
+        found = [getattr(value, name, None) for name in _OF_ANNOTATIONS]
     elif home_of(type(value)) in _UNCHANGING or is_own_cache(value):
         found = []
     elif hasattr(value, "__wrapped__") or hasattr(value, "cache_info"):
@@ -202,8 +227,12 @@ def _parts_of_users(value: Any) -> list[Any]:
     return [*found, type(value)]
 
 
+_OF_ANNOTATIONS = (
+    "__origin__", "__args__", "__metadata__", "__bound__", "__constraints__", "__default__", "__supertype__", "__value__",
+    "__forward_value__",
+)  # fmt: skip
+"""What an annotation holds, such as the types in `list[int]`. They need not be types."""
 _UNCHANGING = {
-    "typing",
     "__future__",
     "operator",
     *(f"sortie.policies.verification.{m}" for m in ("call_checks", "outside")),
@@ -211,14 +240,6 @@ _UNCHANGING = {
 """Modules of classes that keep nothing that changes."""
 _SHOWN = types.MemberDescriptorType | types.GetSetDescriptorType
 _ALWAYS_SHOWN = {"__dict__", "__weakref__", "__class__", "__traceback__", "__context__", "__cause__"}
-
-
-def _may_change(name: str, value: Any) -> bool:
-    """Whether an attribute of a class may keep something: all but what Python itself puts there."""
-    if name[:2] != "__":
-        return True
-    changes = (types.FunctionType, staticmethod, classmethod, property, list, dict, set, bytearray)
-    return name not in _PYTHONS_OWN and (isinstance(value, changes) or is_users(home_of(type(value))))
 
 
 def _attributes(value: Any) -> dict[str, Any]:

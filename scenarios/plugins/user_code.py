@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import contextlib
 import functools
 import hashlib
 import importlib
@@ -55,6 +56,19 @@ def load(
     return _Folder(path.resolve(), compiled, own_builtins).load()
 
 
+def modules_with(main: ModuleType) -> dict[str, ModuleType]:
+    """The modules of the run that a module belongs to, by name. Those that only a function imports are imported now.
+
+    Args:
+        main: a module that `load` returned.
+
+    Raises:
+        Exception: what such a module raises, but for ImportError.
+    """
+    loader: Any = main.__spec__ and main.__spec__.loader
+    return loader.folder.import_all() if isinstance(loader, _Loader) else {}
+
+
 def is_users(name: object) -> bool:
     """Whether this is the name of a module that `load` registered."""
     return str(name).startswith(PREFIX)
@@ -89,7 +103,7 @@ class _Folder(MetaPathFinder):
         compiled: Compile | None = None,
         own_builtins: Callable[[Any], dict[str, Any]] | None = None,
     ) -> None:
-        self._path, self._compiled = path, compiled
+        self._path, self.compiled = path, compiled
         self._package = PREFIX + hashlib.sha256(str(path).encode()).hexdigest()[:16]
         self._main = f"{self._package}.{path.stem.replace('.', '_')}"
         package = ModuleType(self._package)
@@ -97,11 +111,24 @@ class _Folder(MetaPathFinder):
         self._modules = {self._package: package}
         self._beside: dict[str, bool] = {}
         make = own_builtins or (lambda find: vars(builtins) | {"__import__": find})
-        self._builtins = make(self._import)
+        self.builtins = make(self._import)
 
     def load(self) -> ModuleType:
         self._registered(self._main)
         return self._modules[self._main]
+
+    def import_all(self) -> dict[str, ModuleType]:
+        """Every module of this run, with those that its functions import."""
+        read = set[str]()
+        while unread := self._modules.keys() - read:
+            read |= unread
+            for module in [self._modules[name] for name in sorted(unread)]:
+                file = Path(getattr(module, "__file__", None) or "")
+                for name, item, level in _named(_Source(file, None)) if file.suffix == ".py" else ():
+                    if level or self._is_beside(name.partition(".")[0]):
+                        with contextlib.suppress(ImportError):
+                            self._import(name, vars(module), None, [item] if item else [], level)
+        return self._modules
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Where a module of this run is. Python calls this while `_registered` imports."""
@@ -114,7 +141,7 @@ class _Folder(MetaPathFinder):
             spec = ModuleSpec(name, None, is_package=True)
             spec.submodule_search_locations = [str(where)]
             return spec
-        loader = _Loader(name, where, self._builtins, self._compiled) if where.suffix == ".py" else None
+        loader = _Loader(name, where, self) if where.suffix == ".py" else None
         return importlib.util.spec_from_file_location(name, where, loader=loader)
 
     def _import(
@@ -154,7 +181,7 @@ class _Folder(MetaPathFinder):
             try:
                 return __import__(name, fromlist=fromlist) if fromlist else importlib.import_module(name)
             finally:
-                self._modules = {n: sys.modules[n] for n in self._in_sys()}
+                self._modules.update({n: sys.modules[n] for n in self._in_sys()})
                 if outermost:
                     sys.meta_path.remove(self)
 
@@ -165,17 +192,17 @@ class _Folder(MetaPathFinder):
 class _Loader(SourceFileLoader):
     """Runs a source as it is now: it neither reads nor writes compiled files."""
 
-    def __init__(self, name: str, path: Path, users_builtins: dict[str, Any], compiled: Compile | None = None) -> None:
+    def __init__(self, name: str, path: Path, folder: _Folder) -> None:
         super().__init__(name, str(path))
-        self._builtins, self._compiled = users_builtins, compiled
+        self.folder = folder
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
-        code: CodeType = (self._compiled or self.source_to_code)(self.get_data(path), path)
+        code: CodeType = (self.folder.compiled or self.source_to_code)(self.get_data(path), path)
         return code
 
     def exec_module(self, module: ModuleType) -> None:
-        vars(module)["__builtins__"] = self._builtins
+        vars(module)["__builtins__"] = self.folder.builtins
         super().exec_module(module)
 
 

@@ -277,6 +277,18 @@ STATE = {
     "thread": "import threading\nbad = threading.active_count() > 1000",
     "subprocess": "import subprocess\nbad = subprocess.run(['true']).returncode != 0",
 }
+HELPER = """
+x: int = 0
+S = [0]
+def make():
+    k = [0]
+    def step():
+        k[0] += 1
+        return k[0]
+    return step
+step = make()
+"""
+"""A module beside every policy, under the name helper."""
 STATE_FILES = {
     "mutable default": "DEFAULT|def decide(view, kept=[]):\n    kept.append(1)\n    bad = len(kept) > 1000003",
     "callable object": """OBJECT|class Policy:
@@ -316,6 +328,132 @@ def decide(view):
 RNG = np.random.default_rng(3)
 def decide(view):
     bad = RNG.random() < 1e-6""",
+    "helper imported in the function": """HELPER|def decide(view):
+    import helper
+    helper.S[0] += 1
+    bad = helper.S[0] > 200000""",
+    "list imported in the function": """HELPER|def decide(view):
+    from helper import S
+    S[0] += 1
+    bad = S[0] > 200000""",
+    "closure imported in the function": """HELPER|def decide(view):
+    from helper import step
+    bad = step() > 200000""",
+    "annotations of a helper": """HELPER|import helper
+def decide(view):
+    from helper import __annotations__ as names
+    names["n"] = names.get("n", 0) + 1
+    bad = names["n"] > 200000""",
+    "list in an alias": """ALIAS|import typing
+G = list[[0]]
+def decide(view):
+    kept = typing.get_args(G)[0]
+    kept[0] += 1
+    bad = kept[0] > 200000""",
+    "list in a union of aliases": """ALIAS|import typing
+G = list[[0]] | None
+def decide(view):
+    kept = typing.get_args(typing.get_args(G)[0])[0]
+    kept[0] += 1
+    bad = kept[0] > 200000""",
+    "list in Annotated": """ALIAS|import typing
+G = typing.Annotated[int, [0]]
+def decide(view):
+    kept = typing.get_args(G)[1]
+    kept[0] += 1
+    bad = kept[0] > 200000""",
+    "iterator in Annotated": """ALIAS|import itertools, typing
+G = typing.Annotated[int, itertools.count()]
+def decide(view):
+    bad = next(typing.get_args(G)[1]) > 200000""",
+    "list in an itemgetter": """GETTER|import operator
+class Echo:
+    def __getitem__(self, key):
+        return key
+G = operator.itemgetter([0])
+def decide(view):
+    kept = G(Echo())
+    kept[0] += 1
+    bad = kept[0] > 200000""",
+    "annotations of a class": """ANNOTATIONS|import typing
+S = [0]
+class C:
+    x: S
+del S
+def decide(view):
+    kept = typing.get_type_hints(C)["x"]
+    kept[0] += 1
+    bad = kept[0] > 200000""",
+    "annotations of a function": """ANNOTATIONS|import typing
+S = [0]
+def f(x: S): pass
+del S
+def decide(view):
+    kept = typing.get_type_hints(f)["x"]
+    kept[0] += 1
+    bad = kept[0] > 200000""",
+    "metadata of a field": """FIELD|import dataclasses
+@dataclasses.dataclass
+class C:
+    x: int = dataclasses.field(default=0, metadata={"s": [0]})
+def decide(view):
+    kept = dataclasses.fields(C)[0].metadata["s"]
+    kept[0] += 1
+    bad = kept[0] > 200000""",
+    "tuple as the text of a class": """DOC|class C:
+    __doc__ = ([0],)
+def decide(view):
+    C.__doc__[0][0] += 1
+    bad = C.__doc__[0][0] > 200000""",
+    "deque as the text of a class": """DOC|import collections
+class C:
+    __doc__ = collections.deque([0])
+def decide(view):
+    C.__doc__[0] += 1
+    bad = C.__doc__[0] > 200000""",
+    "text of a function": """DOC|import functools
+class C:
+    def __init__(self, n): self.__doc__ = n
+ZERO = C(0)
+def f(): pass
+functools.update_wrapper(f, ZERO, ("__doc__",), ())
+def decide(view):
+    n = f.__doc__ + 1
+    functools.update_wrapper(f, C(n), ("__doc__",), ())
+    functools.update_wrapper(f, ZERO, (), ())
+    bad = n > 200000""",
+    "name of a function": """NAME|import functools
+class C:
+    def __init__(self, n): self.__name__ = n
+ZERO = C("")
+def f(): pass
+functools.update_wrapper(f, ZERO, ("__name__",), ())
+def decide(view):
+    n = int("0" + f.__name__) + 1
+    functools.update_wrapper(f, C(str(n)), ("__name__",), ())
+    functools.update_wrapper(f, ZERO, (), ())
+    bad = n > 200000""",
+    "deleter of a property": """DELETER|def make():
+    def f(self, kept=[0]):
+        kept[0] += 1
+        self.n = kept[0]
+    return f
+class B:
+    x = property(None, None, make())
+def decide(view):
+    b = B()
+    del b.x
+    bad = b.n > 200000""",
+    "signs of NaN": """NAN|import math
+S = [float("nan")] * 19
+def decide(view):
+    k = 0
+    while k < 19 and math.copysign(1, S[k]) < 0:
+        S[k] = -S[k]
+        k += 1
+    if k < 19:
+        S[k] = -S[k]
+    bad = sum(2**k for k in range(19) if math.copysign(1, S[k]) < 0) > 200000""",
 }
 
 OUTSIDE = {

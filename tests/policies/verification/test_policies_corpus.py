@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from policies_corpus import FAULTY, LINE, RIGHT
+from policies_corpus import FAULTY, HELPER, LINE, RIGHT
 
 from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants import parse
@@ -28,6 +28,7 @@ def verify(tmp_path: Path) -> Verify:
     def act(source: str) -> list[ProofVerdict]:
         path = tmp_path / "policy.py"
         path.write_text(source)
+        (tmp_path / "helper.py").write_text(HELPER)
         return prove(resolve(f"{path}:decide"), parse(LINE), max_drones=3, views=0)
 
     return act

@@ -59,7 +59,7 @@ def test_what_changes_is_noticed_wherever_a_function_keeps_it(tmp_path: Path, ke
     path = tmp_path / "keeps.py"
     path.write_text(keeper)
     use = load(path).use
-    kept = Kept({"it": use})
+    kept = Kept(lambda: {"it": use})
     assert kept.changed() == ""
     use()
     assert kept.changed() == "changes it"
@@ -70,7 +70,7 @@ def test_what_python_keeps_of_flags_is_no_memory_and_what_a_policy_keeps_is(tmp_
     path = tmp_path / "flags.py"
     path.write_text(f"import enum\nclass Mode(enum.{kind}):\n    A = 1\n    B = 2\n    C = 4\n")
     mode = load(path).Mode
-    kept = Kept({"it": mode})
+    kept = Kept(lambda: {"it": mode})
     assert (mode.A | mode.B) & ~mode.B == mode.A
     assert kept.changed() == ""
     (mode.A | mode.B).often = 1
