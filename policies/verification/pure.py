@@ -16,6 +16,7 @@ import re
 import statistics
 import sys
 import types
+import typing
 from enum import Enum
 from typing import Any
 
@@ -107,7 +108,8 @@ _NOT = {
     operator.attrgetter: "operator.attrgetter", operator.methodcaller: "operator.methodcaller",
     operator.is_: "operator.is_", operator.is_not: "operator.is_not", functools.lru_cache: "functools.lru_cache",
     functools.cache: "functools.cache", functools.singledispatch: "functools.singledispatch",
-    statistics.NormalDist: "statistics.NormalDist", getattr(operator, "call", None): "operator.call",
+    statistics.NormalDist: "statistics.NormalDist", typing.overload: "typing.overload",
+    typing.get_overloads: "typing.get_overloads", getattr(operator, "call", None): "operator.call",
 }  # fmt: skip
 _OPEN_MODULES = frozenset(
     {"builtins", "math", "operator", "_operator", "itertools", "_functools", "_bisect", "_heapq", "_collections"}
@@ -188,6 +190,16 @@ def is_trusted(home: str) -> bool:
 def is_own_cache(value: Any) -> bool:
     """Whether this is a function of Sortie's own that keeps results (`functools.cache`)."""
     return hasattr(value, "cache_info") and is_trusted(str(value.__module__))
+
+
+def is_cache_key(value: Any) -> bool:
+    """Whether a cache may keep this as an argument: a plain number or text, a part of Sortie's, or a tuple of these."""
+    if isinstance(value, tuple | frozenset):
+        members = (frozenset if isinstance(value, frozenset) else tuple).__iter__(value)  # type: ignore[arg-type]
+        return not is_users(home_of(type(value))) and all(map(is_cache_key, members))
+    return type(value) in (int, str, bytes) or (
+        home_of(type(value)).startswith("sortie.") and isinstance(value, int | float | str)
+    )
 
 
 def is_seeded(path: str) -> bool:

@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import fingerprint
+from sortie.policies.verification.pure import is_cache_key, is_own_cache
 from sortie.policies.verification.symbols import Refused
 
 
@@ -114,6 +115,8 @@ _COMPARABLE = ({str}, {bytes}, {int, float, bool})
 
 def ordered_for(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """Arguments of a call, with plain sets for functions that sort them, and watched ones to be made by others."""
+    if is_own_cache(function) and not all(map(is_cache_key, (*args, *kwargs.values()))):
+        stop(f"gives {function.__name__} something that it keeps from one decision to the next")
     is_blind = any(function is f for f in _BLIND) and "key" not in kwargs  # equal keys would show the order
 
     def one(value: Any) -> Any:
@@ -121,7 +124,8 @@ def ordered_for(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) ->
             return value if function in (isinstance, issubclass) else Unordered if value is set else UnorderedFrozen
         if is_blind and type(value) in (Unordered, UnorderedFrozen):
             members = list((set if type(value) is Unordered else frozenset).__iter__(value))
-            return members if any({type(x) for x in members} <= kinds for kinds in _COMPARABLE) else value
+            alike = any({type(x) for x in members} <= kinds for kinds in _COMPARABLE)
+            return members if alike and all(x == x for x in members) else value  # NaN leaves the order as it was
         return value
 
     return tuple(map(one, args)), {name: one(value) for name, value in kwargs.items()}

@@ -454,6 +454,23 @@ def decide(view):
     if k < 19:
         S[k] = -S[k]
     bad = sum(2**k for k in range(19) if math.copysign(1, S[k]) < 0) > 200000""",
+    "key of a cache": """CACHE|from sortie.policies.contract import nothing
+class C:
+    n = 0
+    def __hash__(self): return 7
+    def __eq__(self, other): return True
+def decide(view):
+    kept = nothing(view.ego * 0 - 5, C(), "x").destination
+    kept.n += 1
+    bad = kept.n > 200000""",
+    "overloads": """OVERLOAD|import typing
+def decide(view):
+    def k(): return 0
+    before = typing.get_overloads(k)
+    n = before[0]() + 1 if before else 0
+    @typing.overload
+    def k(): return n
+    bad = n > 200000""",
 }
 
 OUTSIDE = {
@@ -487,6 +504,7 @@ OUTSIDE = {
     "order of a set": "bad = next(iter({'a', 'b', 'c'})) == 'c' and soc == 0.4",
     "order of a set in a loop": "for x in {'a', 'b', 'c'}:\n    bad = x == 'c' and soc == 0.4",
     "order of a set by a key": "bad = max({'a', 'b', 'c'}, key=lambda _: 0) == 'c' and soc == 0.4",
+    "order of a set with NaN": "bad = sorted({float('nan'), 1.0, 2.0})[0] == 2.0 and soc == 0.4",
     "order of a set sorted by a key": "bad = sorted({'a', 'b', 'c'}, key=lambda _: 0)[0] == 'c' and soc == 0.4",
     "pop of a set": "bad = {'a', 'b', 'c'}.pop() == 'c' and soc == 0.4",
     "list of a set": "bad = list({'a', 'b', 'c'})[0] == 'c' and soc == 0.4",
