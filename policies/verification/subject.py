@@ -41,11 +41,11 @@ def _with_checks(source: Source) -> Policy:
 
 
 def own_invariants(policy: Policy) -> object:
-    """What a policy's file keeps under `INVARIANTS`, however the policy itself was made; None for a policy without a file."""
+    """What a policy's file keeps under `INVARIANTS`, however the policy itself was made; empty text where there are none."""
     found: Any = policy
     while isinstance(found, functools.partial):
         found = found.func
-    return None if not isinstance(found, Guarded) or found.source is None else found.source.names.get(OWN_INVARIANTS)
+    return "" if not isinstance(found, Guarded) or found.source is None else found.source.names.get(OWN_INVARIANTS, "")
 
 
 def _is_sorties(function: Callable[..., Any]) -> bool:

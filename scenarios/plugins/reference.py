@@ -145,7 +145,8 @@ def from_file(kind: str, reference: str, error: type[SortieError] = PluginError)
         inspect.signature(function)
     except (TypeError, ValueError) as failure:  # some of those written in C
         raise error(f"{kind} file {file!r}: {attribute!r} names no parameters, must be a Python function") from failure
-    return function if isinstance(function, Guarded) else Guarded(function, Source(path, attribute, vars(module)))
+    plain = function.__wrapped__ if isinstance(function, Guarded) else function  # whose own file may be another one
+    return Guarded(plain, Source(path, attribute, vars(module)))
 
 
 def _from_package(kind: str, entry: EntryPoint, error: type[SortieError]) -> Callable[..., Any]:

@@ -417,7 +417,7 @@ def test_a_policy_with_its_parameters_is_searched_with_them(tmp_path: Path) -> N
     assert why == ""
     assert [d.rate_hz for d in follows(VIEW.frozen)] == [6.0, 6.0]
     assert own_invariants(policy) == "rate_hz <= 9"
-    assert own_invariants(resolve("worked", {"rho": 0.5})) is None
+    assert own_invariants(resolve("worked", {"rho": 0.5})) == ""
     rules = shield(policy, ()).rules  # type: ignore[attr-defined]
     shielded, why = searchable(Shielded(policy, rules))
     assert isinstance(shielded, Shielded)

@@ -10,6 +10,7 @@ from cli_examples import command
 from sortie.policies.contract import TaskPhase
 from sortie.policies.registry import resolve
 from sortie.policies.verification.conformance import RULES
+from sortie.policies.verification.subject import own_invariants
 from sortie.policies.verification.views import draw_views, from_json, to_json
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
 from sortie.sim.cli import console
@@ -275,6 +276,25 @@ def test_invariants_that_are_no_text_are_refused(tmp_path: Path, capsys: pytest.
     path.write_text(f"INVARIANTS = ['rate_hz <= 5']\n{ALIASES['alias']}")
     assert command("verify", f"{path}:decide", *QUICK, "--out", tmp_path / "out") == 2
     assert capsys.readouterr().err == f"error: {path}:decide: INVARIANTS is of type list, must be text\n"
+
+
+def test_invariants_that_are_none_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "policy.py"
+    path.write_text(f"INVARIANTS = None\n{ALIASES['alias']}")
+    assert command("verify", f"{path}:decide", *QUICK, "--out", tmp_path / "out") == 2
+    assert capsys.readouterr().err == f"error: {path}:decide: INVARIANTS is of type NoneType, must be text\n"
+
+
+@pytest.mark.parametrize("kind", ["guarded", "resolved"])
+def test_the_named_files_invariants_are_read_where_its_policy_is_already_guarded(kind: str, tmp_path: Path) -> None:
+    other, path = tmp_path / "other.py", tmp_path / "policy.py"
+    other.write_text("def decide(view):\n    return []\n")
+    made = {
+        "guarded": "from sortie.scenarios.plugins.user_calls import guarded\n@guarded\ndef decide(view):\n    return []\n",
+        "resolved": f"from sortie.policies.registry import resolve\ndecide = resolve({f'{other}:decide'!r})\n",
+    }
+    path.write_text(f"INVARIANTS = 'rate_hz <= 5'\n{made[kind]}")
+    assert own_invariants(resolve(f"{path}:decide")) == "rate_hz <= 5"
 
 
 def test_a_line_about_time_gets_a_scenario_that_flies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
