@@ -148,7 +148,11 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
             *(value.__defaults__ or ()),
             *(value.__kwdefaults__ or {}).values(),
             *(v for v in value.__dict__.values() if not isinstance(v, inspect.Signature)),
-            *([] if is_others else [value.__code__, value.__name__, value.__qualname__, value.__module__, value.__doc__]),
+            *(
+                []
+                if is_others
+                else [value.__code__, value.__name__, value.__qualname__, value.__module__, value.__doc__]
+            ),
             *([] if is_others else value.__annotations__.values()),
         ]
     elif isinstance(value, types.ModuleType):
