@@ -53,7 +53,7 @@ NMS_IOU = 0.15
 OWN_WEIGHT = 2.0
 """Weight of an ego's boxes that come from fused maps; a drone that looked alone weighs 1. Of 1, 2, 3 and 5, tried on the
 calibration's held-out scenes, 1 and 2 lie within 0.01 of AP of each other and 5 up to 0.05 below. Where maps are read alone as
-well, it is at least 1 and the number of those maps. Suppression does not use it."""
+well, it is 1 plus their number, if that is more. Suppression does not use it."""
 LATE_MIN_SCORE = 0.2
 """In late fusion peers send boxes with a score above this."""
 Rule = Literal["nms", "average"]
