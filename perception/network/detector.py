@@ -66,11 +66,11 @@ def shipped(fusion: str) -> Path:
 
 
 def named_weights(weights: Path | None) -> Path:
-    """The file of a network: DiscoNet's shipped one for None; a shipped one may be named without its folder.
+    """The file of a network: the default one for None; a shipped one may be named without its folder.
 
     Example:
         >>> named_weights(None).name, named_weights(Path("fine.safetensors")).parent == NETWORKS
-        ('disconet.safetensors', True)
+        ('fine.safetensors', True)
     """
     return SHIPPED_WEIGHTS if weights is None else located(weights)
 

@@ -78,7 +78,7 @@ class Perception(Section):
     )
     weights: str | None = Field(
         None,
-        description="A safetensors file: a network's. The surrogate takes the calibration beside it (`NAME.surrogate.safetensors`), or the file if it is one. Left out, the shipped network; `fine.safetensors` names the second shipped one.",
+        description="A safetensors file: a network's. The surrogate takes the calibration beside it (`NAME.surrogate.safetensors`), or the file if it is one. Left out, the default network of the fusion; `disconet.safetensors` names the coarse one, which was the default before and was trained as those of other fusions were.",
     )
     codebook: str | None = Field(
         None,

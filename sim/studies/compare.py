@@ -40,8 +40,10 @@ class Contender(NamedTuple):
     """Decides in place of the scenario's policy; None where the scenario names it."""
 
     def with_own_fusion(self) -> Contender:
-        """The same with the fusion that its method was published with, where it is a prior method, and with that fusion's network;
-        all of these were trained on the same few frames."""
+        """The same with the fusion that its method was published with, where it is a prior method, and with that fusion's network.
+
+        These networks were all trained on the same few frames; the default one was trained on many more.
+        """
         fusion = None if self.function is not None else own_fusion(self.scenario.policy.name)
         if fusion is None:
             return self

@@ -130,8 +130,10 @@ def test_the_shipped_codebook_belongs_to_the_shipped_network_and_has_every_lengt
 def test_a_shipped_codebook_may_be_named_without_its_folder() -> None:
     """As its network: here another network's, so that it is found and refused."""
     scene, (ego, peer) = SceneModel(Scene(), None, (-50, -50, 50, 50)), cross(0.0, 0.0, 0.3)[:2]
-    detector = TorchDetector(scene, Perception(codebook="fine.codebook.safetensors"), 1)
-    with pytest.raises(InputError, match=r"fine\.codebook\.safetensors: fitted to another encoder than the weights'"):
+    detector = TorchDetector(scene, Perception(codebook="disconet.codebook.safetensors"), 1)
+    with pytest.raises(
+        InputError, match=r"disconet\.codebook\.safetensors: fitted to another encoder than the weights'"
+    ):
         detector.detect([(ego, [Share(peer, "codes", 0.1, None, 1.0)])])
 
 

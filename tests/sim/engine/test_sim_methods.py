@@ -90,5 +90,7 @@ def test_own_fusion_flies_the_methods_own_network(tmp_path: Path) -> None:
         return {s["policy"]: s["outcome"]["ap50"]["full_scene"] for s in json.loads(path.read_text())["sorties"]}
 
     one, own = seen(), seen("--own-fusion")
-    assert one["v2vnet-style(rho=0.02)"] == one["disconet-style(rho=0.02)"] == own["disconet-style(rho=0.02)"]
-    assert own["v2vnet-style(rho=0.02)"] != one["v2vnet-style(rho=0.02)"]
+    assert one["v2vnet-style(rho=0.02)"] == one["disconet-style(rho=0.02)"]
+    assert len({one["v2vnet-style(rho=0.02)"], *own.values()}) == 3, (
+        "DiscoNet's is that which was trained as V2VNet's was"
+    )
