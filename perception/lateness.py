@@ -22,11 +22,11 @@ from sortie.perception.types import Boxes, Capture, Share
 
 Floats = NDArray[np.float64]
 
-SIGMA0_M = 0.39
+SIGMA0_M = 0.35
 """Standard deviation of a fresh box's place, along each axis."""
-SPEED_MPS = 6.3
+SPEED_MPS = 5.9
 """Speed of the cars that move."""
-MOVING = 0.47
+MOVING = 0.45
 """Share of the boxes whose cars move."""
 INSTANT_S = 1e-9
 """Ages closer together than this are equal but for rounding."""

@@ -135,7 +135,7 @@ class Perception(Section):
         "fitted",
         description="What covariance intersection assumes that the errors of several drones' boxes have in common: a fitted share, or anything, as in its first form (Julier and Uhlmann 1997).",
     )
-    score_threshold: float = Field(0.1, ge=0, le=1, description="Detections below this score are dropped.")
+    score_threshold: float = Field(0.25, ge=0, le=1, description="Detections below this score are dropped.")
     cells_by: Literal["confidence", "norm"] = Field("confidence", description="What ranks the cells under a budget.")
     serve: Literal["grid", "region_first"] = Field(
         "grid",

@@ -13,7 +13,7 @@ from sortie.perception.budget import content_bytes
 from sortie.perception.errors import InputError
 from sortie.perception.intersection import intersect, inverse
 from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
-from sortie.perception.lateness import MOVING, SPEED_MPS
+from sortie.perception.lateness import MOVING, SIGMA0_M, SPEED_MPS
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.training.box_errors import Errors, calibration, common, errors_of, fit
@@ -137,7 +137,7 @@ def test_age_grows_a_covariance_by_what_cars_may_have_moved_or_by_a_tracks_veloc
     first = spread_of(FLAT, own, HERE)
     for source, more_m2 in (
         (late, MOVING * (SPEED_MPS * 0.2) ** 2),
-        (replace(late, velocity_mps=np.zeros((1, 2)), variance_m2=np.array([0.39**2 + 0.05])), 0.05),
+        (replace(late, velocity_mps=np.zeros((1, 2)), variance_m2=np.array([SIGMA0_M**2 + 0.05])), 0.05),
     ):
         grown = covariance.astype(float) + more_m2 * np.array([[1.0, 0.0, 1.0]])
         information = inverse(np.concatenate([first.astype(float), grown]))

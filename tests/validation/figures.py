@@ -482,6 +482,12 @@ def _read_maps() -> Tables:
     return read_maps.tables()
 
 
+def _trucks() -> Tables:
+    import trucks
+
+    return {"trucks": trucks.table()}
+
+
 def _score_threshold() -> Tables:
     import score_threshold
 
@@ -765,6 +771,7 @@ FIGURES: dict[str, Figure] = {
     "fine_times": Figure(1, _fine_times, timed=True),
     "fine_network": Figure(7, _fine_network),
     "read_maps": Figure(12, _read_maps),
+    "trucks": Figure(1, _trucks),
     "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),
     "fine_flights": Figure(20, _fine_flights),

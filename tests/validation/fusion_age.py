@@ -13,20 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from stored import Column, Table, points
-from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.benchmark.dataset import Benchmark
 from sortie.perception.benchmark.difficulty import Split
 from sortie.perception.benchmark.scenes import AREA_M, DRONES, draw_captures, draw_scene
+from sortie.perception.geometry import CELLS
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import Matched, match, suppress
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.bev import lift
 from sortie.perception.network.decode import decode
-from sortie.perception.network.fusion.base import takes_part
+from sortie.perception.network.fused import Peer, fused_map
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
-from sortie.perception.network.warp import warp
 from sortie.perception.scene.render import Renderer
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
@@ -114,37 +113,30 @@ def _frame(
 ) -> dict[tuple[str, float], list[Boxes]]:
     """Boxes of every ego alone and, for each age, with its peers' features placed in the two ways."""
     geometry = net.config.geometry
-    middle = np.mean([c.est_pose[:2] for c in fleet], axis=0)
 
-    def poses(captures: Sequence[Capture]) -> torch.Tensor:
-        return torch.from_numpy(np.array([c.est_pose for c in captures]) - [*middle, 0.0]).float()
-
-    def boxes(fused: torch.Tensor, ego: int) -> Boxes:
+    def boxes(fused: torch.Tensor | None, ego: int) -> Boxes:
+        assert fused is not None
         local = decode(net.head(fused)[0], SCORE_THRESHOLD, geometry).numpy()
         return suppress(Boxes.placed(local, fleet[ego].est_pose), NMS_IOU)
 
-    now, own = poses(fleet), torch.empty(0)
-    everywhere = torch.ones(DRONES - 1, 1, 64, 64, dtype=torch.bool)
-    ones = torch.ones(1, DRONES - 1)
+    own = torch.empty(0)
+    everywhere = torch.ones(CELLS, CELLS, dtype=torch.bool)
     out: dict[tuple[str, float], list[Boxes]] = {}
     for age in ages_s:
         then = [earlier(c, age, speed_mps) for c in fleet]
-        features = net.encoder(lift(renderer.render(then), then, geometry))
+        maps = net.spread(net.encoder(lift(renderer.render(then), then, geometry)))
         if age == 0.0:
-            own = features
+            own = maps
             out["single", age] = [boxes(own[ego : ego + 1], ego) for ego in range(DRONES)]
-        for how, there in (("compensated", poses(then)), ("ignored", now)):
+        for how, at in (("compensated", then), ("ignored", fleet)):
             if how == "ignored" and age == 0.0:
                 out[how, age] = out["compensated", age]
                 continue
-            found = []
-            for ego in range(DRONES):
-                peers = [i for i in range(DRONES) if i != ego]
-                moved, sent, inside = warp(features[peers], everywhere, now[ego], there[peers], geometry.cell_m)
-                part = takes_part(sent[None, :, 0], inside[None, :, 0], ones, "masked")
-                agents = torch.cat([own[ego : ego + 1], moved])[None]
-                found.append(boxes(net.fusion(agents, part, F.pad(ones, (1, 0), value=1.0)), ego))
-            out[how, age] = found
+            peers = [Peer(c.est_pose, 1.0, map_, everywhere) for c, map_ in zip(at, maps, strict=True)]
+            out[how, age] = [
+                boxes(fused_map(net, c.est_pose, own[i], peers[:i] + peers[i + 1 :], "masked"), i)
+                for i, c in enumerate(fleet)
+            ]
     return out
 
 

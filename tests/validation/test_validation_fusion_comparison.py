@@ -8,12 +8,12 @@ import fusion_comparison
 
 from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
 from sortie.perception.network.checkpoint import load_weights
-from sortie.perception.network.detector import SHIPPED_WEIGHTS
+from sortie.scenarios.shipped import NETWORKS
 
 
 def test_one_frame_gives_every_row(tmp_path: Path) -> None:
     split = make_split(Benchmark(), "test", tmp_path, scenes=1, workers=1)
-    rows = fusion_comparison.measure({"disconet": load_weights(SHIPPED_WEIGHTS)}, load_frames(split))
+    rows = fusion_comparison.measure({"disconet": load_weights(NETWORKS / "disconet.safetensors")}, load_frames(split))
     assert [(r.method, r.received_budget) for r in rows] == [
         ("disconet", 1.0), ("disconet", 0.05), ("none", 0.0), ("late, nms", 0.0), ("late, average", 0.0),
     ]  # fmt: skip

@@ -10,8 +10,8 @@ from sortie.perception.lateness import MOVING, SIGMA0_M, SPEED_MPS, still_right
 
 
 def test_lateness_is_what_the_calibration_towns_show() -> None:
-    """The parameters were fitted before the surrogate's draws belonged to the car. With those of now the fit lies within twice
-    its standard error, as eighths of the towns show it, of what rounds to them; towns are what was drawn independently."""
+    """The fit lies within twice its standard error, as eighths of the towns show it, of what rounds to the parameters; towns are
+    what was drawn independently."""
     eighths = [observed(range(k, TOWNS, 8)) for k in range(8)]
     kept = Kept(*(np.concatenate([getattr(e, f.name) for e in eighths]) for f in fields(Kept)))
     error = np.std([fitted(e) for e in eighths], axis=0, ddof=1) / np.sqrt(8)

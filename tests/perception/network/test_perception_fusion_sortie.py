@@ -72,7 +72,9 @@ def test_late_fusion_sends_what_is_sure() -> None:
 
 
 def test_late_fusion_pays_for_the_boxes_that_it_sends(scene: SceneModel, fleet: list[Capture]) -> None:
-    late, other = (TorchDetector(scene, Perception(fusion=fusion), seed=1) for fusion in ("late", "disconet"))
+    late, other = (
+        TorchDetector(scene, Perception(fusion=fusion, score_threshold=0.1), seed=1) for fusion in ("late", "disconet")
+    )
     alone = late.detect([(fleet[1], [])])[0]
     for roi in (None, (10.0, 20.0, 40.0)):
         assert late.count_boxes(fleet[1], roi) == len(sendable(alone).inside(roi))

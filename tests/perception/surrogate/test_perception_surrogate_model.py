@@ -174,7 +174,7 @@ def test_surer_drones_find_more(parameters: Parameters) -> None:
 
 def test_one_draw_says_whether_there_is_a_box_and_the_other_how_high_its_score_is(parameters: Parameters) -> None:
     first, second = (draw.ravel() for draw in np.meshgrid(np.linspace(0.01, 0.99, 40), [0.6, 0.8, 0.95]))
-    score = parameters.find(lonely(len(first), range=0.5), np.column_stack([first, second]).astype(np.float32)).reshape(
+    score = parameters.find(lonely(len(first), range=0.7), np.column_stack([first, second]).astype(np.float32)).reshape(
         3, 40
     )
     there = score > 0.0

@@ -87,7 +87,7 @@ def test_without_compensation_the_map_that_leads_for_a_drone_without_a_look_lies
 
 def test_of_many_draws_of_everything_each_has_cars_of_its_own_that_are_hard_and_false_positives_of_its_own() -> None:
     """Where every car has one draw for all, which of them are found is the town's draw; one draw is the same twice. Of the cars
-    that a drone finds in either of two draws, about a fifth are found in one of them alone, here over five drones."""
+    that a drone finds in either of two draws, about an eighth are found in one of them alone, here over five drones."""
     none_shared = np.array([0.0, 1.0, 0.0, 0.0], np.float32)
     hung = replace(detector().parameters, alike=np.ones(4, np.float32), shared_false_positives=none_shared)
     cars = SCENE.cars_at(FLEET[0].t_s)
@@ -103,9 +103,9 @@ def test_of_many_draws_of_everything_each_has_cars_of_its_own_that_are_hard_and_
         hits.append(found)
         alarms.append(of_nobody)
     assert (hits[0], alarms[0]) == (hits[2], alarms[2])
-    assert len(hits[0] ^ hits[1]) > 0.15 * len(hits[0] | hits[1])
+    assert len(hits[0] ^ hits[1]) > 0.1 * len(hits[0] | hits[1])
     assert len(alarms[0]) > 1
-    assert not alarms[0] & alarms[1]
+    assert len(alarms[0] & alarms[1]) < 0.05 * len(alarms[0]), "the same sample of the pool by chance"
 
 
 @pytest.mark.parametrize("threshold", [0.05, 0.33, 0.62])

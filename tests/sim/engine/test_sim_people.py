@@ -179,9 +179,11 @@ def test_a_weight_of_zero_brings_nobody() -> None:
 
 
 def test_people_are_tracked_and_sent_as_tracks() -> None:
-    told = shared(sends(Representation.TRACKS))
-    alone, silent = located(shared("silence"))[0], shared("silence")
-    assert located(told)[0] > alone + 0.1
+    """A payload has a drone's twelve best tracks, mostly cars, so fewer people come with tracks than with detections."""
+    told, silent = shared(sends(Representation.TRACKS)), shared("silence")
+    assert located(silent)[0] < located(told)[0] < located(shared(sends(Representation.DETECTIONS)))[0]
+    few = shared(sends(Representation.TRACKS), "perception.score_threshold=0.8")
+    assert located(few)[0] > located(silent)[0] + 0.1, "where few cars are tracked"
     assert outcome(told)["tracking"]["hota"] is not None
     assert not silent.tables["transmissions"].num_rows
 
