@@ -77,7 +77,7 @@ def ways(root: Path) -> Table:
         rows += [_way(name, r, found) for r in found]
         if name == "fine":
             matched = representations.measure(with_matched_poses(frames, weights), weights, (1.0,), ())
-            names = {f"{label}, poses matched": r for r in matched if (label := r.way.label) in (WHOLE, BOXES)}
+            names = {f"{label}, corrected poses": r for r in matched if (label := r.way.label) in (WHOLE, BOXES)}
             more = [replace(r, way=replace(r.way, label=label)) for label, r in names.items()]
             rows += [_way(name, r, [*found, *more]) for r in more]
     columns = [Column("network"), Column("shared"), Column("an ego receives in a frame", ",.2f", " kB"), Column("AP@0.5", ".3f")]  # fmt: skip
@@ -135,7 +135,7 @@ def flights() -> Table:
     for name, weights in NETWORKS.items():
         ap = {policy: flown(weights, policy) for policy in POLICIES}
         if name == "fine":
-            ap |= {f"{p}, poses matched": flown(weights, p, "perception.match_poses=true") for p in POLICIES[1:]}
+            ap |= {f"{p}, corrected poses": flown(weights, p, "perception.match_poses=true") for p in POLICIES[1:]}
         for label, each in ap.items():
             over = [
                 None if label == other or other is None else _gain(each, ap[other])
@@ -150,7 +150,7 @@ def flights() -> Table:
 
 def _plain(label: str) -> str | None:
     """The policy of a row with matched poses."""
-    policy, matched, _ = label.partition(", poses matched")
+    policy, matched, _ = label.partition(", corrected poses")
     return policy if matched else None
 
 
@@ -186,7 +186,7 @@ def draw(table: Table, path: Path) -> None:
             x, (ap, low, high) = [v[0] for v in chosen], np.array([v[1] for v in chosen]).T
             label = f"{network}: {kind}"
             axes.errorbar(x, ap, yerr=[ap - low, high - ap], color=colour, marker=marker, capsize=2, label=label)
-        for label, marker in ((f"{BOXES}, poses matched", "D"), (f"{WHOLE}, poses matched", "*")):
+        for label, marker in ((f"{BOXES}, corrected poses", "D"), (f"{WHOLE}, corrected poses", "*")):
             if label in rows:
                 x, (ap, low, high) = rows[label]
                 style = {"color": "#d08a1d", "marker": marker, "ms": 9, "capsize": 2}

@@ -69,7 +69,7 @@ class Way:
         name = {"none": "silence", "detections": "averaged boxes"}.get(self.sent) or (
             "whole maps" if self.rho == 1.0 else f"maps, ρ = {self.rho:g}"
         )
-        return name + ", read alone too" * self.read + ", poses matched" * self.matched
+        return name + ", read alone too" * self.read + ", corrected poses" * self.matched
 
 
 WAYS = (
@@ -140,7 +140,7 @@ def flight_table() -> Table:
             None if other == (policy, read, matched) else _interval(np.subtract(each, ap[other]).tolist())
             for other in (("boxes", False, matched), (policy, False, matched))
         ]
-        rows.append([policy + ", maps read alone too" * read + ", poses matched" * matched, _interval(each), *over])
+        rows.append([policy + ", maps read alone too" * read + ", corrected poses" * matched, _interval(each), *over])
     columns = [Column("policy"), Column("AP of the full scene", ".3f")]
     columns += [Column(name, "+.1f", factor=100) for name in ("over `boxes`, same poses", "by reading")]
     about = f"`track_target` for 16 s, scored once a second; towns and seeds {TOWNS[0]} to {TOWNS[-1]}; intervals over flights."
