@@ -318,12 +318,20 @@ class ViewOfRanges(FleetView):
 
     @property
     def attached(self) -> FleetView:
-        near: FleetView = FleetView.attached.fget(self)  # type: ignore[attr-defined]
-        return self if near is self else self._replace(descriptors=near.descriptors, age_s=near.age_s)
+        near: FleetView = FleetView.attached.fget(_without_order(self))  # type: ignore[attr-defined]
+        if len(near.age_s) == len(self.age_s):
+            return self
+        return self._replace(descriptors=near.descriptors, age_s=near.age_s)
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
         return FleetView
+
+
+def _without_order(view: FleetView) -> FleetView:
+    """The view by ascending id, which no policy may see."""
+    by_id = [{i: m[i] for i in sorted(m)} for m in (view.descriptors, view.age_s)]
+    return FleetView(view.ego, view.period_s, by_id[0], by_id[1], view.detached_after_periods)
 
 
 _ORDER = "peers by overlap with drone "

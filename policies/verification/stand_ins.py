@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
+from sortie.policies.contract import _copied
 from sortie.policies.verification.symbols import Path
 
 FLAGS = 8
@@ -70,7 +71,9 @@ class InAnyOrder(dict[int, Any]):
 
 def is_blind(frame: Any) -> bool:
     """Whether the code that iterates is Sortie's own, and does not do so on behalf of a user's."""
-    return str(frame.f_globals.get("__name__", "")).startswith("sortie.") and frame.f_code.co_name != FOR_USER
+    home = str(frame.f_globals.get("__name__", ""))
+    # a copy has the order of its original, which whoever gets the copy can see
+    return home.startswith("sortie.") and frame.f_code.co_name != FOR_USER and frame.f_code is not _copied.__code__
 
 
 FOR_USER = "on_behalf_of_the_policy"

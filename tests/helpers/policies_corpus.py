@@ -256,6 +256,14 @@ RECOGNISED = {
             ("me.battery_soc = 1", "AttributeError", "can't set"),
         )
     },
+    **{
+        f"order of {made}": f"s = list({made}.descriptors)\nbad = len(s) < len(view.age_s) and s != sorted(s) and {RARE}"
+        for made in (
+            "FleetView(view.ego, view.period_s, view.descriptors, view.age_s).attached",
+            "FleetView.attached.fget(view)",
+            "view.attached",
+        )
+    },
 }
 """What a stand-in must share with the real object, each before a fault in few views."""
 
