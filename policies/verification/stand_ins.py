@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
-from sortie.policies.contract import _copied
+from sortie.policies.contract import plain_copy
 from sortie.policies.verification.symbols import Path
 
 FLAGS = 8
@@ -73,7 +73,7 @@ def is_blind(frame: Any) -> bool:
     """Whether the code that iterates is Sortie's own, and does not do so on behalf of a user's."""
     home = str(frame.f_globals.get("__name__", ""))
     # a copy has the order of its original, which whoever gets the copy can see
-    return home.startswith("sortie.") and frame.f_code.co_name != FOR_USER and frame.f_code is not _copied.__code__
+    return home.startswith("sortie.") and frame.f_code.co_name != FOR_USER and frame.f_code is not plain_copy.__code__
 
 
 FOR_USER = "on_behalf_of_the_policy"
