@@ -26,6 +26,7 @@ from sortie.policies.contract import Descriptor, Directive, FleetView, Policy, P
 from sortie.policies.registry import parameters, viewpoint_of
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.invariants import just_heard
+from sortie.policies.verification.search import BUDGET_S, LEAST_VIEWS, Budget, drawn_budget
 from sortie.policies.verification.subject import searchable
 from sortie.policies.verification.symbols import Refused
 from sortie.policies.verification.views import draw_view, draw_views, shrink
@@ -38,6 +39,8 @@ DECISION_LIMIT_S = 0.010
 """A tenth of a frame at 10 Hz, at 20 drones. The limit is generous, because machines differ; the time is reported."""
 SHUFFLED = 100
 """How many of the views are decided twice, in two orders."""
+TIMED = 50
+"""How many decisions are timed at each size."""
 _STALE_PERIODS = 20.0  # beyond the plane's ten, at which a peer is detached
 _ROUNDING = 1e-9
 
@@ -62,7 +65,12 @@ class _Raised(Exception):
 
 
 def conform(
-    policy: Policy, views: Iterable[FleetView] | None = None, *, seed: int = 0, count: int = VIEWS
+    policy: Policy,
+    views: Iterable[FleetView] | None = None,
+    *,
+    seed: int = 0,
+    count: int = VIEWS,
+    budget_s: float = BUDGET_S,
 ) -> list[Check]:
     """Check a policy against every rule of the kit.
 
@@ -71,13 +79,18 @@ def conform(
         views: the views to test it on; without them, the first `count` views of `seed`.
         seed: of the drawn views.
         count: how many.
+        budget_s: wall-clock time for all rules together, at least `LEAST_DRAWN_S`. Each rule gets a share.
 
     Returns:
-        One check for each rule, always in the same order. A rule that no view could check does not hold.
+        One check for each rule, always in the same order. A rule that no view could check does not hold. Where the time
+        ended, the check names the number of views.
     """
     tried = list(draw_views(seed, count) if views is None else views)
-    checks = [_check_rule(name, rule, policy, tried) for name, rule in RULES.items()]
-    return [*checks, _keeps_no_memory(policy, tried), _decides_in_time(policy)]
+    # no memory decides three times on each view
+    *of_rules, of_memory, _, _, of_timing = drawn_budget(budget_s).shares(len(RULES) + 4)
+    rules = zip(RULES.items(), of_rules, strict=True)
+    checks = [_check_rule(name, rule, policy, tried, budget) for (name, rule), budget in rules]
+    return [*checks, _keeps_no_memory(policy, tried, of_memory), _decides_in_time(policy, of_timing)]
 
 
 def failing(checks: Sequence[Check]) -> list[Check]:
@@ -85,28 +98,36 @@ def failing(checks: Sequence[Check]) -> list[Check]:
     return [c for c in checks if not c.holds]
 
 
-def _check_rule(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView]) -> Check:
+def _check_rule(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView], budget: Budget) -> Check:
     def complaint(view: FleetView) -> str | None:
         try:
             return rule(policy, _copied(view))
         except _Raised:
             return None
 
-    judged = 0
-    for view in views:
+    judged, of_all = 0, ""
+    for number, view in enumerate(views):
+        if number >= LEAST_VIEWS and budget.is_spent:
+            of_all = _of(len(views))
+            break
         try:
             found = rule(policy, _copied(view))
         except _Raised:
             continue
         judged += 1
         if found is not None:
-            small = shrink(view, lambda v: complaint(v) is not None)
+            small = shrink(view, lambda v: not budget.is_spent and complaint(v) is not None)
             return Check(name, False, complaint(small) or found, small)
     return Check(
         name,
         judged > 0,
-        f"{judged} views" if judged else "no view could be checked: see returns directives, bounds kept",
+        f"{judged}{of_all} views" if judged else "no view could be checked: see returns directives, bounds kept",
     )
+
+
+def _of(count: int) -> str:
+    """Of how many views or decisions the time allowed fewer."""
+    return f" of {count}"
 
 
 # --- the rules -----------------------------------------------------------------------------------
@@ -211,21 +232,26 @@ def _alone(policy: Policy) -> Policy:
     return follows
 
 
-def _keeps_no_memory(policy: Policy, views: Sequence[FleetView]) -> Check:
+def _keeps_no_memory(policy: Policy, views: Sequence[FleetView], budget: Budget) -> Check:
     """The same answers in another order of the views, and from the file loaded anew."""
     name = "no memory"
     few = [v.frozen for v in views[:SHUFFLED]]
     try:
-        first = [_as_tuples(_decide(policy, v)) for v in few]
-        order = list(range(len(few)))
-        random.Random(len(few)).shuffle(order)  # noqa: S311
+        first: list[list[tuple[object, ...]]] = []
+        for view in few:
+            if len(first) >= LEAST_VIEWS and budget.is_spent:
+                break
+            first.append(_as_tuples(_decide(policy, view)))
+        order = list(range(len(first)))
+        random.Random(len(first)).shuffle(order)  # noqa: S311
         for instance, what in ((policy, "after other views"), (_loaded_anew(policy), "from the file loaded anew")):
             for k in order:
                 if _as_tuples(_decide(instance, few[k])) != first[k]:
                     return Check(name, False, f"the same view gets other directives {what}", few[k])
     except _Raised:
         return Check(name, False, "no view could be checked: see returns directives, bounds kept")
-    return Check(name, True, f"{len(few)} views in two orders, and from the file loaded anew")
+    of_all = _of(len(few)) if len(first) < len(few) else ""
+    return Check(name, True, f"{len(first)}{of_all} views in two orders, and from the file loaded anew")
 
 
 def _loaded_anew(policy: Policy) -> Policy:
@@ -435,22 +461,26 @@ RULES: dict[str, Rule] = {
 """The kit's rules by name. A policy without a parameter of `_SPENT` always keeps `budget kept`."""
 
 
-def _decides_in_time(policy: Policy) -> Check:
+def _decides_in_time(policy: Policy, budget: Budget) -> Check:
     """Median CPU time of a decision, at 5 and at 20 drones."""
-    name, took_s = "time per decision", {}
+    name, took_s, timed = "time per decision", {}, 0
     for drones in (5, 20):
         view = full_view(drones)
         try:
             for _ in range(3):
                 policy(view)
             marks_ns = [time.thread_time_ns()]
-            for _ in range(50):
+            for _ in range(TIMED):
+                if len(marks_ns) > 1 and budget.is_spent:
+                    break
                 policy(view)
                 marks_ns.append(time.thread_time_ns())
         except Exception as error:
             return Check(name, False, f"raises {type(error).__name__}: {error}", view)
         took_s[drones] = statistics.median(b - a for a, b in pairwise(marks_ns)) * 1e-9
+        timed += len(marks_ns) - 1
     what = ", ".join(f"{s * 1e6:.0f} µs at {n} drones" for n, s in took_s.items())
+    what += "" if timed == 2 * TIMED else f", {timed}{_of(2 * TIMED)} decisions"
     slow = took_s[20] > DECISION_LIMIT_S
     return Check(name, not slow, what + (f", must be at most {DECISION_LIMIT_S * 1e3:g} ms" if slow else ""))
 

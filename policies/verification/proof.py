@@ -45,7 +45,16 @@ from sortie.policies.verification.invariants import (
     violations,
 )
 from sortie.policies.verification.own_constants import views_at
-from sortie.policies.verification.search import Budget, Found, Searched, Stopped, search_size
+from sortie.policies.verification.search import (
+    BUDGET_S,
+    LEAST_VIEWS,
+    Budget,
+    Found,
+    Searched,
+    Stopped,
+    drawn_budget,
+    search_size,
+)
 from sortie.policies.verification.solver import solver_paths
 from sortie.policies.verification.subject import searchable
 from sortie.policies.verification.symbols import Combined, Refused
@@ -53,7 +62,6 @@ from sortie.policies.verification.views import LARGEST, MAX_DRONES, draw_view, s
 
 DRONES = 5
 """The largest fleet that a proof covers if nothing else is asked for."""
-BUDGET_S = 60.0
 TRIED_VIEWS = 1000
 TRIED_AT_CONSTANTS = 200
 """At most so many views more have the numbers of the policy's own code."""
@@ -187,7 +195,8 @@ def prove(
         invariants: what it must keep too.
         max_drones: fleets of 1 to this many drones are searched; each drone multiplies the cells by about ten.
         period_s: the plane's period.
-        budget_s: wall-clock time for the search of all properties together. What it did not reach is not proved.
+        budget_s: wall-clock time for the search of all properties together. What it did not reach is not proved. Drawn
+            views of all properties get as much again, and at least `search.LEAST_DRAWN_S`.
         seed: of the drawn views on which every property is tried that no search refuted.
         views: how many of them, besides a few of the largest fleet; 0 for none at all.
 
@@ -204,20 +213,21 @@ def prove(
     searched = [Searched(p.name) for p in properties]
     coverage = _search(policy, list(zip(searched, properties, strict=True)), max_drones, period_s, Budget(budget_s))
     tried = _Drawn(policy, invariants, seed, views)
+    drawn = tried.first_faults([p for f, p in zip(searched, properties, strict=True) if f.fault is None], budget_s)
     verdicts = []
     for found, prop in zip(searched, properties, strict=True):
         if found.fault is not None:
             said = check_property(prop, policy, found.fault.view, found.fault.raised_age_s) or _NOT_REPEATED
             verdicts.append(ProofVerdict(prop.name, "refuted", said, found.fault.view, found.fault.raised_age_s))
             continue
-        view = tried.first_fault(prop)
+        view, keep_it = drawn[prop]
         if view is not None:
             verdicts.append(
                 ProofVerdict(prop.name, "refuted", check_property(prop, policy, view) or _NOT_REPEATED, view)
             )
             continue
         outcome, text = coverage.verdict(found)
-        verdicts.append(ProofVerdict(prop.name, outcome, f"{text}; {tried.text}"))
+        verdicts.append(ProofVerdict(prop.name, outcome, f"{text}; {keep_it}"))
     return verdicts
 
 
@@ -296,17 +306,32 @@ class _Drawn:
         self._views += own
         self._answers: dict[int, Any] = {}
 
-    @property
-    def text(self) -> str:
+    def _text(self, tried: int) -> str:
         """How many views were tried, in words."""
+        if tried < len(self._views):
+            return f"{tried} of {len(self._views)} drawn views keep it"
         own = f", {self._own} at the policy's own constants" if self._own else ""
         return f"{self._count} drawn views of up to {MAX_DRONES} drones{own} and {self._large} views of {LARGEST} drones keep it"
 
-    def first_fault(self, prop: Property) -> FleetView | None:
-        """The first view on which a property fails, made smaller; None if all keep it."""
+    def first_faults(
+        self, properties: Sequence[Property], budget_s: float
+    ) -> dict[Property, tuple[FleetView | None, str]]:
+        """Of each property the first view on which it fails, made smaller, or None, and how many views keep it, in words."""
+        ordered = sorted(
+            properties, key=lambda p: p is PLANE[1]
+        )  # raised ages cost most: last, they get what others leave
+        shares = drawn_budget(budget_s).shares(len(ordered))
+        return {prop: self._first_fault(prop, share) for prop, share in zip(ordered, shares, strict=True)}
+
+    def _first_fault(self, prop: Property, budget: Budget) -> tuple[FleetView | None, str]:
         for number, view in enumerate(self._views):
+            if number >= LEAST_VIEWS and budget.is_spent:
+                return None, self._text(number)
             shown = RepeatableView(view)
             now = shown.now()
+
+            def fails(other: FleetView) -> bool:
+                return not budget.is_spent and check_property(prop, self._policy, other) is not None
 
             def decide(other: FleetView, /, now: FleetView = now, number: int = number) -> Any:
                 if other is not now:
@@ -317,9 +342,9 @@ class _Drawn:
 
             if _complaint(prop, decide, shown) is not None:
                 if check_property(prop, self._policy, view) is None:
-                    return view.frozen  # it fails only sometimes: it is not the same for the same view
-                return shrink(view, lambda v: check_property(prop, self._policy, v) is not None)
-        return None
+                    return view.frozen, ""  # it fails only sometimes: it is not the same for the same view
+                return shrink(view, fails), ""
+        return None, self._text(len(self._views))
 
 
 def check_property(

@@ -7,6 +7,7 @@ decide the same; otherwise the policy tells stand-ins from real objects, and not
 
 from __future__ import annotations
 
+import copy
 import itertools
 import random
 import time
@@ -19,6 +20,8 @@ from sortie.policies.verification.symbols import Path, Ranged, Refused, explore
 from sortie.scenarios.plugins.user_calls import TookTooLongError
 
 MakePath = Callable[[Sequence[int]], Path]
+BUDGET_S = 60.0
+"""What a search may take if nothing else is asked for."""
 
 
 class Found(NamedTuple):
@@ -40,16 +43,33 @@ class Searched:
 
 
 class Budget:
-    """The time that all searches of a policy may take together."""
+    """The time that several searches or tests of a policy may take together, from now on."""
 
     def __init__(self, budget_s: float) -> None:
         self.budget_s = budget_s
-        self._end_s = time.monotonic() + budget_s
+        self._begin_s = time.monotonic()
 
     @property
     def is_spent(self) -> bool:
         """Whether the time is over."""
-        return time.monotonic() >= self._end_s
+        return time.monotonic() - self._begin_s >= self.budget_s
+
+    def shares(self, count: int) -> list[Budget]:
+        """An even share for each of several that follow each other. What one leaves, the next may use."""
+        ends = [copy.copy(self) for _ in range(count)]
+        for k, end in enumerate(ends, 1):
+            end.budget_s *= k / count
+        return ends
+
+
+LEAST_DRAWN_S = 30.0
+LEAST_VIEWS = 2
+"""So many drawn views are tried however long they take; the first drawn one has no peer."""
+
+
+def drawn_budget(budget_s: float) -> Budget:
+    """The time for drawn views beside a search that may take `budget_s`."""
+    return Budget(max(LEAST_DRAWN_S, budget_s))
 
 
 class Stopped(Exception):

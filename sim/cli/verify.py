@@ -20,8 +20,9 @@ from sortie.policies.contract import FleetView, Policy
 from sortie.policies.registry import resolve
 from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
 from sortie.policies.verification.invariants import Invariant, InvariantError, parse
-from sortie.policies.verification.proof import BUDGET_S, DRONES, PLANE, ProofVerdict, prove
+from sortie.policies.verification.proof import DRONES, PLANE, ProofVerdict, prove
 from sortie.policies.verification.properties import PROMISES
+from sortie.policies.verification.search import BUDGET_S, LEAST_DRAWN_S
 from sortie.policies.verification.shield import check_shieldable
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
 from sortie.policies.verification.views import to_json
@@ -69,7 +70,7 @@ def verify(
     budget: Annotated[
         float,
         typer.Option(
-            help="Time for the proofs of all properties together, s. Lines about time get as much again for their proofs, and as much for courses and flights.",
+            help=f"Time for the proofs of all properties together, s. The kit, and the random views of the properties, get as much again each, and at least {LEAST_DRAWN_S:g} s. Lines about time get as much again for their proofs, and as much for courses and flights.",
             min=0,
         ),
     ] = BUDGET_S,
@@ -193,7 +194,7 @@ def _try(
 ) -> tuple[int, list[Kept]]:
     """Print what the kit and the proofs say; how many rules and properties are broken, and what shows it."""
     table = Table("rule", "verdict", "what", title=f"{escape(policy)}: the conformance kit, {views} drawn views")
-    checks = conform(decide, count=views)
+    checks = conform(decide, count=views, budget_s=budget)
     for check in checks:
         table.add_row(check.name, _verdict("holds" if check.holds else "fails"), escape(check.what))
     out.print(table)

@@ -54,6 +54,6 @@ def verify(policy: Policy, budget_s: float = SEARCH_S) -> Verified:
         budget_s: time for the search, s.
     """
     with watched(DECISION_S):
-        checks = conform(policy)
+        checks = conform(policy, budget_s=budget_s)
         contract, monotone = (v.outcome for v in prove(policy, [], budget_s=budget_s)[:2])
     return Verified(len(checks), tuple(c.name for c in failing(checks)), contract, monotone)

@@ -16,8 +16,9 @@ from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import resolve
 from sortie.policies.verification.advice import advise
 from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import BUDGET_S, ProofVerdict, check_property, property_of, prove
+from sortie.policies.verification.proof import ProofVerdict, check_property, property_of, prove
 from sortie.policies.verification.properties import PROMISES
+from sortie.policies.verification.search import BUDGET_S
 from sortie.policies.verification.views import from_json, to_json
 
 Decide = Callable[[FleetView], Sequence[Directive]]
