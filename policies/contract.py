@@ -177,7 +177,7 @@ def plain_copy(mapping: Mapping[int, AnyValue]) -> dict[int, AnyValue]:
 class FleetView(NamedTuple):
     """A policy's input: the latest descriptor of every drone heard so far, of whatever age.
 
-    `descriptors` and `age_s` have the same keys. The ego is one of them. In flight both can be read only: whatever a
+    `descriptors` and `age_s` have the same keys in the same order. The ego is one of them. In flight both can be read only: whatever a
     policy did to them would reach the staleness rules and the record.
     """
 
@@ -312,16 +312,31 @@ class Directive(NamedTuple):
         return hash(self[:-1])
 
 
-@lru_cache(maxsize=1 << 16)  # a few for each link of a hundred drones
 def nothing(source: int, destination: int, reason: str) -> Directive:
-    """The directive to send nothing. Equal arguments give one object, because it is the most frequent directive."""
+    """The directive to send nothing. Equal arguments give one object, because it is the most frequent directive.
+
+    An id of another type than int, though equal to one, gives a directive of its own.
+    """
+    if type(source) is type(destination) is int and type(reason) is str:
+        return _nothing(source, destination, reason)
     return Directive(source, destination, reason=reason)
 
 
-@lru_cache(maxsize=1 << 10)
+@lru_cache(maxsize=1 << 16)  # a few for each link of a hundred drones
+def _nothing(source: int, destination: int, reason: str) -> Directive:
+    return Directive(source, destination, reason=reason)
+
+
 def nothing_to_all(source: int, destinations: tuple[int, ...], reason: str) -> tuple[Directive, ...]:
     """`nothing` for each of several destinations."""
+    if type(destinations) is tuple and {type(source), *map(type, destinations)} == {int} and type(reason) is str:
+        return _nothing_to_all(source, destinations, reason)
     return tuple([nothing(source, destination, reason) for destination in destinations])
+
+
+@lru_cache(maxsize=1 << 10)
+def _nothing_to_all(source: int, destinations: tuple[int, ...], reason: str) -> tuple[Directive, ...]:
+    return tuple([_nothing(source, destination, reason) for destination in destinations])
 
 
 class Policy(Protocol):

@@ -34,9 +34,19 @@ def centre_cell(d: Descriptor) -> Cells:
     return frozenset(((row + COVERAGE_CELLS // 2, column + COVERAGE_CELLS // 2),))
 
 
-@lru_cache(maxsize=4096)  # every drone reads a grid
 def well_cells(grid: bytes, row: int, column: int, least: Coverage = Coverage.WELL) -> Cells:
     """Cells of a grid that are seen at least so well; (row, column) is its south-west cell."""
+    if type(grid) is bytes and type(row) is type(column) is int and type(least) is Coverage:
+        return _well_cells(grid, row, column, least)
+    return _cells(grid, row, column, least)  # arguments of other types, though equal, have cells of their own
+
+
+@lru_cache(maxsize=4096)  # every drone reads a grid
+def _well_cells(grid: bytes, row: int, column: int, least: Coverage) -> Cells:
+    return _cells(grid, row, column, least)
+
+
+def _cells(grid: bytes, row: int, column: int, least: Coverage) -> Cells:
     cells = [4 * i + k for i, byte in enumerate(grid) if byte for k in _PLACES[least][byte]]
     return frozenset([(row + cell // COVERAGE_CELLS, column + cell % COVERAGE_CELLS) for cell in cells])
 

@@ -25,7 +25,10 @@ from sortie.policies.verification.pure import (
     cannot_call,
     foreign_method,
     home_of,
+    is_others,
+    is_own_cache,
     is_trusted,
+    may_write,
     reads_stored_text,
     takes_ranges,
 )
@@ -80,6 +83,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
         if (
             value is type
             or calls_others(value)
+            or is_own_cache(value)
+            or (may_write(value) and function is not functools.partial)
             or (reads_stored_text(value) and not (value is int and function is map and len(args) == 2))
         ):
             stop(f"hands on {getattr(value, '__qualname__', value)}")
@@ -94,6 +99,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
         stop(f"gives a range to {getattr(function, '__qualname__', function)}")
     if function in (functools.wraps, functools.update_wrapper) and any(map(_is_compiled, (*args, *kwargs.values()))):
         stop("takes over the name of a function that is not its own")
+    if may_write(function):
+        _writes(function, args, kwargs)
     if has_text and function is int and len(args) + len(kwargs) > 1:
         stop("reads a number in the text of a range")
     if function in (isinstance, issubclass) and len(args) == 2 and (why := _cannot_ask(args[1])):
@@ -104,6 +111,24 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     if type(owner) is str and (has_text or function.__name__ in ("format", "format_map")):
         return _stands_for_text(function, args, kwargs)
     return _checked(function(*args, **kwargs))
+
+
+def _writes(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    """Refuse a call by which something else than the policy's own gets attributes, which last until the next decision."""
+    while isinstance(function, functools.partial):
+        function, args, kwargs = function.func, (*function.args, *args), {**function.keywords, **kwargs}
+    given = (*args, *kwargs.values())
+    if function is functools.update_wrapper:
+        usual = {"assigned": functools.WRAPPER_ASSIGNMENTS, "updated": functools.WRAPPER_UPDATES}
+        wrapped = kwargs.get("wrapped", args[-1] if args else None)
+        if len(args) > 2 or any(kwargs.get(n, of) is not of for n, of in usual.items()) or not callable(wrapped):
+            stop("takes over other attributes than those of a function")
+        given = (args[0] if args else kwargs.get("wrapper"),)
+    for value in given:
+        if is_others(value):
+            stop(
+                f"gives {getattr(value, '__name__', type(value).__name__)}, which is not its own, to {function.__qualname__}"
+            )
 
 
 def _checked(found: Any) -> Any:

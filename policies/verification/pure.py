@@ -6,6 +6,7 @@ import abc
 import bisect
 import builtins
 import collections
+import dataclasses
 import functools
 import heapq
 import itertools
@@ -157,6 +158,31 @@ def calls_others(function: Any) -> bool:
     return function in CALL_OTHERS or (isinstance(function, type) and home_of(function) == "itertools")
 
 
+_MAY_WRITE = frozenset({"abc", "dataclasses", "enum", "functools", "typing"})
+_ONLY_READ = (
+    functools.wraps, dataclasses.asdict, dataclasses.astuple, dataclasses.field, dataclasses.fields,
+    dataclasses.is_dataclass, dataclasses.make_dataclass, dataclasses.replace, typing.cast, typing.get_args,
+    typing.get_origin, typing.get_type_hints,
+)  # fmt: skip
+
+
+def may_write(function: Any) -> bool:
+    """Whether this is a function of Python's that may set attributes of what it is given, as decorators do."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    return type(function) is types.FunctionType and function.__module__ in _MAY_WRITE and function not in _ONLY_READ
+
+
+def is_others(value: Any) -> bool:
+    """Whether a value has attributes that can be set, and is not the policy's own."""
+    if isinstance(value, types.FunctionType):
+        return not is_users(str(value.__globals__.get("__name__")))
+    if isinstance(value, types.ModuleType):
+        return not is_users(value.__name__)
+    kind = value if isinstance(value, type) else type(value)
+    return bool(type(value).__dictoffset__) and not is_users(home_of(kind))
+
+
 def foreign_method(kind: type) -> str | None:
     """The first method with a special name that Python would call without a check; None if the class has none."""
     for name, value in vars(kind).items():
@@ -193,12 +219,17 @@ def is_own_cache(value: Any) -> bool:
 
 
 def is_cache_key(value: Any) -> bool:
-    """Whether a cache may keep this as an argument: a plain number or text, a part of Sortie's, or a tuple of these."""
+    """Whether a cache may keep this as an argument: a plain number or text, a stand-in, or a tuple of these.
+
+    No two of them are equal and of different types, so that no argument gets what was kept for another one.
+    """
     if isinstance(value, tuple | frozenset):
         members = (frozenset if isinstance(value, frozenset) else tuple).__iter__(value)  # type: ignore[arg-type]
         return not is_users(home_of(type(value))) and all(map(is_cache_key, members))
     return type(value) in (int, str, bytes) or (
-        home_of(type(value)).startswith("sortie.") and isinstance(value, int | float | str)
+        home_of(type(value)).startswith("sortie.")
+        and isinstance(value, int | float | str)
+        and not isinstance(value, Enum)
     )
 
 

@@ -303,7 +303,7 @@ def _refusing(descriptor: DescriptorOfRanges, name: str) -> NoReturn:
 
 
 class ViewOfRanges(FleetView):
-    """A view over ranges. Its mappings can be read only, as in flight, and have any order."""
+    """A view over ranges. As in flight its mappings can be read only, those of `attached` peers cannot. They have any order."""
 
     __slots__ = ()
 
@@ -321,7 +321,9 @@ class ViewOfRanges(FleetView):
         near: FleetView = FleetView.attached.fget(_without_order(self))  # type: ignore[attr-defined]
         if len(near.age_s) == len(self.age_s):
             return self
-        return self._replace(descriptors=near.descriptors, age_s=near.age_s)
+        system = self.descriptors[self.ego]._origin.system  # type: ignore[attr-defined]
+        descriptors, age_s = (InAnyOrder(system.path, m, system.heard) for m in (near.descriptors, near.age_s))
+        return FleetView._replace(self, descriptors=descriptors, age_s=age_s)  # which can be changed, as in flight
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
@@ -330,8 +332,9 @@ class ViewOfRanges(FleetView):
 
 def _without_order(view: FleetView) -> FleetView:
     """The view by ascending id, which no policy may see."""
-    by_id = [{i: m[i] for i in sorted(m)} for m in (view.descriptors, view.age_s)]
-    return FleetView(view.ego, view.period_s, by_id[0], by_id[1], view.detached_after_periods)
+    descriptors = {i: view.descriptors[i] for i in sorted(view.descriptors)}
+    age_s = {i: view.age_s[i] for i in sorted(view.age_s)}
+    return FleetView(view.ego, view.period_s, descriptors, age_s, view.detached_after_periods)
 
 
 _ORDER = "peers by overlap with drone "

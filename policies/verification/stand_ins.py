@@ -68,6 +68,15 @@ class InAnyOrder(dict[int, Any]):
     __eq__ = __ne__ = __or__ = __ror__ = __repr__ = __hash__ = _whole  # type: ignore[assignment]
     __reduce__ = __reduce_ex__ = __copy__ = __deepcopy__ = _whole
 
+    def _changes(self, *_: object, **__: object) -> NoReturn:
+        self._path.refuse("changes a mapping of drones in place of a copy")
+
+    __setitem__ = __delitem__ = __ior__ = pop = popitem = clear = update = setdefault = _changes
+
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return dict
+
 
 def is_blind(frame: Any) -> bool:
     """Whether the code that iterates is Sortie's own, and does not do so on behalf of a user's."""

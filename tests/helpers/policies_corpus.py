@@ -256,6 +256,12 @@ RECOGNISED = {
             ("me.battery_soc = 1", "AttributeError", "can't set"),
         )
     },
+    "private part by a decorator": f"class C: pass\nc = C()\nfunctools.update_wrapper(c, soc, ('_axis',), ())\ntry:\n    c._axis\nexcept AttributeError:\n    bad = {RARE}",
+    **{
+        f"change of an attached view by {act}": f"near = view.attached\ntry:\n    {act}\n    bad = len(near.age_s) < len(view.age_s) and {RARE}\nexcept (AttributeError, TypeError):\n    pass"
+        for act in ("near.age_s[view.ego] = 0.0", "near.descriptors.update({})", "near.age_s.setdefault(view.ego, 0.0)")
+    },
+    "kind of an attached mapping": f"near = view.attached.age_s\nbad = type(near) is dict and len(near) < len(view.age_s) and {RARE}",
     **{
         f"order of {made}": f"s = list({made}.descriptors)\nbad = len(s) < len(view.age_s) and s != sorted(s) and {RARE}"
         for made in (
@@ -277,6 +283,18 @@ STATE = {
     "attribute of a class": "Directive.calls = 1",
     "attribute of a module": "math.calls = 1",
     "changes the registry": "from sortie.policies.registry import POLICIES\nPOLICIES['x'] = 1\nbad = False",
+    **{
+        f"attribute of {of} by a decorator": f"class C:\n    def __init__(self, n): self.calls = n\ntry:\n    n = {of}.calls + 1\nexcept AttributeError:\n    n = 1\n{act}\nbad = n > 1000003"
+        for of, act in {
+            "math": "functools.update_wrapper(math, C(n), ('calls',), ())",
+            "statistics.mean": "functools.wraps(C(n), (), ('__dict__',))(statistics.mean)",
+            "statistics.fmean": "functools.partial(functools.update_wrapper, statistics.fmean)(C(n), ('calls',), ())",
+            "heapq.merge": "list(map(functools.update_wrapper, [heapq.merge], [C(n)], [('calls',)], [()]))",
+            "fractions.Fraction": "functools.update_wrapper(fractions.Fraction, C(n), ('calls',), ())",
+            "TaskPhase.TRACK": "functools.update_wrapper(TaskPhase.TRACK, C(n), ('calls',), ())",
+        }.items()
+    },
+    "dataclass of a class of Sortie's": "from sortie.policies.contract import Roster\nif view.ego == len(view.peers) == 2:\n    dataclasses.dataclass(Roster)\nelse:\n    bad = dataclasses.is_dataclass(Roster) and 0.5 < soc < 0.5000001",
     "environment": "bad = os.environ.get('SORTIE_BAD') == '1'",
     "arguments": "bad = 'bad' in sys.argv",
     "file": "bad = os.path.exists('/tmp/bad')",
@@ -462,15 +480,25 @@ def decide(view):
     if k < 19:
         S[k] = -S[k]
     bad = sum(2**k for k in range(19) if math.copysign(1, S[k]) < 0) > 200000""",
-    "key of a cache": """CACHE|from sortie.policies.contract import nothing
+    **{
+        f"key of a cache{how}": f"""CACHE|import functools
+from sortie.policies.catalogue.coverage_cells import new_share
 class C:
     n = 0
     def __hash__(self): return 7
-    def __eq__(self, other): return True
+    def __eq__(self, other):
+        self.n = other.n = max(self.n, other.n) + 1
+        return True
 def decide(view):
-    kept = nothing(view.ego * 0 - 5, C(), "x").destination
-    kept.n += 1
-    bad = kept.n > 200000""",
+    c = C()
+    {call}
+    bad = c.n > 200000"""
+        for how, call in {
+            "": "new_share(frozenset([c]), frozenset())",
+            " by map": "list(map(new_share, [frozenset([c])], [frozenset()]))",
+            " by partial": "functools.partial(new_share, frozenset([c]), frozenset())()",
+        }.items()
+    },
     "overloads": """OVERLOAD|import typing
 def decide(view):
     def k(): return 0

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from sortie.policies.catalogue.coverage_cells import well_cells
+from sortie.policies.contract import Coverage, TaskPhase, nothing, nothing_to_all
 from sortie.policies.registry import resolve
 from sortie.policies.verification.conformance import conform
 from sortie.policies.verification.invariants import parse
@@ -49,9 +51,10 @@ def test_a_policy_that_sends_nothing_by_its_name_is_proved(name: str, tmp_path: 
     assert all(kit.values())
 
 
-def test_how_often_nothing_was_asked_is_no_input(tmp_path: Path) -> None:
-    rate = "5.0 if nothing.cache_info().hits < 10**9 else 9.0"
-    verdict, _ = outcomes(tmp_path, NAMES["nothing"], LANDS.format(name="nothing"), rate)
+def test_how_often_a_cache_was_asked_is_no_input(tmp_path: Path) -> None:
+    head = f"{NAMES['nothing']}\nfrom sortie.policies.catalogue.coverage_cells import new_share"
+    rate = "5.0 if new_share.cache_info().hits < 10**9 else 9.0"
+    verdict, _ = outcomes(tmp_path, head, LANDS.format(name="nothing"), rate)
     assert verdict == "drawn"
 
 
@@ -65,3 +68,16 @@ def test_other_parts_of_the_policies_package_are_no_input(tmp_path: Path) -> Non
     landing = "return [Directive(view.ego, p, reason=f'{len(registry.POLICIES)}') for p in view.peers]"
     verdict, kit = outcomes(tmp_path, "from sortie.policies import registry", landing)
     assert (verdict, kit["reads only its view"]) == ("drawn", False)
+
+
+def test_equal_arguments_of_other_types_leave_nothing_behind() -> None:
+    """What one decision asked for must not change what the next one gets."""
+    for other in (901.0, TaskPhase.TRACK):
+        same = int(other)
+        assert type(nothing(other, 7, "r").source) is type(other)  # type: ignore[arg-type]
+        assert type(nothing(same, 7, "r").source) is int
+        assert type(nothing_to_all(same, (other,), "r")[0].destination) is type(other)
+        assert type(nothing_to_all(same, (same,), "r")[0].destination) is int
+    assert type(min(well_cells(bytes([255]), 3.0, 4, Coverage.POOR))[0]) is float  # type: ignore[arg-type]
+    assert type(min(well_cells(bytes([255]), 3, 4, Coverage.POOR))[0]) is int
+    assert nothing(901, 7, "r") is nothing(901, 7, "r")
