@@ -4,7 +4,7 @@ A grid is level and aligned with the drone's heading, with the drone in the midd
 
 x points forward along rows, y left along columns, row 0 the rearmost and column 0 the rightmost. Three
 resolutions cover the same square: the image that the encoder sees, the cells that are exchanged (UAV3D's
-64 × 64 × 80), and the grid of the detection head.
+64 × 64 × 80), and the grid of the detection head. A sharp image has twice the usual pixels along each side.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-IMAGE_PX = 256
+IMAGE_PX, SHARP_PX = 256, 512
+"""Pixels along a side of the image: of the usual one, and of a sharp one."""
 CELLS = 64
 CHANNELS = 80
 HEAD_PX = 128
@@ -80,11 +81,18 @@ class Geometry:
     """How far the grids reach, in metres from the drone to each edge."""
 
     half_extent_m: float = 102.4
+    image_px: int = IMAGE_PX
+    """Pixels along a side of the image."""
 
     @property
     def image_m(self) -> float:
-        """Side of an image pixel: 0.8 m in UAV3D's geometry."""
-        return 2 * self.half_extent_m / IMAGE_PX
+        """Side of an image pixel: 0.8 m in UAV3D's geometry, 0.4 m of a sharp image."""
+        return 2 * self.half_extent_m / self.image_px
+
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras that an image is learned from: the usual ones, for a sharp image with 320 × 180 pixels."""
+        return USUAL._replace(width_px=USUAL.width_px * self.image_px // IMAGE_PX)
 
     @property
     def cell_m(self) -> float:

@@ -37,7 +37,7 @@ def draw(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
         raise ValueError(f"scene {index}, frame {frame}: must be 0 or above")
     config = draw_scene(bench.seed, split, index, bench.difficulty)
     scene = model_of(config)
-    captures = draw_captures(bench.seed, split, index, frame, bench.difficulty)
+    captures = draw_captures(bench.seed, split, index, frame, bench.difficulty, bench.geometry.cameras)
     views = Renderer(scene, scene_id(bench.seed, split, index)).render(captures)
     ground = lift(views, captures, bench.geometry).numpy()
     cars = scene.cars_at(captures[0].t_s)

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sortie.perception.benchmark.difficulty import DENSITIES, Difficulty, Range, Split
+from sortie.perception.geometry import USUAL, Cameras
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.scenarios.formation import slots
@@ -55,7 +56,9 @@ def model_of(config: Scene, target: Target | None = None) -> SceneModel:
     return SceneModel(config, target, (-AREA_M, -AREA_M, AREA_M, AREA_M))
 
 
-def draw_captures(seed: int, split: Split, index: int, frame: int, difficulty: Difficulty) -> list[Capture]:
+def draw_captures(
+    seed: int, split: Split, index: int, frame: int, difficulty: Difficulty, cameras: Cameras = USUAL
+) -> list[Capture]:
     """Five drones in a jittered cross over the scene, any heading, with some attitude and pose error."""
     d = difficulty
     rng = stream(scene_id(seed, split, index), 0, frame, "bench.fleet")
@@ -73,5 +76,6 @@ def draw_captures(seed: int, split: Split, index: int, frame: int, difficulty: D
         ex, ey, ez = np.array([x, y, z]) + d.position_error_sigma_m * rng.normal(size=3)
         est_yaw = yaw + np.radians(d.heading_error_sigma_deg) * rng.normal()
         est = (float(ex), float(ey), float(ez))
-        out.append(Capture(drone, t_s, (float(x), float(y), float(z)), (qx, qy, qz, qw), est, float(est_yaw)))
+        at = (float(x), float(y), float(z))
+        out.append(Capture(drone, t_s, at, (qx, qy, qz, qw), est, float(est_yaw), cameras=cameras))
     return out

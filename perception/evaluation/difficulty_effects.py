@@ -150,7 +150,7 @@ def evaluate_scene(weights: Path, index: int, rows: Sequence[ParameterShift], pa
             if key not in towns:
                 towns[key] = model_of(config)
                 renderers[key] = Renderer(towns[key], scene_id(SEED, "test", index))
-            captures = draw_captures(SEED, "test", index, 0, move.difficulty)
+            captures = draw_captures(SEED, "test", index, 0, move.difficulty, instrument.geometry.cameras)
             frames = Frames(
                 images=lift(renderers[key].render(captures), captures, instrument.geometry).numpy()[None],
                 true_pose=np.array([[c.true_pose for c in captures]]),

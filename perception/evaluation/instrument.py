@@ -29,7 +29,7 @@ BATCH = 5
 
 
 class CarNetInstrument:
-    """A network on frames that carry `images` uint8 [n, d, 4, 256, 256]."""
+    """A network on frames that carry `images` uint8 [n, d, 4, px, px]."""
 
     def __init__(self, net: CarNet, device: torch.device = CPU, fusion_params: Params | None = None) -> None:
         """Args: `fusion_params` change how the network's fusion mixes (`Fusion.tune`)."""

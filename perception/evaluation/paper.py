@@ -15,6 +15,7 @@ from sortie.perception.evaluation.contract import FleetFrames, Instrument
 from sortie.perception.evaluation.evaluate import Region, evaluate
 from sortie.perception.evaluation.measures import under
 from sortie.perception.evaluation.results import TableResults, TableSettings
+from sortie.perception.geometry import FULL, Geometry
 from sortie.perception.scene.render import Renderer
 
 
@@ -44,7 +45,11 @@ def measure(
 
 
 def bench_frames(
-    seed: int, count: int | None, root: Path, progress: Callable[[int, int], None] | None = None
+    seed: int,
+    count: int | None,
+    root: Path,
+    progress: Callable[[int, int], None] | None = None,
+    geometry: Geometry = FULL,
 ) -> Frames:
     """The first `count` frames (None: all) of the benchmark's test split, each of a scene of its own; made where they are
     missing.
@@ -55,13 +60,13 @@ def bench_frames(
     scenes, per_scene = SIZES["test"]
     if count is not None and not 1 <= count <= scenes * per_scene:
         raise ValueError(f"frames is {count}, must be 1 to the test split's {scenes * per_scene}")
-    return load_frames(make_split(Benchmark(seed), "test", root, scenes=count, progress=progress))
+    return load_frames(make_split(Benchmark(seed, geometry=geometry), "test", root, scenes=count, progress=progress))
 
 
-def camera_views(seed: int, frame: int) -> NDArray[np.uint8]:
+def camera_views(seed: int, frame: int, geometry: Geometry = FULL) -> NDArray[np.uint8]:
     """[drone, camera, height, width, 3]: what the drones' cameras see in a frame of the test split, rendered anew."""
     bench, name = Benchmark(seed), scene_id(seed, "test", frame)
     scene = model_of(draw_scene(seed, "test", frame, bench.difficulty))
-    captures = draw_captures(seed, "test", frame, 0, bench.difficulty)
+    captures = draw_captures(seed, "test", frame, 0, bench.difficulty, geometry.cameras)
     views: NDArray[np.uint8] = Renderer(scene, name).render(captures)
     return views

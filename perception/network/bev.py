@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from sortie.perception.compiled import compiled, fma
-from sortie.perception.geometry import FULL, IMAGE_PX, Cameras, Geometry
+from sortie.perception.geometry import FULL, Cameras, Geometry
 from sortie.perception.scene.render import CAMERAS, tilt
 from sortie.perception.scene.town import Bytes, FloatMap
 from sortie.perception.types import Capture
@@ -34,8 +34,8 @@ def _lens(cameras: Cameras) -> FloatMap:
 
 
 def ground_points(geometry: Geometry) -> torch.Tensor:
-    """Centres of the grid's pixels, [256, 256, 2] (x forward, y left), metres."""
-    axis = (torch.arange(IMAGE_PX) + 0.5) * geometry.image_m - geometry.half_extent_m
+    """Centres of the grid's pixels, [px, px, 2] (x forward, y left), metres."""
+    axis = (torch.arange(geometry.image_px) + 0.5) * geometry.image_m - geometry.half_extent_m
     return torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1)
 
 
@@ -46,8 +46,8 @@ def _planes(geometry: Geometry) -> tuple[FloatMap, FloatMap]:
 
 
 def lift(views: Iterable[Bytes], captures: Sequence[Capture], geometry: Geometry = FULL) -> torch.Tensor:
-    """Camera views, each uint8 [5, height, width, 3], to bird's-eye images uint8 [n, 4, 256, 256]: R, G, B, and 255 where any camera saw the ground."""
-    out = np.empty((len(captures), 4, IMAGE_PX, IMAGE_PX), np.uint8)
+    """Camera views, each uint8 [5, height, width, 3], to bird's-eye images uint8 [n, 4, px, px]: R, G, B, and 255 where any camera saw the ground."""
+    out = np.empty((len(captures), 4, geometry.image_px, geometry.image_px), np.uint8)
     ground = _planes(geometry)
     for seen, capture, image in zip(views, captures, out, strict=True):
         level_to_body = tilt(capture.orientation_xyzw).T.astype(np.float32)
@@ -59,7 +59,7 @@ def lift(views: Iterable[Bytes], captures: Sequence[Capture], geometry: Geometry
 
 @compiled
 def _unproject(views: Any, turn: Any, down: Any, lens: Any, ground_x: Any, ground_y: Any, out: Any) -> None:
-    """Look for each ground point of the grid ([256, 256] each) in the column of views, uint8 [5 · height, width, 3]; into `out` [4, 256, 256]."""
+    """Look for each ground point of the grid ([px, px] each) in the column of views, uint8 [5 · height, width, 3]; into `out` [4, px, px]."""
     rows, columns, _ = views.shape
     half_h, half_v, inset, view, flat, steep = lens
     for i in range(ground_x.shape[0]):

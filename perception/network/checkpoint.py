@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from sortie.perception.errors import InputError
 from sortie.perception.files import replacing
+from sortie.perception.geometry import IMAGE_PX, SHARP_PX
 from sortie.perception.network.fusion.base import Fusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.model import CarNet, ModelConfig
@@ -80,6 +81,7 @@ def read_config(path: Path) -> ModelConfig:
         ("decoder", config.decoder, ("shallow", "deep")),
         ("grid", config.grid, ("coarse", "fine")),
         ("half_extent_m", config.half_extent_m, (102.4, 51.2)),
+        ("image_px", config.image_px, (IMAGE_PX, SHARP_PX)),
     ):
         if value not in allowed:
             raise InputError(f"{path}: model.{name} is {value!r}, must be one of {', '.join(map(str, allowed))}")

@@ -132,7 +132,7 @@ class TorchDetector:
             raise InputError(
                 f"{path}: made for fusion {net.config.fusion!r}, perception.fusion is {config.fusion!r}, must be the same"
             )
-        if net.config.geometry != FULL:
+        if net.config.half_extent_m != FULL.half_extent_m:
             raise InputError(
                 f"{path}: made for ±{net.config.half_extent_m:g} m, a sortie flies ±{FULL.half_extent_m:g} m"
             )
@@ -219,7 +219,7 @@ class TorchDetector:
 
         def encode(i: int, seen: Future[None]) -> Tensor:
             seen.result()
-            image = lift(views[i : i + 1], missing[i : i + 1])
+            image = lift(views[i : i + 1], missing[i : i + 1], self._net.config.geometry)
             with self._autocast():
                 features: Tensor = self._net.encoder(image)[0]
             return features

@@ -1,10 +1,12 @@
 """The detector's network: encode one drone's bird's-eye image, fuse what came from others, find cars.
 
-Grids are those of `geometry.py`: image 256², features 80 × 64 × 64, head 128². Features are rounded to float16
+Grids are those of `geometry.py`: image 256² or 512², features 80 × 64 × 64, head 128². Features are rounded to float16
 where they leave the encoder, shared or not, as that is what the radio carries.
 
 A coarse network fuses maps as they are exchanged, in cells of 3.2 m. A fine one first spreads each exchanged cell over
 the head's four, by a learned layer, and fuses those of 1.6 m: no byte more is sent.
+
+An image of 512² has one layer more, which halves it at once. All that follows has the same shapes.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from sortie.perception.geometry import CELLS, CHANNELS, HEAD_PX, Geometry
+from sortie.perception.geometry import CELLS, CHANNELS, HEAD_PX, IMAGE_PX, Geometry
 from sortie.perception.network.bev import ground_points
 from sortie.perception.network.fusion.base import Fusion
 from sortie.perception.network.fusion.registry import FUSIONS
@@ -43,11 +45,13 @@ class ModelConfig:
     grid: Literal["coarse", "fine"] = "coarse"
     """Where maps are fused: in the cells that are exchanged, or in the head's. A fine network's head also tells how well
     each box fits; its trunk has no choice."""
+    image_px: int = IMAGE_PX
+    """Pixels along a side of the image: 256 of 0.8 m, learned from pictures of 160 × 90, or 512 of 0.4 m, from 320 × 180."""
 
     @property
     def geometry(self) -> Geometry:
         """The grids that the network works on."""
-        return Geometry(self.half_extent_m)
+        return Geometry(self.half_extent_m, self.image_px)
 
     @property
     def fused_cells(self) -> int:
@@ -88,13 +92,16 @@ def _up(c_in: int, c_out: int) -> nn.Sequential:
 
 
 class Stem(nn.Sequential):
-    """Bird's-eye image uint8 [n, 4, 256, 256] → [n, 24, 128, 128]: its first layer sees colours, what was seen, and where."""
+    """Bird's-eye image uint8 [n, 4, px, px] → half its side, by a layer that sees colours, what was seen, and where.
+
+    That is [n, 24, 128, 128], or [n, 16, 256, 256] of a sharp image.
+    """
 
     place: Tensor
-    """[1, 3, 256, 256]: x forward, y left and range of each pixel, in half extents."""
+    """[1, 3, px, px]: x forward, y left and range of each pixel, in half extents."""
 
     def __init__(self, config: ModelConfig) -> None:
-        super().__init__(*conv(7, 24, 5, 2))
+        super().__init__(*(conv(7, 24, 5, 2) if config.image_px == IMAGE_PX else conv(7, 16, 3, 2)))
         ground = ground_points(config.geometry).permute(2, 0, 1) / config.half_extent_m
         self.register_buffer("place", torch.cat([ground, ground.norm(dim=0, keepdim=True)])[None], persistent=False)
 
@@ -111,12 +118,13 @@ def colours(image: Tensor) -> Tensor:
 
 
 class Encoder(nn.Module):
-    """Bird's-eye image uint8 [n, 4, 256, 256] → features [n, 80, 64, 64], float32 that is exact in float16."""
+    """Bird's-eye image uint8 [n, 4, px, px] → features [n, 80, 64, 64], float32 that is exact in float16."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.stem = Stem(config)
-        self.down = nn.Sequential(conv(24, 40), conv(40, CHANNELS, 3, 2))
+        sharp = [] if config.image_px == IMAGE_PX else [conv(16, 24, 5, 2)]
+        self.down = nn.Sequential(*sharp, conv(24, 40), conv(40, CHANNELS, 3, 2))
         # signed: without its ReLU what is added may be negative, and so may the sum
         last = list(conv(CHANNELS, CHANNELS))[: 2 if config.exchange == "signed" else 3]
         self.body = nn.Sequential(Residual(*conv(CHANNELS, CHANNELS, dilation=2)), Residual(*last))

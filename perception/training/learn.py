@@ -48,7 +48,7 @@ class Labels:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """b frames × k agents as they were drawn: `images` uint8 [b, k, 4, 256, 256] before they are mirrored and turned;
+    """b frames × k agents as they were drawn: `images` uint8 [b, k, 4, px, px] before they are mirrored and turned;
     `pose` (true) and `est` [b, k, 3] and the labels after it."""
 
     images: Tensor
@@ -68,7 +68,7 @@ class Batch:
     """Of the egos, frame by frame, then of those alone."""
 
     def seen(self, device: torch.device) -> Tensor:
-        """The images [b, k, 4, 256, 256] as they are learned from, on a device."""
+        """The images [b, k, 4, px, px] as they are learned from, on a device."""
         images = self.images.to(device)
         if self.mirrored:  # the world in a mirror: north and south change places
             images = images.flip(-1)

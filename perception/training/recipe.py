@@ -80,8 +80,9 @@ def command(recipe: dict[str, Any], model: dict[str, Any], bench_seed: int, out:
         "exchange": "rectified",
         "decoder": "shallow",
         "grid": "coarse",
+        "image_px": 256,
     }
-    names = {"half_extent_m": "range"}
+    names = {"half_extent_m": "range", "image_px": "image-px"}
     flags += [f"--{names.get(n, n)} {v}" for n, v in model.items() if v != usual.get(n, v)]
     flags += [f"--bench-seed {bench_seed}"] if bench_seed else []
     return " ".join(["sortie train", *flags, "--out", out])

@@ -111,18 +111,34 @@ def train(
             A resumed run first calls it with the rows that `loss.csv` already has.
 
     Raises:
-        ValueError: weights that cannot be read, a benchmark of another range than the network's, or no such device.
+        ValueError: weights that cannot be read, a benchmark, weights or a checkpoint of another range or image than the
+            network's, or no such device.
     """
     begun = time.monotonic()
     tell = progress or (lambda stage, done, of: None)
     show = scalars or (lambda step, values: None)
     bench = Benchmark(geometry=config.geometry) if bench is None else bench
-    if bench.geometry != config.geometry:
+    if bench.geometry.half_extent_m != config.half_extent_m:
         raise ValueError(
             f"the benchmark reaches ±{bench.geometry.half_extent_m:g} m, must be the network's ±{config.half_extent_m:g} m"
         )
+    if bench.geometry != config.geometry:
+        raise ValueError(
+            f"the benchmark's image_px is {bench.geometry.image_px}, must be the network's {config.image_px}"
+        )
     where = device_named(device)
     root, work = root or benchmark_root(), work or out.parent
+    torch.manual_seed(recipe.seed)
+    net = CarNet(config, None if config.fusion in FUSIONS else OwnFusion(config.fusion))
+    if warm_start is not None:
+        _begin_from(net, warm_start, log)
+    net = net.to(where).train()
+    optimiser = torch.optim.AdamW(net.parameters(), lr=recipe.peak_lr, weight_decay=1e-3)
+    run = {**asdict(recipe), "model": asdict(config), "benchmark": bench.key()}
+    work.mkdir(parents=True, exist_ok=True)
+    checkpoint = work / "checkpoint.safetensors"
+    before = _restore(checkpoint, run, net, optimiser, log) if resume else _Progress()
+
     files = make_split(bench, "train", root, scenes=recipe.scenes, progress=lambda i, n: tell("rendering scenes", i, n))
     held_out = make_split(bench, "validation", root, progress=lambda i, n: tell("rendering validation", i, n))
     data, validation = load_frames(files), load_frames(held_out)
@@ -134,17 +150,6 @@ def train(
         )
     check, check_steps = _first(validation, CHECK_FRAMES), max(CHECK_STEPS, recipe.steps // CHECKS // 10 * 10)
     log.info("%d training frames in %d scenes", len(data), len(files))
-
-    torch.manual_seed(recipe.seed)
-    net = CarNet(config, None if config.fusion in FUSIONS else OwnFusion(config.fusion))
-    if warm_start is not None:
-        _begin_from(net, warm_start, log)
-    net = net.to(where).train()
-    optimiser = torch.optim.AdamW(net.parameters(), lr=recipe.peak_lr, weight_decay=1e-3)
-    run = {**asdict(recipe), "model": asdict(config), "benchmark": bench.key()}
-    work.mkdir(parents=True, exist_ok=True)
-    checkpoint = work / "checkpoint.safetensors"
-    before = _restore(checkpoint, run, net, optimiser, log) if resume else _Progress()
     done, curve = before.step, work / "loss.csv"
     rows = _resume_curve(curve, done)
     recent = before.recent or tuple(row["train/loss"] for _, row in rows[-1:])  # a checkpoint of 0.2.0 has none
@@ -252,14 +257,21 @@ def _begin_from(net: CarNet, path: Path, log: logging.Logger) -> None:
     """Take over the tensors of `path` that the network has in the same shape."""
     own = read_config(path).fusion not in FUSIONS and isinstance(net.fusion, OwnFusion)
     given = load_weights(path, copy.deepcopy(net.fusion) if own else None)
-    if read_config(path).geometry != net.config.geometry:
+    found = read_config(path)
+    if found.half_extent_m != net.config.half_extent_m:
         raise ValueError(f"{path}: made for another range than ±{net.config.half_extent_m:g} m")
+    _refuse_other_image(path, found.image_px, net.config)
     mine, theirs = net.state_dict(), given.state_dict()
     fit = {k: v for k, v in theirs.items() if k in mine and mine[k].shape == v.shape}
     net.load_state_dict(fit, strict=False)
     anew = sorted(set(mine) - set(fit))
     if anew:
         log.info("begin anew: %s", ", ".join(anew))
+
+
+def _refuse_other_image(path: Path, image_px: int, config: ModelConfig, advice: str = "") -> None:
+    if image_px != config.image_px:
+        raise ValueError(f"{path}: image_px is {image_px}, must be {config.image_px} as in the run{advice}")
 
 
 def _resume_curve(path: Path, done: int) -> list[tuple[int, dict[str, float]]]:
@@ -298,13 +310,19 @@ def _save(path: Path, facts: dict[str, Any], net: CarNet, optimiser: torch.optim
 def _restore(
     path: Path, run: dict[str, Any], net: CarNet, optimiser: torch.optim.Optimizer, log: logging.Logger
 ) -> _Progress:
-    """Load a checkpoint of the same run; no progress when there is none or it belongs to another."""
+    """Load a checkpoint of the same run; no progress when there is none or it belongs to another.
+
+    Raises:
+        ValueError: it belongs to a network of another image.
+    """
     from safetensors import safe_open
 
     if not path.is_file():
         return _Progress()
     with safe_open(path, framework="pt") as file:
         facts = json.loads(file.metadata()["sortie"])
+        facts["model"] = asdict(ModelConfig()) | facts.get("model", {})  # an older one does not name newer choices
+        _refuse_other_image(path, facts["model"]["image_px"], net.config, "; --no-resume starts anew")
         if any(facts.get(k) != v for k, v in run.items()):
             log.info("%s belongs to another run (%s); starting anew", path, facts)
             return _Progress()

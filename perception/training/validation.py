@@ -17,6 +17,7 @@ from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.evaluation.results import TAU
 from sortie.perception.files import replacing
+from sortie.perception.geometry import IMAGE_PX, Geometry
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.checkpoint import read_config, read_facts, save_weights
 from sortie.perception.network.model import CarNet
@@ -147,6 +148,11 @@ def card(name: str, model: dict[str, Any], facts: dict[str, Any]) -> str:
             f"{heights} up, headings {headings}."
         )
     scenes, per_scene = SIZES["validation"]
+    asked, pictures = "", ""
+    if (image_px := model.get("image_px", IMAGE_PX)) != IMAGE_PX:
+        cameras = Geometry(image_px=image_px).cameras
+        asked = f" --image-px {image_px}"
+        pictures = f"pictures of {cameras.width_px} × {cameras.height_px} pixels (`fleet.camera.width_px` {cameras.width_px}), "
     return f"""# {name}
 
 Weights of `perception/network/model.py`, float32: {", ".join(f"{k} {v}" for k, v in model.items())}.
@@ -154,7 +160,7 @@ Weights of `perception/network/model.py`, float32: {", ".join(f"{k} {v}" for k, 
 {made}
 
 **Data**: {last["scenes"] * SIZES["train"][1]} fleet-frames of five drones in {last["scenes"]} scenes, the train split of benchmark
-`{bench["key"]}` (seed {bench["seed"]}, {bench["density"]} density, ±{bench["half_extent_m"]:g} m; `sortie bench make`); no outside data.{varied}
+`{bench["key"]}` (seed {bench["seed"]}, {bench["density"]} density, ±{bench["half_extent_m"]:g} m; `sortie bench make{asked}`); no outside data.{varied}
 **Learning**: {last["batch"]} frames a step, AdamW, one cycle; mirrored and turned by quarters. In each frame {EGOS} drones fuse everyone
 present (two to five) and one is alone, so a third of the supervised outputs are single-drone: the head works without peers.
 {dropped}
@@ -165,6 +171,6 @@ Validation split: {scenes * per_scene} fleet-frames in {scenes} scenes, every dr
 drone's *estimated* pose, so its heading error moves every far box: 0.5° is 0.7 m at 80 m, and a car is 1.85 m wide. Every car
 inside the ego's square counts, whether anyone can see it or not.
 
-**Made for** five drones 17–23 m apart, {heights} up, headings {headings}, banks of a few degrees, towns of
+**Made for** five drones 17–23 m apart, {heights} up, headings {headings}, banks of a few degrees, {pictures}towns of
 this generator. **Not made for** {beyond}, real images.
 """

@@ -15,6 +15,7 @@ from sortie.perception.benchmark.manifest import problems, read
 from sortie.perception.geometry import Geometry
 from sortie.scenarios.report_text import points
 from sortie.sim.cli.console import err, out, stages
+from sortie.sim.cli.options import ImagePx, ImagePxOption
 from sortie.sim.user_errors import user_errors
 
 app = typer.Typer(no_args_is_help=True, help="The benchmark: seeded splits of procedural scenes.")
@@ -51,6 +52,7 @@ def make(
         list[SplitName] | None, typer.Option(help="Make only this split. Repeat the option for several.")
     ] = None,
     range_: Annotated[RangeName, typer.Option("--range", help="How far the grids reach, ± metres.")] = RangeName.full,
+    image_px: ImagePxOption = ImagePx.usual,
     density: Annotated[DensityName, typer.Option(help="How many cars.")] = DensityName.default,
     scenes: Annotated[
         int | None, typer.Option(help="Make only this many scenes of each split, from the first.", min=1)
@@ -60,7 +62,7 @@ def make(
     """Render the splits. Finished scenes are kept, and an interrupted run continues."""
     from sortie.perception.benchmark.dataset import MOST, SIZES, Benchmark, make_split
 
-    bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value)))
+    bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value), int(image_px.value)))
     with user_errors(), stages() as report:
         for name in dict.fromkeys(s.value for s in split) if split else SIZES:
             count = min(scenes or SIZES[name][0], MOST[name])

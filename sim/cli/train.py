@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from sortie.sim.cli.console import out, stages
+from sortie.sim.cli.options import ImagePx, ImagePxOption
 from sortie.sim.folders import ensure_files
 from sortie.sim.user_errors import user_errors
 
@@ -84,6 +85,7 @@ def train(
         ),
     ] = Precision.float32,
     range_: Annotated[Range, typer.Option("--range", help="How far the grids reach, ± metres.")] = Range.full,
+    image_px: ImagePxOption = ImagePx.usual,
     bench_seed: Annotated[int, typer.Option(help="Seed of the benchmark.", min=0)] = 0,
     bench_dir: Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")] = Path("runs/bench"),
     warm_start: Annotated[
@@ -133,13 +135,13 @@ def train(
         if warm_start is not None and not warm_start.is_file():
             raise ValueError(f"{warm_start}: no such weights")
         ensure_files(out_file)
-    config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value, grid.value)
+    config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value, grid.value, int(image_px.value))
     with stages() as progress, user_errors(), _curves(out_file) as scalars:
         result = train_detector(
             out_file,
             recipe,
             config,
-            Benchmark(bench_seed, geometry=Geometry(half_extent_m)),
+            Benchmark(bench_seed, geometry=Geometry(half_extent_m, int(image_px.value))),
             root=bench_dir,
             warm_start=warm_start,
             minutes=minutes,

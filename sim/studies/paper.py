@@ -76,7 +76,13 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
     wall_s, cpu_s = time.perf_counter(), _cpu_s()
     on_the_bus = {} if job.live is None else measured_live(job.live)
     instrument = CarNetInstrument.load(job.weights, fusion_params=dict(job.fusion_params))
-    frames = bench_frames(job.seed, job.frames, work / "bench", lambda done, of: progress("test scenes", done, of))
+    frames = bench_frames(
+        job.seed,
+        job.frames,
+        work / "bench",
+        lambda done, of: progress("test scenes", done, of),
+        instrument.geometry,
+    )
     measured = measure(
         instrument,
         frames,
@@ -90,7 +96,7 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
     scores = measured.all_scores()
     table, points = rows.judge(scores, plane), rows.points(scores)
     varied = sensitivity(measured)
-    seen = picture(instrument, frames, 0, views=camera_views(job.seed, 0), **_drawn(job.settings))
+    seen = picture(instrument, frames, 0, views=camera_views(job.seed, 0, instrument.geometry), **_drawn(job.settings))
     progress("verdicts", 1, 1)
     facts = {
         "command": job.command,
@@ -122,9 +128,9 @@ def frame_picture(
     Raises:
         ValueError: no such frame or drone, or weights that do not fit.
     """
-    frames = bench_frames(job.seed, max(1, frame + 1), work / "bench")
-    views = camera_views(job.seed, frame) if frame >= 0 else None
     instrument = CarNetInstrument.load(job.weights, fusion_params=dict(job.fusion_params))
+    frames = bench_frames(job.seed, max(1, frame + 1), work / "bench", geometry=instrument.geometry)
+    views = camera_views(job.seed, frame, instrument.geometry) if frame >= 0 else None
     return picture(instrument, frames, frame, ego=ego, budgets=budgets, views=views, **_drawn(job.settings))
 
 

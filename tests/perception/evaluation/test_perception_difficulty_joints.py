@@ -17,6 +17,7 @@ import torch
 from sortie.perception.benchmark.difficulty import Difficulty
 from sortie.perception.benchmark.scenes import draw_captures, draw_scene, model_of
 from sortie.perception.evaluation import difficulty_effects as effects
+from sortie.perception.geometry import FULL
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import compare
 
@@ -100,7 +101,7 @@ def test_a_scene_is_drawn_and_flown_as_each_move_says(monkeypatch: pytest.Monkey
     monkeypatch.setattr(effects, "evaluate", evaluate)
     monkeypatch.setattr(effects, "lift", lambda views, captures, geometry: torch.zeros(len(captures), 1))
     monkeypatch.setattr(effects.Renderer, "render", lambda *_: None)
-    monkeypatch.setattr(effects.CarNetInstrument, "load", lambda _: SimpleNamespace(geometry=None))
+    monkeypatch.setattr(effects.CarNetInstrument, "load", lambda _: SimpleNamespace(geometry=FULL))
     effects.evaluate_scene(Path("none"), 5, rows, tmp_path / "scene.npz")
     for frames, d in zip(seen, moved, strict=True):
         captures = draw_captures(effects.SEED, "test", 5, 0, d)

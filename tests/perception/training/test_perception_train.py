@@ -224,6 +224,26 @@ def test_a_warm_start_takes_what_fits_and_names_the_rest(tmp_path: Path, caplog:
     assert load_weights(tmp_path / "old.safetensors").config == ModelConfig()
 
 
+def test_a_run_from_weights_or_a_checkpoint_of_another_image_is_refused_before_anything_is_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "make_split", lambda *_, **__: pytest.fail("rendered"))
+    save_weights(CarNet(), tmp_path / "old.safetensors")
+    sharp = ModelConfig(image_px=512)
+    with pytest.raises(ValueError, match=r"old\.safetensors: image_px is 256, must be 512 as in the run$"):
+        train(tmp_path / "w.safetensors", Recipe(), sharp, warm_start=tmp_path / "old.safetensors")
+    with pytest.raises(ValueError, match="the benchmark's image_px is 256, must be the network's 512"):
+        train(tmp_path / "w.safetensors", Recipe(), sharp, Benchmark())
+    checkpoint, net = tmp_path / "checkpoint.safetensors", CarNet()
+    optimiser = torch.optim.AdamW(net.parameters())
+    run = {"model": asdict(net.config), "benchmark": Benchmark().key()}
+    older = {k: v for k, v in run["model"].items() if k != "image_px"}  # type: ignore[attr-defined]
+    training._save(checkpoint, {**run, "model": older, "step": 7, "spent_s": 2.0}, net, optimiser)
+    with pytest.raises(ValueError, match=r"image_px is 256, must be 512 as in the run; --no-resume starts anew$"):
+        train(tmp_path / "w.safetensors", Recipe(), sharp)
+    assert training._restore(checkpoint, run, net, optimiser, logging.getLogger("sortie.train")).step == 7
+
+
 @pytest.mark.usefixtures("small")
 def test_a_fusion_of_ones_own_is_trained_with_its_encoder(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(

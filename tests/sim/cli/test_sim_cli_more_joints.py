@@ -21,6 +21,7 @@ from sim_examples import BASE
 
 import sortie
 from sortie.perception.evaluation.condition import Sharing
+from sortie.perception.geometry import Geometry
 from sortie.perception.uncertainty import BoxErrors
 from sortie.policies.contract import PolicyError
 from sortie.policies.verification.invariants import Invariant
@@ -104,13 +105,13 @@ def test_train(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = {
         "steps": 11, "batch": 6, "scenes": 12, "seed": 13, "peak-lr": 0.25, "cell-dropout": 0.5, "unsent": "zero", "fusion": "late",
         "exchange": "signed", "decoder": "deep", "grid": "fine", "varied": 0.75, "precision": "bfloat16", "range": "51.2",
-        "bench-seed": 14, "bench": "b", "warm-start": "late", "minutes": 1.5, "device": "cpu", "out": "o",
+        "image-px": 512, "bench-seed": 14, "bench": "b", "warm-start": "late", "minutes": 1.5, "device": "cpu", "out": "o",
     }  # fmt: skip
     given = [word for name, value in options.items() for word in (f"--{name}", value)]
     assert command("train", *given, "--no-resume") == 2
     out, recipe, config, bench = seen.args
-    assert (out, config, bench[0]) == (Path("o"), (51.2, "late", "signed", "deep", "fine"), 14)
-    assert bench[1]["geometry"].half_extent_m == 51.2
+    assert (out, config, bench[0]) == (Path("o"), (51.2, "late", "signed", "deep", "fine", 512), 14)
+    assert bench[1]["geometry"] == Geometry(51.2, 512)
     assert recipe == {
         "steps": 11, "batch": 6, "seed": 13, "scenes": 12, "peak_lr": 0.25, "cell_dropout": 0.5, "unsent": "zero", "varied": 0.75,
         "precision": "bfloat16", "warm_start": "late.own",
@@ -121,7 +122,7 @@ def test_train(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert command("train", "--warm-start", "w") == 2
     assert (seen.kwargs["warm_start"], seen.args[1]["warm_start"]) == (here / "w", "w")
     assert command("train") == 2
-    assert seen.args[2] == (102.4, "disconet", "rectified", "shallow", "coarse")
+    assert seen.args[2] == (102.4, "disconet", "rectified", "shallow", "coarse", 256)
     assert (seen.kwargs["warm_start"], seen.args[1]["warm_start"], seen.kwargs["resume"]) == (None, "", True)
 
 
@@ -272,13 +273,13 @@ def test_bench(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     files = {"splits": {"tau": {"a": {"frames": 5}, "b": {"frames": 7}}}}
     monkeypatch.setattr("sortie.sim.cli.bench.read", lambda folder: files)
     common = ("--seed", "3", "--density", "dense", "--range", "51.2")
-    assert command("bench", "make", *common, "--split", "tau", "--split", "test", "--split", "tau", "--scenes", "9",
+    assert command("bench", "make", *common, "--image-px", "512", "--split", "tau", "--split", "test", "--split", "tau", "--scenes", "9",
                    "--workers", "2", "--out", "o") == 0  # fmt: skip
     assert [(args[1:], given) for args, given in split.calls] == [
         (("tau", Path("o")), {"scenes": 4, "workers": 2}), (("test", Path("o")), {"scenes": 9, "workers": 2}),
     ]  # fmt: skip
     seed, difficulty, geometry = bench.args
-    assert (seed, difficulty.density, geometry.half_extent_m) == (3, "dense", 51.2)
+    assert (seed, difficulty.density, geometry) == (3, "dense", Geometry(51.2, 512))
     assert ["tau", "2", "12"] in table_rows(capsys.readouterr().out)
     assert command("bench", "make") == 0
     assert [(args[1], given["scenes"]) for args, given in split.calls[2:]] == [
@@ -288,7 +289,7 @@ def test_bench(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert [given["scenes"] for _, given in split.calls[-2:]] == [150, 4], "the train split goes on"
     assert command("bench", "survey", *common, "--scenes", "2") == 2
     seed, difficulty, geometry = bench.args
-    assert (seed, difficulty.density, geometry.half_extent_m) == (3, "dense", 51.2)
+    assert (seed, difficulty.density, geometry) == (3, "dense", Geometry(51.2))
     assert counted.args == (bench.answer, "train", 0)
     assert command("bench", "difficulty", "--weights", "w", "--scenes", "5", "--store", "t", "--workers", "6") == 0
     assert (effects.args, effects.kwargs) == ((Path("w"), Path("t")), {"scenes": 5, "workers": 6})

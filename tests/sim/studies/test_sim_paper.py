@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from sortie.perception.evaluation.measures import Elsewhere
 from sortie.perception.evaluation.picture import Picture
 from sortie.perception.evaluation.results import TableSettings
 from sortie.perception.evaluation.sensitivity import Varied
-from sortie.perception.geometry import CELLS, FULL
+from sortie.perception.geometry import CELLS, FULL, Geometry
 from sortie.perception.types import Boxes
 from sortie.policies.registry import resolve
 from sortie.sim.engine.sortie import run_sortie
@@ -317,13 +318,16 @@ def test_two_frames_from_nothing_to_a_report_and_a_recording(
 
 def test_a_frame_is_drawn_by_the_instrument_that_was_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: list[Any] = []
-    monkeypatch.setattr(paper, "bench_frames", lambda seed, count, root: None)
-    monkeypatch.setattr(paper, "camera_views", lambda seed, frame: None)
-    monkeypatch.setattr(paper.CarNetInstrument, "load", lambda path, fusion_params: seen.append(fusion_params))
+    sharp = SimpleNamespace(geometry=Geometry(image_px=512))
+    drawn: list[Geometry] = []
+    monkeypatch.setattr(paper, "bench_frames", lambda seed, count, root, geometry: drawn.append(geometry))
+    monkeypatch.setattr(paper, "camera_views", lambda seed, frame, geometry: drawn.append(geometry))
+    monkeypatch.setattr(paper.CarNetInstrument, "load", lambda path, fusion_params: seen.append(fusion_params) or sharp)
     monkeypatch.setattr(paper, "picture", lambda instrument, frames, f, **options: seen.append(options))
     settings = TableSettings(("zero",), "norm", 0.3, ways=Ways("zeros", "region_first"))
     job = paper.PaperSettings(tmp_path / "w", settings, fusion_params={"temperature": math.inf})
     paper.frame_picture(job, tmp_path, 0)
     params, options = seen
+    assert drawn == [sharp.geometry] * 2, "frames and pictures as the network was trained on"
     assert params == {"temperature": math.inf}
     assert (options["tau"], options["cells_by"], options["ways"]) == (0.3, "norm", ("zeros", "region_first"))
