@@ -43,7 +43,11 @@ def compare(
     ] = None,
     set_: SetOption = None,
     own_fusion: Annotated[
-        bool, typer.Option("--own-fusion", help="Fly each prior method that was published with a fusion of its own with that fusion, and with its network.")
+        bool,
+        typer.Option(
+            "--own-fusion",
+            help="Fly each prior method that was published with a fusion of its own with that fusion, and with its network.",
+        ),
     ] = False,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
     recording: Annotated[
