@@ -360,7 +360,7 @@ def test_coarser_pictures_show_less_ground_well_and_the_rest_as_before() -> None
 @pytest.mark.slow
 def test_a_torch_drone_finds_less_in_coarser_pictures_and_in_narrower_ones() -> None:
     def found(more: str) -> tuple[int, list[tuple[float, ...]]]:
-        record = run_sortie(fleet(more, *TORCH, "perception.score_threshold=0.3"), "silence")
+        record = run_sortie(fleet(more, *TORCH, "perception.score_threshold=0.6"), "silence")
         return len(boxes(record, 2)), boxes(record, 0)
 
     usual, coarse, narrow = (found(m) for m in ("", ", camera: {width_px: 64}", ", camera: {field_of_view_deg: 40}"))
