@@ -321,7 +321,7 @@ def _worked_over_silence() -> Tables:
                 [where, label, int(both.sum()), its[both].mean(), *(over if label != "silence" else [None] * 2)]
             )
     columns = [
-        Column("accuracy"), Column("policy"), Column("conditions"), Column("AP", ".3f"),
+        Column("scored area"), Column("policy"), Column("conditions"), Column("AP", ".3f"),
         Column("over silence", "+.1f", factor=100), Column("conditions in which it is above"),
     ]  # fmt: skip
     return {"worked_over_silence": Table(columns, rows, "AP@0.5; gains in points, intervals over conditions.")}
