@@ -523,7 +523,7 @@ def test_verify(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )  # fmt: skip
     assert command("verify", "best-2(received_budget=0.25)", *options) == 0
     assert resolved.args == ("best-2", {"received_budget": 0.25})
-    assert seen["conform"].kwargs == {"count": 50}
+    assert seen["conform"].kwargs == {"count": 50, "budget_s": 4.0}
     decide, rules = seen["prove"].args
     assert seen["prove"].kwargs == {"max_drones": 3, "budget_s": 4.0}
     subject, timed = seen["judge_over_time"].args
