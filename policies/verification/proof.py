@@ -330,17 +330,29 @@ class _Drawn:
             shown = RepeatableView(view)
             now = shown.now()
 
-            def fails(other: FleetView) -> bool:
-                return not budget.is_spent and check_property(prop, self._policy, other) is not None
+            has_end = number >= LEAST_VIEWS
+            cut = list[FleetView]()  # a view with many ages takes many decisions
 
-            def decide(other: FleetView, /, now: FleetView = now, number: int = number) -> Any:
+            def ask(other: FleetView, /, has_end: bool = has_end, cut: list[FleetView] = cut) -> Any:
+                if has_end and budget.is_spent:
+                    cut.append(other)
+                    raise Stopped
+                return self._policy(other)
+
+            def fails(other: FleetView, ask: Policy = ask, cut: list[FleetView] = cut) -> bool:
+                return not budget.is_spent and check_property(prop, ask, other) is not None and not cut
+
+            def decide(other: FleetView, /, now: FleetView = now, number: int = number, ask: Policy = ask) -> Any:
                 if other is not now:
-                    return self._policy(other)
+                    return ask(other)
                 if number not in self._answers:
-                    self._answers[number] = self._policy(now)
+                    self._answers[number] = ask(now)
                 return self._answers[number]
 
-            if _complaint(prop, decide, shown) is not None:
+            complaint = _complaint(prop, decide, shown)
+            if cut:
+                return None, self._text(number)
+            if complaint is not None:
                 if check_property(prop, self._policy, view) is None:
                     return view.frozen, ""  # it fails only sometimes: it is not the same for the same view
                 return shrink(view, fails), ""

@@ -100,9 +100,10 @@ class Flags:
         return sum(self._path.pick(flag_axis(bit, self._id), (0, 1 << bit)) for bit in read)
 
     def __and__(self, mask: object) -> Any:
-        return self._bits(mask) if isinstance(mask, int) else NotImplemented
+        return self._bits(mask) if type(mask) is int else self._bits(-1) & mask  # type: ignore[operator]
 
-    __rand__ = __and__
+    def __rand__(self, mask: object) -> Any:
+        return self._bits(mask) if type(mask) is int else mask & self._bits(-1)  # type: ignore[operator]
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._bits(-1), name)
@@ -113,16 +114,15 @@ class Flags:
 
 
 def _by_value(name: str) -> Callable[..., Any]:
-    reflected = f"__{name[3:]}" if name[:3] == "__r" else ""
+    """A method of `int` on the plain number. An operator gives the other operand its say, as Python does."""
+    plain_name = f"__{name[3:]}" if name[:3] == "__r" and hasattr(int, f"__{name[3:]}") else name
+    operates = divmod if plain_name == "__divmod__" else getattr(operator, plain_name, None)
 
     def act(*operands: Any) -> Any:
         plain = [x._bits(-1) if type(x) is Flags else x for x in operands]
-        found = getattr(int, name)(*plain)
-        if found is not NotImplemented or len(plain) != 2:
-            return found
-        if hasattr(operator, reflected):  # the other operand's own method meets the int, not the stand-in
-            return getattr(operator, reflected)(*reversed(plain))
-        return getattr(operator, name)(*plain) if hasattr(operator, name) else found
+        if len(plain) != 2 or operates is None:
+            return getattr(int, name)(*plain)
+        return operates(*plain) if plain_name == name else operates(*reversed(plain))
 
     return act
 

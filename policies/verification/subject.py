@@ -45,7 +45,15 @@ def own_invariants(policy: Policy) -> object:
     found: Any = policy
     while isinstance(found, functools.partial):
         found = found.func
-    return "" if not isinstance(found, Guarded) or found.source is None else found.source.names.get(OWN_INVARIANTS, "")
+    if not isinstance(found, Guarded) or found.source is None:
+        return ""
+    names = found.source.names
+    if OWN_INVARIANTS in names or "__getattr__" not in names:
+        return names.get(OWN_INVARIANTS, "")
+    try:
+        return names["__getattr__"](OWN_INVARIANTS)  # type: ignore[operator]  # as Python asks a module for any name
+    except AttributeError:
+        return ""
 
 
 def _is_sorties(function: Callable[..., Any]) -> bool:

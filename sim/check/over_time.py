@@ -12,6 +12,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 from sortie.policies.contract import FleetView, Policy, PolicyError
@@ -23,6 +24,7 @@ from sortie.policies.verification.courses import (
     draw_course,
     shrink_course,
 )
+from sortie.policies.verification.enforced import Violation
 from sortie.policies.verification.invariants import Invariant, Recent
 from sortie.policies.verification.proof import Outcome
 from sortie.policies.verification.search import Budget
@@ -90,9 +92,9 @@ def judge_over_time(
         seed: of the courses.
     """
     base, drones = loads("name: verify") if scenario is None else scenario, max(2, drones)
-    times, spent, proving = PlaneTimes.of(base), Budget(budget_s), Budget(budget_s)
+    times, proving = PlaneTimes.of(base), Budget(budget_s)
     verdicts = []
-    for rule in rules:
+    for rule, spent in zip(rules, Budget(budget_s).shares(len(rules)), strict=True):
         found, tried = _search(subject, rule, base, times, drones, courses, spent, seed)
         flown = 0
         if found is None and scenario is not None:
@@ -100,7 +102,10 @@ def judge_over_time(
         if found is not None:
             verdicts.append(found)
             continue
-        said = f"{tried} courses of up to {drones} drones" + (f" and {flown} flights keep it" if flown else " keep it")
+        of_all = "" if tried == courses else f" of {courses}"
+        said = f"{tried}{of_all} courses of up to {drones} drones" + (
+            f" and {flown} flights keep it" if flown else " keep it"
+        )
         said += f", at a dwell time of {times.dwell_s:g} s" + (", with the shield" if times.shielded else "")
         try:
             covered = prove_over_time(subject.policy, rule, times, drones, proving)
@@ -123,7 +128,7 @@ def _search(
     budget: Budget,
     seed: int,
 ) -> tuple[TimeVerdict | None, int]:
-    """The verdict if a course breaks the line, and how many courses were tried."""
+    """The verdict if a course breaks the line, and how many courses were tried to their end."""
     decisions = min(_LONGEST, math.ceil((3 * _longest_s(rule, times) + 2 * times.dwell_s + 1.0) / times.frame_s))
     values = Values.of(constants_of(subject.policy, [rule]))
     best: list[tuple[float, int, Course]] = []
@@ -135,16 +140,16 @@ def _search(
             size, limit = int(rng.integers(2, drones + 1)), times.detached_after_periods
             still = Course(size, decisions, times.frame_s, times.period_s, limit, {}, {})
             course = draw_course(seed, number, still, values)
-        pressure, view = _run(subject.policy, rule, times, course)
-        if view is not None:
-            verdict = _refuted(subject, rule, base, times, course)
+        pressure = _run(subject.policy, rule, times, course, budget)
+        if pressure == math.inf:
+            verdict = _refuted(subject, rule, base, times, course, budget)
             if verdict is not None:
                 return verdict, number + 1
+        if budget.is_spent:
+            return None, number
         heapq.heappush(best, (pressure, number, course))
         if len(best) > _BEST:
             heapq.heappop(best)
-        if budget.is_spent:
-            return None, number + 1
     return None, courses
 
 
@@ -153,27 +158,37 @@ def _longest_s(rule: Invariant, times: PlaneTimes) -> float:
     return max(times.dwell_s if span == DWELL else span for span in spans)
 
 
-def _run(policy: Policy, rule: Invariant, times: PlaneTimes, course: Course) -> tuple[float, FleetView | None]:
-    """How near a course comes to breaking a line, and the view at which it does."""
+def _views(course: Course, budget: Budget) -> Iterator[FleetView]:
+    """The views of a course, as far as the time goes."""
+    return takewhile(lambda view: not budget.is_spent, course.views())
+
+
+def _run(policy: Policy, rule: Invariant, times: PlaneTimes, course: Course, budget: Budget) -> float:
+    """How near a course comes to breaking a line; infinite if it does."""
     loop, pressure = ClosedLoop(policy, [rule], times), 0.0
-    for k, view in enumerate(course.views()):
+    for k, view in enumerate(_views(course, budget)):
         try:
             if loop.step(view, k * times.frame_s):
-                return math.inf, view
+                return math.inf
         except PolicyError:  # the contract's rules report it
-            return 0.0, None
+            return 0.0
         pressure = max(pressure, loop.past.pressure())
-    return pressure, None
+    return pressure
 
 
 def _refuted(
-    subject: Subject, rule: Invariant, base: Scenario, times: PlaneTimes, course: Course
+    subject: Subject, rule: Invariant, base: Scenario, times: PlaneTimes, course: Course, budget: Budget
 ) -> TimeVerdict | None:
     """The verdict with the smallest course found; None if a flight of it keeps the line."""
-    course = shrink_course(course, lambda c: first_break(subject.policy, rule, times, c.views()) is not None)
-    views = list(course.views())
-    loop = ClosedLoop(subject.policy, [rule], times)
-    broken = [v for k, view in enumerate(views) for v in loop.step(view, k * times.frame_s)]
+    course = shrink_course(course, lambda c: first_break(subject.policy, rule, times, _views(c, budget)) is not None)
+    loop, views, broken = ClosedLoop(subject.policy, [rule], times), list[FleetView](), list[Violation]()
+    for view in course.views():
+        views.append(view)
+        broken = loop.step(view, (len(views) - 1) * times.frame_s)
+        if broken:
+            break
+    if not broken:  # it decides otherwise than before
+        return None
     what = f"broken by {broken[0].cause} after {(len(views) - 1) * times.frame_s:.2f} s of a course: {broken[0].what}"
     scenario = course_scenario(subject, rule, what, base, views)
     return TimeVerdict(rule.text, "refuted", what, views[-1], scenario) if breaks(scenario) else None

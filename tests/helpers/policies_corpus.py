@@ -222,6 +222,9 @@ STAND_INS = {
 RARE = "0.802 < soc * 1.945 < 0.8020001"
 """Charges so few that only a search finds them."""
 RECOGNISED = {
+    "own int masks first": "class I(int):\n    def __rand__(self, other):\n        return 99\nbad = me.novelty_flags & I(0) == 99 and 0.4 < soc < 0.4000001",
+    "own int compares first": "class I(int):\n    def __gt__(self, other):\n        return False\nbad = not me.novelty_flags < I(999) and 0.4 < soc < 0.4000001",
+    "own int divides first": "class I(int):\n    def __rdivmod__(self, other):\n        return 99\nbad = divmod(me.novelty_flags, I(3)) == 99 and 0.4 < soc < 0.4000001",
     "minus of a whole number": f"bad = isinstance(-int(first), int) and {RARE}",
     "type of minus": f"bad = type(-int(first)) == int and {RARE}",
     "pattern of minus": f"match -int(first):\n    case int():\n        bad = {RARE}",

@@ -577,3 +577,15 @@ def test_a_solver_s_cells_decide_as_the_numbers_in_them(decide: Callable[[Any, A
         assert decide(x, y) == answer
         found.add(answer)
     assert found >= {decide(x, y) for x in grid for y in grid}
+
+
+@pytest.mark.parametrize(("asked", "expected"), [("INVARIANTS", "rate_hz <= 9"), ("OTHERS", "")])
+def test_invariants_that_a_file_gives_only_when_asked_are_read(tmp_path: Path, asked: str, expected: str) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "def __getattr__(name):\n"
+        f"    if name == {asked!r}: return 'rate_hz <= 9'\n"
+        "    raise AttributeError(name)\n"
+        "def decide(view): return []\n"
+    )
+    assert own_invariants(resolve(f"{file}:decide")) == expected

@@ -63,7 +63,7 @@ def test_each_rule_gets_two_views_however_slow_the_policy_is(clock: Clock) -> No
 
 def test_drawn_views_of_proofs_end_with_their_time(clock: Clock) -> None:
     verdicts = prove(clock.slow(0.3), LINES, max_drones=1, budget_s=0.0)
-    assert clock.now_s < 30 + 15  # the view at which the time ends counts, with all its ages
+    assert clock.now_s < 30 + 1  # it ends within a view, between two of its ages
     assert [v.outcome for v in verdicts] == ["searched"] * 4
     assert verdicts[0].what.endswith("; 26 of 1202 drawn views keep it")
     assert all(" of 1202 drawn views keep it" in v.what for v in verdicts)

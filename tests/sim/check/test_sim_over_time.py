@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import resolve
+from sortie.policies.verification import search
 from sortie.policies.verification.courses import Course, Values, constants_of, draw_course
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.search import Budget
 from sortie.scenarios.reading.load import loads
+from sortie.sim.check import over_time
 from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes
 from sortie.sim.check.few_states import NotFinite, prove_over_time
 from sortie.sim.check.over_time import Subject, course_scenario, flights_of, judge_over_time
@@ -190,3 +194,49 @@ def test_views_of_a_course_come_frame_by_frame_and_count_in_the_plane_s_periods(
     assert [view.period_s for view in views] == [0.1 * every] * 4
     assert [view.descriptors[0].stamp_ns for view in views] == [0, 100_000_000, 200_000_000, 300_000_000]
     assert [view.age_s[1] for view in views] == pytest.approx([0.02, 0.02, 0.12, 0.22])
+
+
+def test_courses_end_with_their_time_and_each_line_gets_a_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [0.0]
+    monkeypatch.setattr(search, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+
+    def slow(view: FleetView) -> list[Directive]:
+        now_s[0] += 0.3
+        return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=2.0, reason="r") for p in view.peers]
+
+    rules = parse("climbs_in(dwell) <= 1\nclimbs_in(60) <= 2")
+    verdicts = judge_over_time(Subject(slow, "slow", {}), rules, drones=2, budget_s=60.0, courses=90)
+    assert now_s[0] < 60 + 1
+    assert verdicts[0].what.startswith("1 of 90 courses of up to 2 drones keep it")
+    assert verdicts[1].what.startswith("0 of 90 courses of up to 2 drones keep it")
+
+
+def test_a_course_of_a_slow_policy_is_made_smaller_as_far_as_the_time_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [0.0]
+    monkeypatch.setattr(search, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr(over_time, "breaks", lambda scenario: True)
+
+    def silent(view: FleetView) -> list[Directive]:
+        now_s[0] += 1.0
+        return [Directive(view.ego, p, reason="r") for p in view.peers]
+
+    rules = parse("when peers >= 1: within 0.5 s: any_link(rate_hz > 0)")
+    (verdict,) = judge_over_time(Subject(silent, "silent", {}), rules, drones=2, budget_s=30.0, courses=90)
+    assert now_s[0] < 30 + 50
+    assert verdict.outcome == "refuted"
+    assert "after 0.60 s of a course" in verdict.what
+
+
+def test_a_break_that_does_not_come_again_refutes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(over_time, "breaks", lambda scenario: True)
+    decided = [0]
+
+    def once(view: FleetView) -> list[Directive]:
+        decided[0] += 1
+        rate_hz = 0.0 if decided[0] < 20 else 2.0
+        kind = Representation.DETECTIONS if rate_hz else Representation.NONE
+        return [Directive(view.ego, p, kind, rate_hz=rate_hz, reason="r") for p in view.peers]
+
+    rules = parse("when age_s < 0.5: within 1.5 s: rate_hz > 0")
+    (verdict,) = judge_over_time(Subject(once, "once", {}), rules, drones=2, budget_s=60.0, courses=2)
+    assert verdict.outcome == "searched"
