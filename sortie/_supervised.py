@@ -1,12 +1,14 @@
 """A parent for commands of which the exit code is a verdict: their code may not end the process before it is reached.
 
 A policy can end its process from compiled code, from a thread, or when Python exits, with an exit code of its choice. The
-command therefore runs in a child that reports its exit code through a pipe.
+command therefore runs in a child that reports its exit code through a pipe. A thread that a policy leaves behind may also keep
+the process from ending: the child is killed some time after its report.
 """
 
 from __future__ import annotations
 
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -15,6 +17,10 @@ from types import FrameType
 COMMANDS = ("check", "verify")
 _PIPE = "SORTIE_REPORTS_TO"
 _ENDED = b"error: the process ended before the command did; code that it runs must not end the process\n"
+_LINGERED = b"error: the process did not end after the command; code that it runs must not leave a thread behind\n"
+GRACE_S = 5.0
+"""How long a child may go on after its report, s."""
+_LOOK_S = 0.1
 
 
 def supervised() -> int | None:
@@ -37,12 +43,21 @@ def supervised() -> int | None:
     child = subprocess.Popen(command, pass_fds=[writes], env=os.environ | {_PIPE: str(writes)})  # noqa: S603 - this command again
     children.append(child)
     os.close(writes)
-    status = child.wait()
-    os.set_blocking(reads, False)
+    reported, is_open = b"", True
+    while not reported and is_open:
+        # its end, too, as somebody else may still hold the other end of the pipe
+        has_ended = child.poll() is not None
+        if select.select([reads], [], [], 0.0 if has_ended else _LOOK_S)[0]:
+            reported = os.read(reads, 1)
+            is_open = bool(reported)
+        elif has_ended:
+            is_open = False
     try:
-        reported = os.read(reads, 1)
-    except BlockingIOError:  # somebody else still holds the other end
-        reported = b""
+        status = child.wait(GRACE_S if reported else None)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        status = child.wait()
+        os.write(2, _LINGERED)
     if reported:
         return reported[0] or int(status != 0)
     if status == 0:

@@ -29,6 +29,12 @@ def late(view, seen=[]):
 def fine(view):
     return []
 
+def lingers(view, seen=[]):
+    if not seen:
+        seen.append(threading.Thread(target=threading.Event().wait))
+        seen[0].start()
+    return []
+
 def slow(view):
     print("decides", flush=True)
     while True:
@@ -57,6 +63,7 @@ def command(folder: Path, policy: str) -> list[str]:
         ("thread", 1, "error: the process ended before the command did"),
         ("late", 2, "returns int, must be a sequence of directives"),
         ("fine", 0, ""),
+        ("lingers", 1, "error: the process did not end after the command"),
     ],
 )
 def test_the_exit_code_is_the_commands(tmp_path: Path, policy: str, code: int, line: str) -> None:
