@@ -116,7 +116,7 @@ class Flags:
 def _by_value(name: str) -> Callable[..., Any]:
     """A method of `int` on the plain number. An operator gives the other operand its say, as Python does."""
     plain_name = f"__{name[3:]}" if name[:3] == "__r" and hasattr(int, f"__{name[3:]}") else name
-    operates = divmod if plain_name == "__divmod__" else getattr(operator, plain_name, None)
+    operates = divmod if plain_name == "__divmod__" else vars(operator).get(plain_name)
 
     def act(*operands: Any) -> Any:
         plain = [x._bits(-1) if type(x) is Flags else x for x in operands]
