@@ -20,6 +20,7 @@ from sortie.policies.contract import (
     Reposition,
     Representation,
 )
+from sortie.scenarios.plugins.user_calls import text_of
 
 _MAX_RUNG, _MAX_RHO, _MAX_RATE_HZ, _MAX_DEADLINE_S, _MAX_WEIGHT, _MAX_DUTY = (b.high for b in DIRECTIVE_BOUNDS.values())
 _PLAIN_NUMBERS = frozenset({float, int})
@@ -170,17 +171,17 @@ def find_wrong_type(d: object) -> str | None:
     where = f"directive {d.source}→{d.destination}"
     for name in ("source", "destination"):
         if not _is_whole(getattr(d, name)):
-            return f"{where}: {name} is {getattr(d, name)!r}, must be a drone's id, a whole number"
+            return f"{where}: {name} is {text_of(getattr(d, name))}, must be a drone's id, a whole number"
     for name, (high, kind) in DIRECTIVE_BOUNDS.items():
         value = getattr(d, name)
         if not _is_honest(value) or not _compares(value, 0.0, high) or (kind != "a number" and not _is_whole(value)):
             bounds = "" if name == "representation" else f"in [0, {high:g}], "
-            return f"{where}: {name} is {value!r}, must be {bounds}{kind}"
+            return f"{where}: {name} is {text_of(value)}, must be {bounds}{kind}"
     if not (d.roi is None or type(d.roi) is Disc):
-        return f"{where}: roi is {d.roi!r}, must be a Disc or None"
+        return f"{where}: roi is {text_of(d.roi)}, must be a Disc or None"
     for name, value in () if d.roi is None else d.roi._asdict().items():
         if not _is_honest(value) or not _compares(value, -_FAR_M, _FAR_M):
-            return f"{where}: roi.{name} is {value!r}, must be a number"
+            return f"{where}: roi.{name} is {text_of(value)}, must be a number"
     fault = _reason_fault(d.reason)
     return f"{where}: {fault}" if fault else None
 
@@ -237,7 +238,7 @@ _HALF_PAIR = re.compile("[\ud800-\udfff]")
 def _reason_fault(reason: object) -> str | None:
     """Why a reason cannot stand in the record; None if it can."""
     if not isinstance(reason, str) or not _is_honest(reason):
-        return f"reason is {reason!r}, must be text"
+        return f"reason is {text_of(reason)}, must be text"
     if _HALF_PAIR.search(reason):
         return f"reason is {reason!r}, must be text that UTF-8 can write"
     return None

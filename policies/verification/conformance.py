@@ -30,7 +30,7 @@ from sortie.policies.verification.search import BUDGET_S, LEAST_VIEWS, Budget, d
 from sortie.policies.verification.subject import searchable
 from sortie.policies.verification.symbols import Refused
 from sortie.policies.verification.views import draw_view, draw_views, shrink
-from sortie.scenarios.plugins.user_calls import Guarded
+from sortie.scenarios.plugins.user_calls import Guarded, guarded, text_of
 from sortie.scenarios.plugins.user_code import load
 
 VIEWS = 300
@@ -156,7 +156,7 @@ def _returns_a_sequence(policy: Policy, view: FleetView) -> str | None:
     try:
         answer = policy(view.frozen)
     except Exception as error:
-        return f"raises {type(error).__name__}: {error}"
+        return f"raises {type(error).__name__}: {text_of(error, str)}"
     if type(answer) not in (list, tuple):
         return f"returns {type(answer).__name__}, must be a list or a tuple of directives"
     return None
@@ -282,9 +282,9 @@ def _accepts_small_views(policy: Policy, view: FleetView) -> str | None:
         view._replace(descriptors={}, age_s={}),
     ):
         try:
-            directives = list(policy(few.frozen))
+            directives = guarded(list)(policy(few.frozen))
         except Exception as error:
-            return f"{len(few.descriptors)} drones in the view: raises {type(error).__name__}: {error}"
+            return f"{len(few.descriptors)} drones in the view: raises {type(error).__name__}: {text_of(error, str)}"
         if directives:
             return f"{len(few.descriptors)} drones in the view: {len(directives)} directives, must be none"
     return None
@@ -295,7 +295,7 @@ def _accepts_stale_views(policy: Policy, view: FleetView) -> str | None:
     try:
         check_directives(policy(stale.frozen), stale)
     except Exception as error:
-        return f"every descriptor {_STALE_PERIODS:g} periods old: {type(error).__name__}: {error}"
+        return f"every descriptor {_STALE_PERIODS:g} periods old: {type(error).__name__}: {text_of(error, str)}"
     return None
 
 
@@ -433,7 +433,7 @@ def _viewpoint_keeps_rules(policy: Policy, view: FleetView) -> str | None:
     except Reached as error:
         return f"its viewpoint {error}"
     except Exception as error:
-        return f"its viewpoint raises {type(error).__name__}: {error}"
+        return f"its viewpoint raises {type(error).__name__}: {text_of(error, str)}"
     return next((f"its viewpoint: {what}" for what, other in others.items() if other != request), None)
 
 
@@ -476,7 +476,7 @@ def _decides_in_time(policy: Policy, budget: Budget) -> Check:
                 policy(view)
                 marks_ns.append(time.thread_time_ns())
         except Exception as error:
-            return Check(name, False, f"raises {type(error).__name__}: {error}", view)
+            return Check(name, False, f"raises {type(error).__name__}: {text_of(error, str)}", view)
         took_s[drones] = statistics.median(b - a for a, b in pairwise(marks_ns)) * 1e-9
         timed += len(marks_ns) - 1
     what = ", ".join(f"{s * 1e6:.0f} µs at {n} drones" for n, s in took_s.items())

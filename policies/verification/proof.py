@@ -59,6 +59,7 @@ from sortie.policies.verification.solver import solver_paths
 from sortie.policies.verification.subject import searchable
 from sortie.policies.verification.symbols import Combined, Refused
 from sortie.policies.verification.views import LARGEST, MAX_DRONES, draw_view, shrink
+from sortie.scenarios.plugins.user_calls import text_of
 
 DRONES = 5
 """The largest fleet that a proof covers if nothing else is asked for."""
@@ -287,7 +288,7 @@ def _search(
     except (Refused, Reached) as refused:
         coverage.cannot = str(refused)
     except Exception as error:  # its file does not load with the checks
-        coverage.cannot = f"raises {type(error).__name__}: {error}"
+        coverage.cannot = f"raises {type(error).__name__}: {text_of(error, str)}"
     return coverage
 
 
@@ -370,12 +371,14 @@ def _complaint(prop: Property, policy: Policy, view: RepeatableView) -> str | No
     try:
         return prop.complaint(policy, view)
     except Exception as error:
-        return _invalid_directive(policy, view.now()) or f"raises {type(error).__name__}: {error}"
+        return _invalid_directive(policy, view.now()) or f"raises {type(error).__name__}: {text_of(error, str)}"
 
 
 def _invalid_directive(policy: Policy, view: FleetView) -> str | None:
     """The first invalid directive in the policy's output, as text; None if that is not the cause of an exception."""
     try:
-        return next((wrong for d in policy(view) if (wrong := find_wrong_type(d)) is not None), None)
+        answer = policy(view)
+        found = map(find_wrong_type, answer if type(answer) in (list, tuple) else ())  # others may never end
+        return next((wrong for wrong in found if wrong is not None), None)
     except Exception:
         return None

@@ -85,7 +85,8 @@ class Guarded:
                 watch.begin()
                 return self.__wrapped__(*args, **kwargs)
             finally:
-                watch.end()  # an interrupt that was sent arrives here at the latest
+                if watch.end():  # an interrupt arrives here at the latest, or was lost in the call
+                    raise _Interrupt
         except SystemExit as stop:
             raise ProgramExitError(f"exit code {stop.code}, must return").with_traceback(stop.__traceback__) from None
         except _Interrupt as late:
@@ -106,6 +107,14 @@ def guarded(function: Callable[..., Any]) -> Callable[..., Any]:
     if isinstance(function, functools.partial):
         return functools.partial(guarded(function.func), *function.args, **function.keywords)
     return function if isinstance(function, Guarded) else Guarded(function)
+
+
+def text_of(value: object, form: Callable[[Any], str] = repr) -> str:
+    """A user's object as text. Its own code makes it; where that fails or is late, the text is the name of its type."""
+    try:
+        return str.__str__(guarded(form)(value))  # not a text of the user's own type
+    except Exception:
+        return f"a {type(value).__name__}"
 
 
 def is_guarded(function: Callable[..., Any]) -> bool:
@@ -183,10 +192,12 @@ class _Watch:
         with self._lock:
             self.calling, self._ticks = True, 0
 
-    def end(self) -> None:
+    def end(self) -> bool:
+        """Whether the call was late."""
         with self._lock:
             self.calling = False
         self._return()
+        return self._ticks * TICK_S > self._limit_s
 
     def _return(self) -> None:
         if self._here is not None and _working_folder() != self._here:

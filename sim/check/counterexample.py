@@ -110,9 +110,9 @@ def raised_ages(policy: Policy, view: FleetView) -> dict[int, float] | None:
 
 
 def _decided(policy: Policy, view: FleetView) -> list[Directive]:
-    directives = list(policy(view))
+    directives = policy(view)
     check_directives(directives, view)
-    return directives
+    return list(directives)
 
 
 def shows_in_flight(scenario: Scenario) -> bool:

@@ -21,7 +21,7 @@ from sortie.policies.contract import FleetView, PolicyError
 from sortie.policies.registry import parameters, resolve, viewpoint_of
 from sortie.policies.verification.conformance import conform, full_view
 from sortie.scenarios.plugins import user_calls
-from sortie.scenarios.plugins.user_calls import Guarded, ProgramExitError, TookTooLongError, guarded, watched
+from sortie.scenarios.plugins.user_calls import Guarded, ProgramExitError, TookTooLongError, guarded, text_of, watched
 
 POLICY = """
 import os, re, sys, time
@@ -50,6 +50,21 @@ def spins_again(view):
             spins(view)
         except Exception:
             pass
+
+class Spins:
+    def __del__(self):
+        spins(None)
+
+class Text(str):
+    def __str__(self):
+        spins(None)
+
+def spins_at_its_end(view):
+    kept = Spins()
+    return []
+
+def says_text(view):
+    return Text("said")
 
 def sleeps(view):
     time.sleep(1000)
@@ -126,7 +141,8 @@ def test_the_guard_leaves_a_policy_as_it_is(file: Path) -> None:
     assert policy(full_view(2)) == []
 
 
-@pytest.mark.parametrize("name", ["spins", "spins_again"])
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Python drops what `__del__` raises
+@pytest.mark.parametrize("name", ["spins", "spins_again", "spins_at_its_end"])
 def test_a_call_that_is_late_is_interrupted_and_not_made_again(file: Path, name: str) -> None:
     policy = resolve(f"{file}:{name}")
     with watched(0.15, "0.15 s"):
@@ -134,6 +150,14 @@ def test_a_call_that_is_late_is_interrupted_and_not_made_again(file: Path, name:
             with pytest.raises(TookTooLongError, match=r"^no answer within 0\.15 s$"):
                 policy(full_view(2))
     assert resolve("worked")(full_view(2)), "nothing arrives later"
+
+
+def test_a_users_object_as_text_ends_within_the_limit(file: Path) -> None:
+    said = resolve(f"{file}:says_text")(full_view(2))
+    with watched(0.15, "0.15 s"):
+        assert text_of(said, str) == "a Text"
+        assert text_of(said) == "'said'"
+    assert type(text_of(said)) is str
 
 
 def test_each_call_has_the_whole_limit() -> None:
