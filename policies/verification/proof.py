@@ -378,7 +378,8 @@ def _invalid_directive(policy: Policy, view: FleetView) -> str | None:
     """The first invalid directive in the policy's output, as text; None if that is not the cause of an exception."""
     try:
         answer = policy(view)
-        found = map(find_wrong_type, answer if type(answer) in (list, tuple) else ())  # others may never end
-        return next((wrong for wrong in found if wrong is not None), None)
+        if type(answer) not in (list, tuple):  # others may never end
+            return find_inexact(answer)
+        return next((wrong for d in answer if (wrong := find_wrong_type(d)) is not None), None)
     except Exception:
         return None

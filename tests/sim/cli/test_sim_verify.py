@@ -201,7 +201,7 @@ def quits(view):
         ("raises_when_old", "raises RuntimeError: too old"),
         ("nothing", "returns NoneType, must be a list or a tuple of directives"),
         ("lacks", "missing 1 required keyword-only argument: 'must'"),
-        ("text", "a policy returns Directive, got str"),
+        ("text", "a policy returns a list or a tuple of directives, got str"),
         ("texts", "rate_hz is '10', must be in [0, 30], a number"),
         ("texts_when_old", "rate_hz is '10', must be in [0, 30], a number"),
         ("rung", "representation is 'features', must be a Representation, such as sortie.Representation.DETECTIONS"),
