@@ -85,7 +85,8 @@ class Guarded:
                 watch.begin()
                 return self.__wrapped__(*args, **kwargs)
             finally:
-                if watch.end():  # an interrupt arrives here at the latest, or was lost in the call
+                # an interrupt arrives here at the latest, or was lost in the call
+                if watch.end() and not isinstance(sys.exc_info()[1], _Interrupt):
                     raise _Interrupt
         except SystemExit as stop:
             raise ProgramExitError(f"exit code {stop.code}, must return").with_traceback(stop.__traceback__) from None
