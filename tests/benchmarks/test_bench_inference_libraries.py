@@ -1,8 +1,7 @@
 """The detector's forward pass by the hand-written kernel and by libraries: `make bench-all` runs these; nothing here asserts a time.
 
-A forward pass is one drone's image through encoder and head, in float32.
-ONNX Runtime and
-OpenVINO are no dependencies: `pip install onnx onnxruntime openvino` adds their rows.
+A forward pass is one drone's image through encoder and head, in float32. ONNX Runtime and OpenVINO are no dependencies:
+`pip install onnx onnxruntime openvino` adds their rows.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from sortie.scenarios.schema import Perception, Scene
 
 Forward = Callable[[Tensor], Tensor]
 Parts = tuple[Forward, Forward]
-"""Encoder, uint8 [1, 4, 256, 256] → [1, 80, 64, 64], and head, → [1, 7, 128, 128]: apart, as fusion lies between them."""
+"""Encoder, uint8 [1, 4, 256, 256] → [1, 80, 64, 64], and head, → [1, 8, 128, 128]: apart, as the exchange lies between them."""
 IMAGE = torch.zeros(1, 4, 256, 256, dtype=torch.uint8)
 
 
@@ -63,9 +62,14 @@ def folded() -> CarNet:
     return net
 
 
+def parts_of(net: CarNet) -> tuple[nn.Module, nn.Module]:
+    """Encoder and head, the layer that makes an exchanged map fine with the head."""
+    return net.encoder, nn.Sequential(net.spread, net.head)
+
+
 def by_torch(net: CarNet) -> Parts:
     """Layer by layer."""
-    return net.encoder, net.head
+    return parts_of(net)
 
 
 def by_compiler(freezing: bool = False) -> Parts:
@@ -73,8 +77,8 @@ def by_compiler(freezing: bool = False) -> Parts:
     from torch._inductor import config
 
     config.freezing = freezing
-    net = folded()
-    parts = torch.compile(net.encoder), torch.compile(net.head)
+    encoder, head = parts_of(folded())
+    parts = torch.compile(encoder), torch.compile(head)
     with torch.no_grad():
         parts[1](parts[0](IMAGE))
     return parts
@@ -83,9 +87,9 @@ def by_compiler(freezing: bool = False) -> Parts:
 def exported(folder: Path) -> list[Path]:
     """Encoder and head as ONNX files."""
     pytest.importorskip("onnx")
-    net, paths = folded(), [folder / "encoder.onnx", folder / "head.onnx"]
+    parts, paths = parts_of(folded()), [folder / "encoder.onnx", folder / "head.onnx"]
     with torch.no_grad():
-        for part, seen, path in zip((net.encoder, net.head), (IMAGE, net.encoder(IMAGE)), paths, strict=True):
+        for part, seen, path in zip(parts, (IMAGE, parts[0](IMAGE)), paths, strict=True):
             torch.onnx.export(part, (seen,), str(path), input_names=["seen"], dynamo=False)
     return paths
 
