@@ -127,7 +127,7 @@ def check_reposition(request: object, view: FleetView) -> None:
     """
     if request is None:
         return
-    if not isinstance(request, Reposition):
+    if type(request) is not Reposition:
         raise PolicyError(f"a viewpoint returns Reposition or None, got {type(request).__name__}")
     where, me = f"reposition of drone {view.ego}", view.me
     if me is None:
@@ -136,10 +136,9 @@ def check_reposition(request: object, view: FleetView) -> None:
         raise PolicyError(f"{where}: {fault}")
     away_m = []
     for name, value, here_m in (("x_m", request.x_m, me.position_m[0]), ("y_m", request.y_m, me.position_m[1])):
-        try:
-            away_m.append(math.fabs(value - here_m))
-        except Exception as error:  # only a number does this; the message names what came instead
-            raise PolicyError(f"{where}: {name} is {value!r}, must be a number") from error
+        if not _is_honest(value) or not _compares(value, -math.inf, math.inf):
+            raise PolicyError(f"{where}: {name} is {_told(value)}, must be a number")
+        away_m.append(math.fabs(value - here_m))
     far_m = math.hypot(*away_m)
     if not far_m <= MAX_REPOSITION_M:  # also catches NaN
         raise PolicyError(f"{where}: {far_m:.1f} m from the drone, must be at most {MAX_REPOSITION_M:g} m")
@@ -160,7 +159,7 @@ def find_inexact(answer: object) -> str | None:
         for name, value in zip(Directive._fields, d, strict=True):
             for part in value if type(value) is Disc else (value,):
                 if not _is_honest(part):
-                    return f"directive {d.source!r}→{d.destination!r}: {name} is of the policy's own type {type(part).__name__}"
+                    return f"{_where(d)}: {name} is of the policy's own type {type(part).__name__}"
     return None
 
 
@@ -168,20 +167,20 @@ def find_wrong_type(d: object) -> str | None:
     """The first field of a directive that is of a wrong type, as an error text; None if all types are right."""
     if type(d) is not Directive:
         return f"a policy returns Directive, got {type(d).__name__}"
-    where = f"directive {d.source}→{d.destination}"
+    where = _where(d)
     for name in ("source", "destination"):
-        if not _is_whole(getattr(d, name)):
-            return f"{where}: {name} is {text_of(getattr(d, name))}, must be a drone's id, a whole number"
+        if not _is_honest(getattr(d, name)) or not _is_whole(getattr(d, name)):
+            return f"{where}: {name} is {_told(getattr(d, name))}, must be a drone's id, a whole number"
     for name, (high, kind) in DIRECTIVE_BOUNDS.items():
         value = getattr(d, name)
         if not _is_honest(value) or not _compares(value, 0.0, high) or (kind != "a number" and not _is_whole(value)):
             bounds = "" if name == "representation" else f"in [0, {high:g}], "
-            return f"{where}: {name} is {text_of(value)}, must be {bounds}{kind}"
+            return f"{where}: {name} is {_told(value)}, must be {bounds}{kind}"
     if not (d.roi is None or type(d.roi) is Disc):
         return f"{where}: roi is {text_of(d.roi)}, must be a Disc or None"
     for name, value in () if d.roi is None else d.roi._asdict().items():
         if not _is_honest(value) or not _compares(value, -_FAR_M, _FAR_M):
-            return f"{where}: roi.{name} is {text_of(value)}, must be a number"
+            return f"{where}: roi.{name} is {_told(value)}, must be a number"
     fault = _reason_fault(d.reason)
     return f"{where}: {fault}" if fault else None
 
@@ -191,7 +190,7 @@ def _find_fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
     wrong = find_wrong_type(d)
     if wrong is not None:
         return wrong
-    where = f"directive {d.source}→{d.destination}"
+    where = _where(d)
     if d.source != view.ego:
         return f"{where}: source is {d.source}, must be the ego {view.ego}"
     if d.destination == view.ego or d.destination not in view.descriptors:
@@ -207,6 +206,15 @@ def _find_fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
             if not -_FAR_M <= value <= _FAR_M:
                 return f"{where}: roi.{name} is {value!r}, must be finite in 32 bits"
     return f"{where}: second directive for the same link" if d.destination in seen else None
+
+
+def _where(d: Directive) -> str:
+    return f"directive {text_of(d.source, str)}→{text_of(d.destination, str)}"
+
+
+def _told(value: object) -> str:
+    """A value in an error; of a type of the user's own with the type's name, as it may look like a valid one."""
+    return text_of(value) if _is_honest(value) else f"{text_of(value)} of the policy's own type {type(value).__name__}"
 
 
 def _compares(value: Any, low: float, high: float) -> bool:
@@ -245,7 +253,7 @@ def _reason_fault(reason: object) -> str | None:
 
 
 def _is_whole(value: Any) -> bool:
-    """Whether a value is an integer of any type, as the wire needs it: 2 and numpy's 2, not 2.0."""
+    """Whether a value of an honest type is an integer, as the wire needs it: 2 and numpy's 2, not 2.0."""
     try:
         operator.index(value)
     except TypeError:

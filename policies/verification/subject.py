@@ -6,10 +6,11 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from sortie.policies.contract import Policy
+from sortie.policies.contract import Policy, PolicyError
 from sortie.policies.verification.instrument import instrumented
 from sortie.policies.verification.shield import Shielded
-from sortie.scenarios.plugins.user_calls import Guarded, Source
+from sortie.scenarios.plugins.reference import describe_error
+from sortie.scenarios.plugins.user_calls import Guarded, Source, guarded
 
 OWN_INVARIANTS = "INVARIANTS"
 """The name under which a policy's file keeps its own invariants, as text."""
@@ -41,7 +42,11 @@ def _with_checks(source: Source) -> Policy:
 
 
 def own_invariants(policy: Policy) -> object:
-    """What a policy's file keeps under `INVARIANTS`, however the policy itself was made; empty text where there are none."""
+    """What a policy's file keeps under `INVARIANTS`, however the policy itself was made; empty text where there are none.
+
+    Raises:
+        PolicyError: the file is asked for them, and fails.
+    """
     found: Any = policy
     while isinstance(found, functools.partial):
         found = found.func
@@ -51,9 +56,13 @@ def own_invariants(policy: Policy) -> object:
     if OWN_INVARIANTS in names or "__getattr__" not in names:
         return names.get(OWN_INVARIANTS, "")
     try:
-        return names["__getattr__"](OWN_INVARIANTS)  # type: ignore[operator]  # as Python asks a module for any name
+        return guarded(names["__getattr__"])(OWN_INVARIANTS)  # type: ignore[arg-type]  # as Python asks a module for any name
     except AttributeError:
         return ""
+    except Exception as error:
+        raise PolicyError(
+            f"{found.source.file}: __getattr__({OWN_INVARIANTS!r}) raises {describe_error(error)}"
+        ) from error
 
 
 def _is_sorties(function: Callable[..., Any]) -> bool:

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from sortie.fleet.staleness import cap_by_age, health
 from sortie.policies.checks import check_directives
-from sortie.policies.contract import Directive, FleetView, Policy, nothing
+from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, nothing
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.verification.enforced import Steps, Violation, effective, judge, put_right
 from sortie.policies.verification.invariants import Invariant, just_heard
 from sortie.policies.verification.past import Past
 from sortie.policies.verification.shield import enforce
+from sortie.scenarios.plugins.reference import describe_error
 from sortie.scenarios.schema import Scenario
 
 
@@ -64,7 +66,7 @@ class ClosedLoop:
         """Decide on one view, and return the lines that the gates now break.
 
         Raises:
-            PolicyError: the policy returns something else than valid directives.
+            PolicyError: the policy fails, or returns something else than valid directives.
         """
         view, times, me = view.frozen, self._times, view.ego
         decided = self._ask(view)
@@ -94,15 +96,32 @@ class ClosedLoop:
         return judge(self._rules, view, steps, self.enforced, fresh, self.past)
 
     def _ask(self, view: FleetView) -> Sequence[Directive]:
-        directives = self._policy(view)
+        try:
+            directives = self._policy(view)
+        except Exception as error:
+            raise PolicyError(f"raises {describe_error(error)}") from error
         check_directives(directives, view)
         return tuple(directives)
 
 
-def first_break(policy: Policy, rule: Invariant, times: PlaneTimes, views: Iterable[FleetView]) -> FleetView | None:
-    """The view of a course at whose decision the gates break a line; None if they keep it."""
+class Break(NamedTuple):
+    """Where a course fails."""
+
+    decisions: int
+    """How many were made, the failing one with them."""
+    view: FleetView
+    what: str
+
+
+def first_break(policy: Policy, rule: Invariant, times: PlaneTimes, views: Iterable[FleetView]) -> Break | None:
+    """The decision of a course at which the gates break a line or the policy fails; None if there is none."""
     loop = ClosedLoop(policy, [rule], times)
     for k, view in enumerate(views):
-        if loop.step(view, k * times.frame_s):
-            return view
+        at = f"after {k * times.frame_s:.2f} s of a course"
+        try:
+            broken = loop.step(view, k * times.frame_s)
+        except PolicyError as error:
+            return Break(k + 1, view, f"the policy fails {at}: {error}")
+        if broken:
+            return Break(k + 1, view, f"broken by {broken[0].cause} {at}: {broken[0].what}")
     return None

@@ -124,8 +124,3 @@ def shows_in_flight(scenario: Scenario) -> bool:
     except Exception:  # what is no directive trips the audit before the contract names it: kept as a view alone
         return False
     return record.totals["invariant_violations"] > 0
-
-
-def breaks(scenario: Scenario) -> bool:
-    """Whether the scenario's flight breaks an invariant."""
-    return run_sortie(scenario).totals["invariant_violations"] > 0

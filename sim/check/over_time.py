@@ -12,7 +12,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import takewhile
+from itertools import islice, takewhile
 from typing import Any, NamedTuple
 
 from sortie.policies.contract import FleetView, Policy, PolicyError
@@ -24,17 +24,16 @@ from sortie.policies.verification.courses import (
     draw_course,
     shrink_course,
 )
-from sortie.policies.verification.enforced import Violation
 from sortie.policies.verification.invariants import Invariant, Recent
 from sortie.policies.verification.proof import Outcome
-from sortie.policies.verification.search import Budget
+from sortie.policies.verification.search import Budget, Stopped
 from sortie.policies.verification.views import to_json
 from sortie.policies.verification.words import DWELL
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes, first_break
-from sortie.sim.check.counterexample import breaks, slug
+from sortie.sim.check.counterexample import shows_in_flight, slug
 from sortie.sim.check.few_states import NotFinite, prove_over_time
 from sortie.sim.engine.sortie import run_sortie
 
@@ -164,14 +163,14 @@ def _views(course: Course, budget: Budget) -> Iterator[FleetView]:
 
 
 def _run(policy: Policy, rule: Invariant, times: PlaneTimes, course: Course, budget: Budget) -> float:
-    """How near a course comes to breaking a line; infinite if it does."""
+    """How near a course comes to breaking a line; infinite if it does, or if the policy fails."""
     loop, pressure = ClosedLoop(policy, [rule], times), 0.0
     for k, view in enumerate(_views(course, budget)):
         try:
             if loop.step(view, k * times.frame_s):
                 return math.inf
-        except PolicyError:  # the contract's rules report it
-            return 0.0
+        except PolicyError:
+            return math.inf
         pressure = max(pressure, loop.past.pressure())
     return pressure
 
@@ -181,17 +180,13 @@ def _refuted(
 ) -> TimeVerdict | None:
     """The verdict with the smallest course found; None if a flight of it keeps the line."""
     course = shrink_course(course, lambda c: first_break(subject.policy, rule, times, _views(c, budget)) is not None)
-    loop, views, broken = ClosedLoop(subject.policy, [rule], times), list[FleetView](), list[Violation]()
-    for view in course.views():
-        views.append(view)
-        broken = loop.step(view, (len(views) - 1) * times.frame_s)
-        if broken:
-            break
-    if not broken:  # it decides otherwise than before
+    broken = first_break(subject.policy, rule, times, course.views())
+    if broken is None:  # it decides otherwise than before
         return None
-    what = f"broken by {broken[0].cause} after {(len(views) - 1) * times.frame_s:.2f} s of a course: {broken[0].what}"
-    scenario = course_scenario(subject, rule, what, base, views)
-    return TimeVerdict(rule.text, "refuted", what, views[-1], scenario) if breaks(scenario) else None
+    views = list(islice(course.views(), broken.decisions))
+    scenario = course_scenario(subject, rule, broken.what, base, views)
+    shown = shows_in_flight(scenario)
+    return TimeVerdict(rule.text, "refuted", broken.what, broken.view, scenario) if shown else None
 
 
 def course_scenario(
@@ -231,15 +226,24 @@ def course_scenario(
 def _fly(
     subject: Subject, rule: Invariant, scenario: Scenario, flights: int, budget: Budget
 ) -> tuple[TimeVerdict | None, int]:
-    """The verdict if a flight of the scenario breaks the line, and how many were flown."""
+    """The verdict if the policy fails or breaks the line in a flight of the scenario, and how many were flown."""
+
+    def each_second(t_s: float) -> None:
+        if budget.is_spent:
+            raise Stopped
+
     for number, flown in enumerate(flights_of(subject, rule, scenario, flights)):
-        record = run_sortie(flown)
+        try:
+            record = run_sortie(flown, progress=each_second)
+        except Stopped:
+            return None, number
+        except PolicyError as error:
+            what = f"the policy fails in a flight of {scenario.name}: {error}"
+            return TimeVerdict(rule.text, "refuted", what, None, flown), number + 1
         if record.totals["invariant_violations"]:
             first = min(record.tables["violations"].to_pylist(), key=lambda row: (row["t_s"], row["drone"]))
             what = f"broken by {first['cause']} at {first['t_s']:.2f} s of a flight of {scenario.name}: {first['text']}"
             return TimeVerdict(rule.text, "refuted", what, None, flown), number + 1
-        if budget.is_spent:
-            return None, number + 1
     return None, flights
 
 

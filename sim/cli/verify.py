@@ -27,7 +27,7 @@ from sortie.policies.verification.shield import check_shieldable
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
 from sortie.policies.verification.views import to_json
 from sortie.scenarios.plugins.reference import Params
-from sortie.scenarios.plugins.user_calls import DECISION_S, watched
+from sortie.scenarios.plugins.user_calls import DECISION_S, LOAD_S, watched
 from sortie.scenarios.reading.load import build, dump, loads
 from sortie.scenarios.schema import PolicySection, Scenario
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
@@ -106,7 +106,8 @@ def verify(
     policy, section = reference, _section(reference)
     flown = None if scenario is None else sortie.load(scenario)
     decide = resolve(section.name, section.params)
-    rules = _invariants(section.name, decide, invariants)
+    with watched(LOAD_S):
+        rules = _invariants(section.name, decide, invariants)
     _ensure_own(out_dir / slug(policy))
     over_time = [rule for rule in rules if rule.over_time]
     if flown is not None and flown.policy.shield:

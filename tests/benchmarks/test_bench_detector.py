@@ -49,7 +49,7 @@ def test_a_fresh_fleet_frame(benchmark: Any, detector: TorchDetector, asked: str
     assert len(benchmark.pedantic(detector.detect, setup=fresh, rounds=8, warmup_rounds=1)) == 5
 
 
-@pytest.mark.parametrize("part", ["render", "lift", "encode", "head"])
+@pytest.mark.parametrize("part", ["render", "lift", "encode", "spread", "head"])
 def test_a_part_for_one_drone(benchmark: Any, detector: TorchDetector, part: str) -> None:
     """One capture through one stage, in one thread as the detector runs it."""
     threads = torch.get_num_threads()
@@ -59,11 +59,13 @@ def test_a_part_for_one_drone(benchmark: Any, detector: TorchDetector, part: str
     with torch.inference_mode():
         image = lift(views, one)
         features = detector._net.encoder(image)
+        fine = detector._net.spread(features)
         do = {
             "render": lambda: detector._renderer.render(one),
             "lift": lambda: lift(views, one),
             "encode": lambda: detector._net.encoder(image),
-            "head": lambda: detector._net.head(features),
+            "spread": lambda: detector._net.spread(features),
+            "head": lambda: detector._net.head(fine),
         }[part]
         assert len(benchmark(do)) == 1
     torch.set_num_threads(threads)

@@ -26,7 +26,7 @@ from sortie.fleet.messages.auth import Dropped, Sealer, open_datagram
 from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES
 from sortie.fleet.messages.wire import decode_directive, encode_descriptor, encode_directive
 from sortie.fleet.staleness import cap_by_age, health
-from sortie.policies.checks import check_directives
+from sortie.policies.checks import check_directives, find_inexact
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Policy, PolicyError, Representation
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.registry import POLICIES, resolve
@@ -159,8 +159,47 @@ def test_what_may_read_differently_is_refused() -> None:
     first, *rest = share(FLEET)
     with pytest.raises(PolicyError, match=r"^a policy returns Directive, got Lying$"):
         check_directives([Lying(*first), *rest], FLEET)
-    with pytest.raises(PolicyError, match=r"rate_hz is 99\.0, must be in \[0, 30\], a number$"):
+    with pytest.raises(
+        PolicyError, match=r"rate_hz is 99\.0 of the policy's own type Quick, must be in \[0, 30\], a number$"
+    ):
         check_directives([first._replace(rate_hz=Quick(99)), *rest], FLEET)
+
+
+class Own(int):
+    """A whole number that decides by itself what it is equal to."""
+
+
+class Failing:
+    """No number, with methods that fail."""
+
+    def __index__(self) -> int:
+        raise ZeroDivisionError
+
+    __str__ = __repr__ = __format__ = __index__  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"destination": Own(1)},
+            "directive 0→1: destination is 1 of the policy's own type Own, must be a drone's id, a whole number",
+        ),
+        (
+            {"source": Own(0)},
+            "directive 0→1: source is 0 of the policy's own type Own, must be a drone's id, a whole number",
+        ),
+        (
+            {"destination": Failing()},
+            "directive 0→a Failing: destination is a Failing of the policy's own type Failing, must be a drone's id, a whole number",
+        ),
+    ],
+)
+def test_an_id_of_the_policy_s_own_type_is_refused_before_its_methods_run(fields: dict[str, int], message: str) -> None:
+    first, *rest = share(FLEET)
+    with pytest.raises(PolicyError, match=f"^{re.escape(message)}$"):
+        check_directives([first._replace(**fields), *rest], FLEET)
+    assert find_inexact([first._replace(**fields)]) is not None
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from policies_examples import fleet_of
 
-from sortie.policies.contract import PERSON_FLAG, Directive, Disc, Representation, Roster, TaskPhase
+from sortie.policies.contract import PERSON_FLAG, Directive, Disc, PolicyError, Representation, Roster, TaskPhase
 from sortie.policies.registry import resolve
 from sortie.policies.verification import pure
 from sortie.policies.verification.axes import decisions_of, observe
@@ -589,3 +589,21 @@ def test_invariants_that_a_file_gives_only_when_asked_are_read(tmp_path: Path, a
         "def decide(view): return []\n"
     )
     assert own_invariants(resolve(f"{file}:decide")) == expected
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (
+            "def __getattr__(name): raise ValueError('no')",
+            r"mine.py: __getattr__\('INVARIANTS'\) raises ValueError: no",
+        ),
+        ("def __getattr__(name): raise SystemExit(0)", "exit code 0, must return"),
+        ("__getattr__ = 3", "raises TypeError"),
+    ],
+)
+def test_a_file_that_fails_when_asked_for_its_invariants_is_an_error(tmp_path: Path, body: str, said: str) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(f"def decide(view): return []\n{body}\n")
+    with pytest.raises(PolicyError, match=said):
+        own_invariants(resolve(f"{file}:decide"))

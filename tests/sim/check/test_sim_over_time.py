@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.policies.contract import Directive, FleetView, PolicyError, Representation
 from sortie.policies.registry import resolve
 from sortie.policies.verification import search
 from sortie.policies.verification.courses import Course, Values, constants_of, draw_course
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.search import Budget
+from sortie.scenarios.plugins.user_calls import watched
 from sortie.scenarios.reading.load import loads
+from sortie.scenarios.schema import Scenario
 from sortie.sim.check import over_time
 from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes
 from sortie.sim.check.few_states import NotFinite, prove_over_time
 from sortie.sim.check.over_time import Subject, course_scenario, flights_of, judge_over_time
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results.record import SortieRecord
 
 TIMES = PlaneTimes(0.1, 0.1, 0.4, 3.0, 10.0, shielded=False)
 STILL = Course(3, 30, 0.1, 0.1, 10.0, {}, {})
@@ -214,7 +219,7 @@ def test_courses_end_with_their_time_and_each_line_gets_a_share(monkeypatch: pyt
 def test_a_course_of_a_slow_policy_is_made_smaller_as_far_as_the_time_allows(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [0.0]
     monkeypatch.setattr(search, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
-    monkeypatch.setattr(over_time, "breaks", lambda scenario: True)
+    monkeypatch.setattr(over_time, "shows_in_flight", lambda scenario: True)
 
     def silent(view: FleetView) -> list[Directive]:
         now_s[0] += 1.0
@@ -228,7 +233,7 @@ def test_a_course_of_a_slow_policy_is_made_smaller_as_far_as_the_time_allows(mon
 
 
 def test_a_break_that_does_not_come_again_refutes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(over_time, "breaks", lambda scenario: True)
+    monkeypatch.setattr(over_time, "shows_in_flight", lambda scenario: True)
     decided = [0]
 
     def once(view: FleetView) -> list[Directive]:
@@ -240,3 +245,65 @@ def test_a_break_that_does_not_come_again_refutes_nothing(monkeypatch: pytest.Mo
     rules = parse("when age_s < 0.5: within 1.5 s: rate_hz > 0")
     (verdict,) = judge_over_time(Subject(once, "once", {}), rules, drones=2, budget_s=60.0, courses=2)
     assert verdict.outcome == "searched"
+
+
+RAISES = """
+from sortie import Directive
+
+def decide(view):
+    if view.me is not None and view.me.battery_soc < {limit}:
+        raise {error}
+    return [Directive(view.ego, p, reason="r") for p in view.peers]
+"""
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [("LookupError('gone')", "raises LookupError: gone"), ("SystemExit(3)", "exit code 3, must return")],
+)
+def test_a_policy_that_fails_in_a_course_is_refuted_by_a_flight_of_it(error: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(RAISES.format(limit=0.3137, error=error))
+    subject = Subject(resolve(f"{path}:decide"), f"{path}:decide", {})
+    with watched(10.0):
+        (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=2, budget_s=60)
+    assert verdict.outcome == "refuted", verdict.what
+    assert verdict.what.startswith("the policy fails after ")
+    assert said in verdict.what
+    assert verdict.scenario is not None
+    with pytest.raises(PolicyError, match=re.escape(said)):
+        run_sortie(verdict.scenario)
+
+
+def test_a_policy_that_fails_in_a_flight_of_the_scenario_is_refuted_by_it(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(RAISES.format(limit="1.0 and view.me.stamp_ns > 5_950_000_000", error="LookupError('gone')"))
+    subject, base = (
+        Subject(resolve(f"{path}:decide"), f"{path}:decide", {}),
+        loads("name: base", overrides=["duration_s=7"]),
+    )
+    rules = parse("climbs_in(0.1) <= 1")
+    (verdict,) = judge_over_time(subject, rules, drones=2, budget_s=60, scenario=base, courses=1, flights=1)
+    assert verdict.outcome == "refuted"
+    assert verdict.what.startswith("the policy fails in a flight of base: policy ")
+    assert verdict.what.endswith("raises LookupError: gone (mine.py, line 6)")
+
+
+def test_a_flight_of_the_scenario_ends_with_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [0.0]
+    monkeypatch.setattr(search, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    flown_s: list[float] = []
+
+    def fly(scenario: Scenario, *, progress: Callable[[float], None]) -> SortieRecord:
+        for second in range(3600):
+            flown_s.append(second)
+            now_s[0] += 20.0
+            progress(second)
+        raise AssertionError("the flight has no end")
+
+    monkeypatch.setattr(over_time, "run_sortie", fly)
+    rules, base = parse("climbs_in(dwell) <= 1"), loads("name: base")
+    subject = Subject(resolve("silence"), "silence", {})
+    (verdict,) = judge_over_time(subject, rules, drones=2, budget_s=60, scenario=base, courses=1, flights=5)
+    assert len(flown_s) == 3
+    assert verdict.what.startswith("1 courses of up to 2 drones keep it, at")
