@@ -10,8 +10,8 @@ from __future__ import annotations
 import copy
 import itertools
 import random
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from time import monotonic  # before a user's file may replace it in its module
 from typing import Any, NamedTuple
 
 from sortie.policies.contract import Directive, Disc, FleetView, Policy
@@ -47,12 +47,12 @@ class Budget:
 
     def __init__(self, budget_s: float) -> None:
         self.budget_s = budget_s
-        self._begin_s = time.monotonic()
+        self._begin_s = monotonic()
 
     @property
     def is_spent(self) -> bool:
         """Whether the time is over."""
-        return time.monotonic() - self._begin_s >= self.budget_s
+        return monotonic() - self._begin_s >= self.budget_s
 
     def shares(self, count: int) -> list[Budget]:
         """An even share for each of several that follow each other. What one leaves, the next may use."""

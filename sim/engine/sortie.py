@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from time import perf_counter  # before a user's file may replace it in its module
 from typing import Protocol
 
 import pyarrow as pa
@@ -109,13 +109,13 @@ def run_sortie(
         PolicyError: an unknown policy, or one that breaks its contract, fails, or takes longer than `limits.decision_s`.
         LimitError: the flight takes longer than `limits.run_s`.
     """
-    begin_s = time.perf_counter()
+    begin_s = perf_counter()
     seed = scenario.seed if seed is None else seed
     name, policies = _policy(scenario, policy)
     limits, end_s = scenario.limits, begin_s + scenario.limits.run_s
 
     def each_second(t_s: float) -> None:
-        if time.perf_counter() > end_s:
+        if perf_counter() > end_s:
             what = f"{scenario.name}, seed {seed}: the flight"
             raise LimitError(f"{what} takes longer than {limits.run_s:g} s (limits.run_s), and is at {t_s:g} s")
         if progress is not None:
@@ -133,7 +133,7 @@ def run_sortie(
             fly(parts, each_second, observer)
         record = _collect(parts, policies, name, seed, replication)
         metrics = own_metrics(own, record)
-    wall = {"wall_s": time.perf_counter() - begin_s, **record.wall}
+    wall = {"wall_s": perf_counter() - begin_s, **record.wall}
     return dataclasses.replace(record, own_files=files, metrics=metrics, wall=wall)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
 
 import pytest
 
@@ -12,6 +12,7 @@ from sortie.policies.verification import search
 from sortie.policies.verification.conformance import RULES, TIMED, conform
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import TRIED_LARGE, prove
+from sortie.policies.verification.search import Budget
 from sortie.policies.verification.views import draw_views
 
 LINES = parse("rate_hz <= 10\nrate_hz <= fresh.rate_hz")
@@ -37,7 +38,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr(search, "time", SimpleNamespace(monotonic=lambda: made.now_s))
+    monkeypatch.setattr(search, "monotonic", lambda: made.now_s)
     return made
 
 
@@ -86,3 +87,9 @@ def test_verdicts_on_a_fast_policy_are_as_ever(clock: Clock) -> None:
     for verdict in prove(fast, LINES, max_drones=1, views=20):
         assert "20 drawn views of up to 20 drones" in verdict.what
         assert verdict.what.endswith(f"and {TRIED_LARGE} views of 200 drones keep it")
+
+
+def test_a_budget_ends_where_a_policy_s_file_stops_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "monotonic", lambda: 0.0)
+    budget = Budget(1e-6)
+    assert any(budget.is_spent for _ in range(100_000))

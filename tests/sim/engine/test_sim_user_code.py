@@ -12,8 +12,8 @@ from sim_examples import BASE, example
 
 from sortie.policies.contract import Directive, FleetView, PolicyError
 from sortie.policies.registry import resolve
+from sortie.sim.engine import sortie as clock
 from sortie.sim.engine.sortie import LimitError, run_sortie
-from sortie.sim.engine.sortie import time as clock
 from sortie.sim.results import run_folder
 
 POLICY = """
