@@ -58,7 +58,7 @@ STATION_COLUMNS = 52
 # columns of a job
 (
     KIND, STATION, FLOW, FOLLOWING, COUNT, LOW, HIGH, FULL_BYTES, LAST_BYTES, ARRIVED, DROPPED, IS_LIVE,
-    JOB_ACCESS, AIR_NS, READY_AT, HEAD_AT, IS_TOLD, DEAD_TRIES,
+    JOB_ACCESS, AIR_NS, READY_AT, HEAD_AT, IS_TOLD, VAIN_TRIES,
 ) = range(18)  # fmt: skip
 JOB_COLUMNS = 18
 
@@ -271,7 +271,7 @@ def remove(job, t, S, J):
             S[s, GRANT + a] = FAR
         else:
             J[following, HEAD_AT] = t
-        if J[job, KIND] == DATA:
+        if J[job, KIND] != GROUP:
             S[s, REQUEST] = 0
         return True
     before = S[s, HEAD + a]
@@ -542,9 +542,9 @@ def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, re
     a, what, job = S[s, ACCESS], S[s, AWAITS], S[s, TX_JOB]
     fail_window(s, a, S, C)
     if job >= 0:
-        if LI[J[job, FLOW], FLOW_DEAD] > 0:
-            J[job, DEAD_TRIES] += 1
-            if J[job, DEAD_TRIES] > C[C_RETRIES]:
+        if LI[J[job, FLOW], FLOW_DEAD] > 0 or J[job, KIND] == BLOCK_REQUEST:
+            J[job, VAIN_TRIES] += 1
+            if J[job, VAIN_TRIES] > C[C_RETRIES]:
                 OUT[told, 0], OUT[told, 1] = T_DEAD, job
                 told += 1
                 remove(job, t, S, J)
@@ -799,7 +799,9 @@ def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, re
         return told
     job = S[s, TX_JOB]
     S[s, WINDOW + a], S[s, FAILS + a] = C[C_WINDOW + a], 0
-    if job >= 0:
+    if job >= 0 and J[job, KIND] == BLOCK_REQUEST:
+        remove(job, t, S, J)
+    elif job >= 0:
         if what == DATA and C[C_LEARNS] == 1:
             flow = J[job, FLOW]
             LS[flow, S[s, TX_MCS], 0] += S[s, TX_COUNT]
@@ -979,8 +981,12 @@ def submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes
 
 
 @loop
-def cancel(job, t, S, J):
-    """Take a job out, wherever it is; a frame of it that is on the air goes on to its end."""
+def cancel(job, t, S, J, requests):
+    """Take a job out, wherever it is; a frame of it that is on the air goes on to its end.
+
+    With `requests`, one whose fragments are unanswered leaves a block-ack request at the head: the receiver must not wait
+    for them any longer.
+    """
     s = J[job, STATION]
     before, at = -1, S[s, COMING]
     while at >= 0 and at != job:
@@ -992,6 +998,10 @@ def cancel(job, t, S, J):
             S[s, ARRIVE_AT] = J[S[s, COMING], READY_AT] if S[s, COMING] >= 0 else FAR
         else:
             J[before, FOLLOWING] = J[job, FOLLOWING]
+    elif requests and S[s, HEAD + J[job, JOB_ACCESS]] == job and J[job, LOW] < J[job, HIGH]:
+        J[job, KIND], S[s, REQUEST] = BLOCK_REQUEST, 1
+        if S[s, TX_JOB] == job:
+            S[s, TX_JOB] = -1
     else:
         remove(job, t, S, J)
     renew(s, S)

@@ -321,7 +321,7 @@ class Medium(Generic[J, F]):
                 return
             self._free.append(new.row)
             del self._at_row[new.row]
-        self.withdraw(old)
+        self._take(old, requests=True)
         self.submit(new)
 
     def _enter(self, job: J) -> tuple[int, ...]:
@@ -360,13 +360,13 @@ class Medium(Generic[J, F]):
     def withdraw(self, job: J) -> None:
         """Take a job out without a word; the next in its queue begins."""
         self.sync()
-        self._take(job)
+        self._take(job, requests=False)
         self.replan()
 
-    def _take(self, job: J) -> None:
+    def _take(self, job: J, *, requests: bool) -> None:
         self._read(job)
         a = self._settled.arrays
-        self._e.cancel(job.row, self._ns(self._env.now), a[_S], a[_J])
+        self._e.cancel(job.row, self._ns(self._env.now), a[_S], a[_J], requests)
         self._leave(job)
 
     def _leave(self, job: J) -> None:
@@ -441,12 +441,16 @@ class Medium(Generic[J, F]):
             self._submit(entry)
 
     def drop_context(self, sender: int) -> None:
-        """Forget a drone's group frames, waiting or to come; one that is on the air ends."""
+        """Forget a drone's group frames and its block-ack requests, waiting or to come; a frame on the air ends."""
         self.sync()
         a, e = self._settled.arrays, self._e
+        rows = a[_J]
+        is_request = (rows[:, e.IS_LIVE] == 1) & (rows[:, e.STATION] == sender) & (rows[:, e.KIND] == e.BLOCK_REQUEST)
+        for row in np.flatnonzero(is_request).tolist():
+            e.cancel(row, self._ns(self._env.now), a[_S], rows, False)
         for row, frame in list(self._at_row.items()):
             if isinstance(frame, GroupFrame) and frame.sender == sender and a[_S][sender, e.TX_JOB] != row:
-                e.cancel(row, self._ns(self._env.now), a[_S], a[_J])
+                e.cancel(row, self._ns(self._env.now), a[_S], a[_J], False)
                 self._finished.append(row)
                 del self._at_row[row]
         self.replan()
@@ -524,7 +528,7 @@ class Medium(Generic[J, F]):
             job = heappop(deadlines)[3]
             if job.live:
                 is_head = self._queues[job.sender][0] is job
-                self._take(job)
+                self._take(job, requests=True)
                 is_served = is_head and job.t_start_s < now - _NS
                 self._on_end(job, End.DEADLINE_IN_SERVICE if is_served else End.DEADLINE_QUEUED, now)
         self._is_telling = False

@@ -352,6 +352,65 @@ def test_a_replacement_keeps_a_queued_place_and_leaves_the_head() -> None:
     assert [k for _, k, _ in b.log] == [1, 2]
 
 
+FAINT_DBM, DEAF_DBM = -72.0, -95.0
+"""Too weak for MCS 7, though not for control frames; and too weak for any frame."""
+
+
+def _cut_short(power_dbm: float, *, until_s: float | None = None) -> Bench:
+    """A sample of 64 fragments to station 1; its deadline passes while they are on the air for the first time."""
+    power = np.full((3, 3), -50.0)
+    power[0, 1] = power[1, 0] = power_dbm
+    b = Bench(power)
+    b.submit(0, 64, deadline_s=exchange_s(64) / 2, to=1)
+    if until_s is not None:
+        b.run(until_s)
+    return b
+
+
+def test_a_sample_cut_short_by_its_deadline_leaves_a_block_ack_request_before_the_next_sample() -> None:
+    b = _cut_short(FAINT_DBM)
+    b.submit(0, 1, to=2)
+    b.run()
+    assert [(k, how) for _, k, how in b.log] == [(0, End.DEADLINE_IN_SERVICE), (1, End.ARRIVED)]
+    assert b.medium.transmit_s[0] == pytest.approx(exchange_s(64) + 32e-6 + exchange_s(1), abs=1e-8)
+    assert b.medium.transmit_s[1:] == pytest.approx([32e-6, 28e-6], abs=1e-8)
+    without_s = AIFS_S["best_effort"] + exchange_s(64) + exchange_s(1)
+    assert b.log[1][0] > without_s + 2 * 32e-6 + SIFS_S + AIFS_S["best_effort"]
+
+
+def test_a_block_ack_request_that_nobody_answers_ends_with_the_retry_limit() -> None:
+    b = _cut_short(DEAF_DBM)
+    b.run()
+    assert b.medium.transmit_s[0] == pytest.approx(exchange_s(64) + 8 * 32e-6, abs=1e-8)
+
+
+def test_a_replaced_sample_leaves_a_block_ack_request_and_a_withdrawn_or_waiting_one_leaves_none() -> None:
+    for ends, requests in (("replace", 1), ("withdraw", 0), ("wait", 0)):
+        power = np.full((3, 3), -50.0)
+        power[0, 1] = power[1, 0] = FAINT_DBM
+        b = Bench(power)
+        if ends == "wait":
+            b.submit(0, 64, to=2)
+            b.submit(0, 64, deadline_s=exchange_s(64) / 2, to=1)
+        else:
+            old = b.submit(0, 64, to=1)
+            b.run(exchange_s(64) / 2)
+            if ends == "replace":
+                b.medium.replace(old, b.job(0, 1, to=2))
+            else:
+                b.medium.withdraw(old)
+        b.run()
+        more_s = exchange_s(1) if ends == "replace" else 0.0
+        assert b.medium.transmit_s[0] == pytest.approx(exchange_s(64) + requests * 32e-6 + more_s, abs=1e-8), ends
+
+
+def test_a_silenced_drone_sends_no_block_ack_request() -> None:
+    b = _cut_short(FAINT_DBM, until_s=exchange_s(64) * 0.75)
+    b.medium.drop_context(0)
+    b.run()
+    assert b.medium.transmit_s[0] == pytest.approx(exchange_s(64), abs=1e-8)
+
+
 def test_nobody_there_is_found_out_by_one_frame() -> None:
     b = Bench(-50.0)
     job = b.job(0, 500)
