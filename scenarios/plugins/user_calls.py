@@ -96,11 +96,17 @@ class Guarded:
                 watch.late[self._origin] = self._late
             raise TookTooLongError(self._late).with_traceback(late.__traceback__) from None
         except BaseException as stop:
-            if isinstance(stop, Exception | KeyboardInterrupt) or type(stop).__module__.startswith("sortie."):
+            if isinstance(stop, Exception | KeyboardInterrupt) or _is_sorties(type(stop)):
                 raise
             raise ProgramExitError(f"raises {type(stop).__name__}, must return").with_traceback(
                 stop.__traceback__
             ) from None
+
+
+def _is_sorties(kind: type) -> bool:
+    """Whether a class is at home in Sortie. A user's class may only claim to be."""
+    module = str(kind.__module__)
+    return module.startswith("sortie.") and getattr(sys.modules.get(module), kind.__name__, None) is kind
 
 
 def guarded(function: Callable[..., Any]) -> Callable[..., Any]:

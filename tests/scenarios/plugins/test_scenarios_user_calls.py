@@ -246,3 +246,14 @@ def test_a_frozen_view_can_be_read_only() -> None:
         view.age_s[1] = 0.0
     with pytest.raises(TypeError, match="doesn't support item deletion"):
         del view.descriptors[1]
+
+
+@pytest.mark.parametrize("module", ["sortie.scenarios.plugins.user_calls", "sortie.not_there", None])
+def test_an_exception_that_only_claims_to_be_sortie_s_own_ends_nothing(module: object) -> None:
+    kind = type("_Interrupt2", (BaseException,), {"__module__": module})
+
+    def decide(view: object) -> object:
+        raise kind
+
+    with pytest.raises(ProgramExitError, match=r"raises _Interrupt2, must return"):
+        Guarded(decide)(None)
