@@ -52,7 +52,7 @@ def everyone(view: FleetView, *, received_budget: float = 1.0) -> list[Directive
 @among_attached
 @boxes_across_networks
 def best_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list[Directive]:
-    """Each receiver gets features from the k peers that cover most of its footprint; the budget is as for `everyone`."""
+    """Each receiver gets features from the k peers that cover most of its footprint; the budget is as for `all-4`."""
     return _serve(
         view, k, received_budget, f"the {k} that cover most of the receiver's footprint", lambda _, by: by[:k]
     )
@@ -61,7 +61,7 @@ def best_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list
 @among_attached
 @boxes_across_networks
 def worst_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> list[Directive]:
-    """Each receiver gets features from the k peers that cover least of its footprint; the budget is as for `everyone`."""
+    """Each receiver gets features from the k peers that cover least of its footprint; the budget is as for `all-4`."""
     what = f"the {k} that cover least of the receiver's footprint"
     return _serve(view, k, received_budget, what, lambda _, by: by[max(0, len(by) - k) :])
 
@@ -69,7 +69,7 @@ def worst_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0) -> lis
 @among_attached
 @boxes_across_networks
 def random_k(view: FleetView, *, k: int = 2, received_budget: float = 1.0, salt: int = 0) -> list[Directive]:
-    """Each receiver gets features from k peers drawn anew every `RESHUFFLE_S`; the budget is as for `everyone`.
+    """Each receiver gets features from k peers drawn anew every ten seconds; the budget is as for `all-4`.
 
     The draw is a pure function of the receiver's id, its stamp and the salt, so all senders draw alike.
     """
@@ -131,7 +131,7 @@ def best_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) -
 @among_attached
 @boxes_across_networks
 def worst_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) -> list[Directive]:
-    """Each drone sends features to the k peers that cover least of its own footprint; as `best_k_receivers`."""
+    """Each drone sends features to the k peers that cover least of its own footprint; as `best-2-receivers`."""
     return _send_to(
         view, peers_by_overlap(view)[::-1][:k], sent_budget, f"the {k} that cover least of the sender's footprint"
     )
@@ -140,7 +140,7 @@ def worst_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0) 
 @among_attached
 @boxes_across_networks
 def random_k_receivers(view: FleetView, *, k: int = 2, sent_budget: float = 1.0, salt: int = 0) -> list[Directive]:
-    """Each drone sends features to k peers drawn anew every `RESHUFFLE_S`; as `best_k_receivers`."""
+    """Each drone sends features to k peers drawn anew every ten seconds; as `best-2-receivers`."""
     return _send_to(view, _draw(view, salt, view.ego, view.peers, k), sent_budget, f"{k} drawn at random")
 
 

@@ -107,7 +107,7 @@ def main() -> None:
     try:
         try:
             with path_errors():
-                app()
+                app(prog_name="sortie")  # also in the child process of `_supervised`
         except SortieError as error:
             err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
             sys.exit(2)
