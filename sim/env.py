@@ -214,7 +214,7 @@ class _Flight:
     def __init__(self, scenario: Scenario, seed: int | None, replication: int) -> None:
         self.actions: dict[int, np.ndarray[Any, Any]] = {}
         self.views: dict[int, FleetView] = {}
-        self.done = False
+        self.done = self._flown = False
         self._scenario, self._t_s = scenario, 0.0
         joins = [e for e in scenario.events if isinstance(e, DroneJoins)]
         self._joins_s = {e.drone: e.at_s for e in sorted(joins, key=lambda e: e.at_s)}  # the last time
@@ -283,6 +283,7 @@ class _Flight:
         mission = new["mission"]
         self._mission = mission if self._mission is None else pa.concat_tables([self._mission, mission])
         if t_s >= self._scenario.duration_s - 1e-9:
+            self._flown = True
             return  # the last one: the end hands over
         self._mine.release()
         self._theirs.acquire()
@@ -290,8 +291,14 @@ class _Flight:
             raise _Closed
 
     def decide(self, view: FleetView) -> list[Directive]:
-        """The standing action of the view's ego as directives; nothing before the first."""
-        self.views[view.ego] = view
+        """The standing action of the view's ego as directives; nothing before the first.
+
+        Only the views of the flight's own decisions are kept. An invariant with `fresh.` asks again about the same view at
+        age 0, and `record.disagreement` asks after the flight about the views of others.
+        """
+        kept = self.views.get(view.ego)
+        if not self._flown and (kept is None or kept.descriptors is not view.descriptors):
+            self.views[view.ego] = view
         others = [i for i in range(self._scenario.fleet.drones) if i != view.ego]
         return directives(view, others, self.actions.get(view.ego))
 

@@ -108,6 +108,18 @@ def test_without_a_seed_episodes_differ_and_with_one_they_do_not() -> None:
     e.close()
 
 
+@pytest.mark.parametrize("asks", ["policy.invariants=rate_hz <= fresh.rate_hz", "record.disagreement=true"])
+def test_a_drone_observes_what_it_heard_also_where_its_policy_is_asked_about_other_views(asks: str) -> None:
+    def last_seen(*more: str) -> np.ndarray:
+        e = env(*SHORT, "duration_s=1", *more)
+        e.reset(seed=3)
+        seen = e.step(all_share(e, 1))[0]
+        e.close()
+        return np.stack(list(seen.values()))
+
+    assert np.array_equal(last_seen(asks), last_seen())
+
+
 GOOD = [FEATURES, SMALL, FAST, 0] * 2
 
 
