@@ -17,7 +17,6 @@ again before its next one, and goes on from there.
 from __future__ import annotations
 
 import math
-import operator
 import threading
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -33,8 +32,8 @@ from sortie.perception.metrics.ap import average_precision
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.observation import CHOICES, LIMIT, ROW, Obs, directives, observe
 from sortie.scenarios.plain_sum import plain_sum
-from sortie.scenarios.reading.nodes import ScenarioError
 from sortie.scenarios.schema import DroneJoins, Scenario
+from sortie.scenarios.whole import whole
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.identity import code_version
 from sortie.sim.results.accuracy import matched
@@ -57,15 +56,6 @@ class Earned(NamedTuple):
     def reward(self) -> float:
         """The AP, less `COST_PER_MB` and `COST_PER_KJ`."""
         return (self.ap50 or 0.0) - COST_PER_MB * self.sent_bytes / 1e6 - COST_PER_KJ * self.spent_j / 1e3
-
-
-def _seed(seed: Any) -> int | None:
-    """A seed as Python's own whole number, also from numpy's; None stays."""
-    if seed is None:
-        return None
-    if isinstance(seed, bool) or not hasattr(seed, "__index__") or not 0 <= operator.index(seed) < 2**63:
-        raise ScenarioError(f"seed: {seed!r}, must be a whole number from 0 to 2^63 - 1")
-    return operator.index(seed)
 
 
 class _Closed(BaseException):
@@ -127,7 +117,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         Raises:
             ScenarioError: the seed is no whole number from 0 to 2^63 - 1.
         """
-        seed = _seed(seed)
+        seed = whole("seed", seed)
         self.close()
         replication = self._episodes if seed is None else 0
         self._episodes += 1
@@ -355,7 +345,7 @@ class TeamEnv(gymnasium.Env[Obs, np.ndarray[Any, Any]]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin a sortie with this seed; without one, with a seed drawn from the generator of the last seed given."""
-        seed = _seed(seed)
+        seed = whole("seed", seed)
         super().reset(seed=seed)
         flown = int(self.np_random.integers(2**31)) if seed is None else seed
         observations, _ = self.drones.reset(seed=flown)

@@ -21,6 +21,7 @@ from sortie.scenarios.reading import load as reading
 from sortie.scenarios.reading.load import Overrides
 from sortie.scenarios.reading.nodes import ScenarioError
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.whole import whole
 from sortie.sim.folders import RunError
 from sortie.sim.policy_text import policy_overrides
 from sortie.sim.user_errors import user_errors
@@ -114,7 +115,7 @@ def fly(
     from sortie.sim.engine.sortie import run_sortie
 
     chosen, function = _with_policy(load(scenario, overrides), policy)
-    seed, replication = _whole("seed", seed), _whole("replication", replication, 32) or 0
+    seed, replication = whole("seed", seed), whole("replication", replication, 32) or 0
     _ensure_callable("progress", progress)
     if observer is not None and not all(callable(getattr(observer, name, None)) for name in ("begin", "second")):
         raise ScenarioError(f"observer: {observer!r}, must have the methods begin and second")
@@ -294,7 +295,7 @@ def compare(
         listed = chosen_seeds(base, count=None if seeds is None else operator.index(seeds))
     else:
         raise ScenarioError(f"seeds: {seeds!r}, must be a list of seeds or how many, 1 or more")
-    chosen = [_whole("seeds", seed) or 0 for seed in listed]
+    chosen = [whole("seeds", seed) or 0 for seed in listed]
     _ensure_callable("progress", progress)
     if not chosen or len(set(chosen)) < len(chosen):
         raise ScenarioError(f"seeds: {chosen}, must be one or more, each named once")
@@ -439,7 +440,7 @@ def campaign(
     _ensure_callable("notice", notice)
     tell = _warn if notice is None else notice
     files = None if security is None else _certificates(security)
-    units = _whole("by_torch", by_torch)
+    units = whole("by_torch", by_torch)
     study = load_campaign(as_path("campaign", campaign))
     folder = campaign_folder(study.campaign.campaign) if out is None else as_path("out", out)
     count = len(os.sched_getaffinity(0)) if workers is None else workers
@@ -616,19 +617,10 @@ def _precision_settings(half_width: Any, seeds: object, metric: Any, pilot: Any,
         raise RunError("seeds and half_width: name one of them; a half-width chooses its number of seeds")
     if not _is_number(half_width):
         raise RunError(f"half_width: {half_width!r}, must be a number above 0 and below 1; 0.01 is one AP point")
-    first, most = _whole("pilot", pilot), _whole("most_seeds", most_seeds)
+    first, most = whole("pilot", pilot), whole("most_seeds", most_seeds)
     most = MOST if most is None else most
     metric = METRICS[0] if metric is None else metric
     return Settings(float(half_width), metric, min(PILOT, most) if first is None else first, most)
-
-
-def _whole(name: str, value: Any, bits: int = 63) -> int | None:
-    """A seed or a replication as Python's own whole number, also from numpy's; None stays."""
-    if value is None:
-        return None
-    if isinstance(value, bool) or not hasattr(value, "__index__") or not 0 <= operator.index(value) < 2**bits:
-        raise ScenarioError(f"{name}: {value!r}, must be a whole number from 0 to 2^{bits} - 1")
-    return operator.index(value)
 
 
 def _is_number(value: object) -> bool:

@@ -440,6 +440,8 @@ WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "a progress of a check that is no function": (lambda: sortie.check("track_target", SHORT_TEXTS, progress=5), sortie.ScenarioError, "progress: 5, must be a function, or None"),  # type: ignore[arg-type]
     "a negative seed of an episode": (lambda: sortie.env("track_target", SURROGATE).reset(seed=-1), sortie.ScenarioError, "seed: -1, must be a whole number from 0 to 2^63 - 1"),
     "a negative seed of a team's episode": (lambda: sortie.env("track_target", SURROGATE, team=True).reset(seed=-1), sortie.ScenarioError, "seed: -1, must be a whole number from 0 to 2^63 - 1"),
+    "an array of seeds for an episode": (lambda: sortie.env("track_target", SURROGATE).reset(seed=np.array([1, 2])), sortie.ScenarioError, "seed: array([1, 2]), must be a whole number from 0 to 2^63 - 1"),  # type: ignore[arg-type]
+    "an array of seeds for a flight": (lambda: sortie.fly("track_target", seed=np.array([1, 2])), sortie.ScenarioError, "seed: array([1, 2]), must be a whole number from 0 to 2^63 - 1"),  # type: ignore[arg-type]
     "nothing to check": (lambda: sortie.check("nope"), sortie.ScenarioError, "nope: no such file"),
     "a lone drone": (lambda: sortie.env({"name": "a", "fleet": {"drones": 1}}), sortie.RunError, "fleet.drones is 1, must be at least 2 to share"),
 }  # fmt: skip
