@@ -133,7 +133,13 @@ class Watchdog:
         self._note, self._decided = note, decided
         assert self._pipe is not None  # noqa: S101 - it was loaded just now
         self._begin, self._loaded = begin, True
-        self._pipe.send(begin)
+        try:
+            self._pipe.send(begin)
+        except (
+            BrokenPipeError,
+            ConnectionResetError,
+        ):  # it ended after it was loaded; the first decision starts a new one
+            self._end(kill=False)
 
     def __call__(self, view: FleetView) -> Sequence[Directive]:
         """The policy's directives, or the fallback's."""

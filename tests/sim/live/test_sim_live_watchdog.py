@@ -120,6 +120,27 @@ def test_a_policy_that_dies_gets_a_new_process(watched: Watched) -> None:
     assert rung(watched.watchdog) == Representation.FEATURES
 
 
+def test_a_policy_that_dies_between_loading_and_the_flight_gets_a_new_process(tmp_path: Path) -> None:
+    """A drone that starts late may wait for minutes between the two."""
+    notes: list[str] = []
+    (tmp_path / "mine.py").write_text(POLICY)
+    dog = Watchdog(
+        PolicyOrders(example(f"policy={{name: '{tmp_path}/mine.py:decide'}}"), 0), fallback=DETECTIONS, deadline_s=5.0
+    )
+    try:
+        dog.wait_until_loaded()
+        assert dog._process is not None
+        dog._process.kill()
+        dog._process.join()
+        dog.begin(Begin(0.0, time.monotonic()), notes.append, lambda _: None)
+        assert rung(dog) == Representation.DETECTIONS
+        assert notes == ["fallback to detections at 2 Hz: the policy's process is starting"]
+        Watched(dog, tmp_path / "mode", notes).until(lambda: len(notes) == 2)
+        assert (dog.restarts, rung(dog)) == (1, Representation.FEATURES)
+    finally:
+        dog.close()
+
+
 def test_a_policy_that_hangs_delays_its_drone_once_and_is_killed(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
