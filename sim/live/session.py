@@ -37,6 +37,8 @@ CONNECT_S = 90.0
 """The longest time for the processes to start and to find one another."""
 LEAD_S = 0.3
 """From the start signal until the flight begins."""
+LAST_REPORT_S = 30.0
+"""The longest time from the end of the flight until a process sends its last report. One that hangs is lost."""
 EXIT_S = 5.0
 """The longest time for a process to end after the flight."""
 Progress = Callable[[str, float, float], None]
@@ -146,7 +148,11 @@ def fly_live(
             begun({d.orders.drone: d.process.pid or 0 for d in flown if not d.orders.late})
         with _stop_on_interrupt() as stop:
             while not (stop.is_set() or all(d.over for d in flown)):
-                t_s = min(end_s, begin_s + time.monotonic() - go.monotonic_s)
+                now_s = begin_s + time.monotonic() - go.monotonic_s
+                t_s = min(end_s, now_s)
+                if now_s > end_s + LAST_REPORT_S:
+                    lost += _hanging(flown, fleet, begin_s)
+                    break
                 if kill is not None and t_s >= kill[1]:
                     _kill(next(d.process for d in flown if d.orders.drone == kill[0]))
                     kill = None
@@ -277,6 +283,14 @@ def _collect(flown: list[_Drone], fleet: FleetReports, lost: list[Lost], t_s: fl
                 drone.over = True
                 drone.process.join(EXIT_S)
                 lost.append(Lost(drone.orders.drone, t_s, _describe_exit(drone.process.exitcode)))
+
+
+def _hanging(flown: list[_Drone], fleet: FleetReports, begin_s: float) -> Iterator[Lost]:
+    """The processes that have not ended, as lost at their latest reports."""
+    for drone in flown:
+        if not drone.over:
+            last = fleet.last.get((drone.orders.drone, drone.orders.late))
+            yield Lost(drone.orders.drone, begin_s if last is None else last.t_s, _describe_exit(None))
 
 
 def _receive(pipe: Connection) -> object | None:

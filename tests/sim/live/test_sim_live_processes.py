@@ -1,0 +1,60 @@
+"""The bench and the processes of a live flight: processes that die before it, and processes that hang in it."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from memory_bus import MemoryBus
+from sim_examples import example
+
+from sortie.sim.live import session
+from sortie.sim.live.reports import Home, Ready, Report, SinceLastReport
+from sortie.sim.live.session import fly_live
+
+
+@pytest.fixture
+def fly(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
+    """Flies for 0.2 s with processes that have sent these messages already; returns what the result is made of."""
+
+    def fly(*sent: list[object]) -> dict[str, Any]:
+        theirs: list[Connection] = []
+
+        def start(orders: session.Orders) -> session._Drone:
+            ours, its = multiprocessing.Pipe()
+            for message in sent[orders.drone]:
+                its.send(message)
+            if sent[orders.drone] == [Ready(orders.drone)]:
+                its.close()  # it died
+            theirs.append(its)
+            process = SimpleNamespace(
+                name=f"drone {orders.drone}", exitcode=0, join=lambda _=None: None, is_alive=lambda: False
+            )
+            return session._Drone(orders, process, ours)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(session, "_start", start)
+        monkeypatch.setattr(session, "Bus", lambda domain: MemoryBus())
+        monkeypatch.setattr(session, "traces", lambda scenario, progress: [None] * scenario.fleet.drones)
+        monkeypatch.setattr(session, "summarise", lambda *of, **more: more)
+        monkeypatch.setattr(session, "LAST_REPORT_S", 0.3)
+        monkeypatch.setattr(session, "CONNECT_S", 0.5)
+        found = fly_live(example(f"fleet.drones={len(sent)}"), duration_s=0.2)
+        assert isinstance(found, dict)
+        return found
+
+    return fly
+
+
+def report(drone: int) -> Report:
+    """At 0.125 s."""
+    return Report(drone, 0.0, 0.125, 0.0, 1, 1, 0, {}, 0.0, {}, {}, SinceLastReport())
+
+
+def test_a_process_that_hangs_is_lost_and_the_flight_ends(fly: Callable[..., dict[str, Any]]) -> None:
+    result = fly([Ready(0), report(0), Home(0)], [Ready(1), report(1)])
+    assert result["lost"] == [(1, 0.125, "does not answer")]
+    assert not result["interrupted"]
