@@ -252,16 +252,17 @@ def _ignoring_interrupts() -> Iterator[None]:
 
 
 def _wait_until_connected(flown: list[_Drone], report_progress: Progress) -> None:
-    """Wait until every process has found all others."""
-    waiting, until_s = {id(d.pipe): d for d in flown}, time.monotonic() + CONNECT_S
+    """Wait until every process has found all others. One that has may still end while the others start."""
+    drone_of, until_s = {id(d.pipe): d for d in flown}, time.monotonic() + CONNECT_S
+    waiting = dict(drone_of)
     while waiting:
         report_progress("starting the processes", len(flown) - len(waiting), len(flown))
-        for pipe in wait([d.pipe for d in waiting.values()], timeout=0.2):
+        for pipe in wait([d.pipe for d in flown], timeout=0.2):
             message = _receive(pipe)  # type: ignore[arg-type]
             if isinstance(message, Ready):
                 del waiting[id(pipe)]
             elif message is None:
-                raise RunError(f"{waiting[id(pipe)].process.name} ended before the flight began")
+                raise RunError(f"{drone_of[id(pipe)].process.name} ended before the flight began")
         if time.monotonic() > until_s:
             names = ", ".join(d.process.name for d in waiting.values())
             raise RunError(

@@ -12,6 +12,7 @@ import pytest
 from memory_bus import MemoryBus
 from sim_examples import example
 
+from sortie.sim.folders import RunError
 from sortie.sim.live import session
 from sortie.sim.live.reports import Home, Ready, Report, SinceLastReport
 from sortie.sim.live.session import fly_live
@@ -58,3 +59,8 @@ def test_a_process_that_hangs_is_lost_and_the_flight_ends(fly: Callable[..., dic
     result = fly([Ready(0), report(0), Home(0)], [Ready(1), report(1)])
     assert result["lost"] == [(1, 0.125, "does not answer")]
     assert not result["interrupted"]
+
+
+def test_a_process_that_ends_while_others_start_is_named(fly: Callable[..., dict[str, Any]]) -> None:
+    with pytest.raises(RunError, match=r"^drone 0 ended before the flight began$"):
+        fly([Ready(0)], [])
