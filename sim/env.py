@@ -229,7 +229,11 @@ class _Flight:
         else:
             self._started = True
             self._thread.start()
-        self._mine.acquire()
+        try:
+            self._mine.acquire()
+        except BaseException:  # Ctrl-C; the sortie still ends its step, before the caller may ask for the next
+            self._mine.acquire()
+            raise
         if self._error is not None:
             raise self._error
 

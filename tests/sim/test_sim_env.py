@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import pickle
+import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -106,6 +108,35 @@ def test_without_a_seed_episodes_differ_and_with_one_they_do_not() -> None:
     assert not np.array_equal(flight(e, None), flight(e, None))
     assert np.array_equal(flight(e, 5), flight(e, 5))
     e.close()
+
+
+def test_an_interrupted_step_is_flown_and_the_next_one_is_that_of_an_uninterrupted_flight() -> None:
+    """Otherwise each later step would return the one before it, while the sortie flies on beside the caller."""
+
+    class Interrupted(threading.Semaphore):
+        pressed = False
+
+        def acquire(self, *how: Any, **more: Any) -> bool:
+            if not self.pressed:
+                self.pressed = True
+                raise KeyboardInterrupt
+            return super().acquire(*how, **more)
+
+    e, other = env(*SEEN), env(*SEEN)
+    for each in (e, other):
+        each.reset(seed=3)
+    assert e._flight is not None
+    e._flight._mine = Interrupted(0)
+    with pytest.raises(KeyboardInterrupt):
+        e.step(all_share(e, 1))
+    other.step(all_share(other, 1))
+    e._flight._spent_j = dict(other._flight._spent_j)  # type: ignore[union-attr] # its energy would count in the next step
+    for _ in range(2):
+        one, two = e.step(all_share(e, 1)), other.step(all_share(other, 1))
+        assert one[1:] == two[1:]
+        assert all(np.array_equal(one[0][a], two[0][a]) for a in one[0])
+    for each in (e, other):
+        each.close()
 
 
 @pytest.mark.parametrize("asks", ["policy.invariants=rate_hz <= fresh.rate_hz", "record.disagreement=true"])
