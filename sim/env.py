@@ -163,10 +163,11 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         return {**self.__dict__, "_flight": None}
 
     def close(self) -> None:
-        """End the sortie's thread."""
+        """End the sortie's thread, and with it the episode."""
         if self._flight is not None:
             self._flight.close()
         self._flight = self._begun = None
+        self.agents = []
 
     def render(self) -> None:
         """Nothing: `sortie fly --live` draws."""

@@ -110,6 +110,16 @@ def test_without_a_seed_episodes_differ_and_with_one_they_do_not() -> None:
     e.close()
 
 
+def test_a_closed_environment_has_no_agents_and_a_closed_fleet_is_over() -> None:
+    """Otherwise `while env.agents` and `while not terminated` go on for ever."""
+    e, team = env(), TeamEnv(example(*SHORT))
+    for each in (e, team):
+        each.reset(seed=3)
+        each.close()
+    assert e.agents == []
+    assert team.step(np.zeros(24, int))[1:4] == (0.0, True, False)
+
+
 def test_an_interrupted_step_is_flown_and_the_next_one_is_that_of_an_uninterrupted_flight() -> None:
     """Otherwise each later step would return the one before it, while the sortie flies on beside the caller."""
 
