@@ -66,6 +66,16 @@ PHASE_SHARE, PHASE_S = 0.1, 0.01
 """Each drone acts at its own moment, within the first tenth of a frame and its first 10 ms."""
 
 
+def latest_phase_s(frame_s: float) -> float:
+    """Until when in each frame every drone has acted, s."""
+    return min(PHASE_SHARE * frame_s, PHASE_S)
+
+
+def phase_of(scenario: Scenario, seed: int, replication: int, drone: int) -> float:
+    """The drone's moment within each frame, s."""
+    return latest_phase_s(scenario.frame_s) * float(stream(seed, replication, drone, "phase").random())
+
+
 class Observer(Protocol):
     """Watches a sortie while it flies; nothing that it does changes the record."""
 
@@ -253,7 +263,7 @@ def build(
             gate=Gate(),
             log=notes,
             sealer=None if key is None else Sealer(key, KEY_ID),
-            phase_s=min(PHASE_SHARE * scenario.frame_s, PHASE_S) * stream(seed, replication, i, "phase").random(),
+            phase_s=phase_of(scenario, seed, replication, i),
             handshake_bytes=pilots[i].handshake_bytes,
             guard=pilots[i].guard,
             reads=pilots[i].reads,

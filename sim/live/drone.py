@@ -14,6 +14,7 @@ from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.memory import PeerMemory
 from sortie.policies.contract import Directive, FleetView, PolicyError
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.sortie import phase_of
 from sortie.sim.folders import RunError
 from sortie.sim.live.bus import Bus
 from sortie.sim.live.clock import WallClock
@@ -23,7 +24,7 @@ from sortie.sim.live.own_events import OwnEvents, status_of
 from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
 from sortie.sim.live.policy_process import Begin, PolicyOrders, take_notices
 from sortie.sim.live.reports import Failed, Go, Home, Ready
-from sortie.sim.live.rules import guard_of, phase_of, rules_of
+from sortie.sim.live.rules import guard_of, rules_of
 from sortie.sim.live.seals import Seals, Secrets
 from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog
 from sortie.sim.results.record import Recorder
@@ -129,7 +130,7 @@ def _fly(
     time.sleep(max(0.0, go.monotonic_s - time.monotonic()))
     clock = WallClock(orders.begin_s, go.monotonic_s)
     rules = rules_of(scenario, orders.begin_s, orders.end_s)
-    phase_s = phase_of(scenario, drone)
+    phase_s = phase_of(scenario, scenario.seed, 0, drone)
     # stamps are nanoseconds since 1970, as in ROS 2
     memory = PeerMemory(drone, rules, status_of(scenario, drone, go.unix_ns * 1e-9 - orders.begin_s))
     recorder = Recorder()

@@ -33,7 +33,7 @@ from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.streams import stream
-from sortie.sim.engine.sortie import PHASE_SHARE
+from sortie.sim.engine.sortie import latest_phase_s
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.payload_message import pack_bytes, unpack_bytes
@@ -322,7 +322,7 @@ class LiveNode:
         if (sender, directive.source, directive.destination) != (topic.source, topic.source, topic.destination):
             return "of another link", f"{directive.source}→{directive.destination} on {topic.name}"
         age_s = self._clock.now - self._memory.in_own_time(sender, stamp_ns * 1e-9)
-        ready_s = self._rules.equipment(sender).compute_delay_s + PHASE_SHARE * self._rules.period_s
+        ready_s = self._rules.equipment(sender).compute_delay_s + latest_phase_s(self._rules.period_s)
         if age_s > ready_s + directive.deadline_s:
             late_s = age_s - ready_s
             return "late", f"from drone {sender}, {late_s:.2f} s after it was ready, must be {directive.deadline_s:g} s"

@@ -81,7 +81,7 @@ class Report:
     refused: dict[str, int]
     """Invalid descriptors, directives and payloads, by reason."""
     late_s: float
-    """The longest time from the begin of a frame until its descriptor was published; planned is a tenth of a frame."""
+    """The longest time from the begin of a frame until its descriptor was published; planned are 10 ms at most."""
     sent: dict[TopicKind, Count]
     received: dict[TopicKind, Count]
     new: SinceLastReport

@@ -31,6 +31,7 @@ from sortie.fleet.staleness import cap_by_age, health
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.sortie import phase_of
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.context import ReplaySenses, traces, unflown
 from sortie.sim.live.node import LiveNode, Role
@@ -38,7 +39,7 @@ from sortie.sim.live.own_events import OwnEvents, status_of
 from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
 from sortie.sim.live.policy_process import Begin, PolicyOrders, take_notices
 from sortie.sim.live.reports import Report
-from sortie.sim.live.rules import guard_of, phase_of, rules_of
+from sortie.sim.live.rules import guard_of, rules_of
 from sortie.sim.live.seals import Seals, Secrets
 from sortie.sim.live.transport import Bus
 from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog
@@ -88,7 +89,7 @@ class RoleNode:
         self._clock = clock = WallClock(0.0, begin_monotonic_s)
         self._rules = rules = rules_of(scenario, 0.0, scenario.duration_s)
         self._memory = memory = PeerMemory(drone, rules, status_of(scenario, drone, orders.begin_unix_s))
-        self._recorder = Recorder()
+        self._recorder, phase_s = Recorder(), phase_of(scenario, scenario.seed, 0, drone)
         self.node = node = LiveNode(
             bus, Seals(orders.secrets, drone), drone, scenario.fleet.drones, seed=scenario.seed, role=role
         )
@@ -110,7 +111,7 @@ class RoleNode:
             gate=node.gate,
             log=node,
             sealer=None,  # the node seals what it writes
-            phase_s=phase_of(scenario, drone),
+            phase_s=phase_s,
             handshake_bytes=lambda: 0,
             guard=guard_of(scenario, drone, clock, self._recorder) if role == Role.POLICY else None,
         )
@@ -124,7 +125,7 @@ class RoleNode:
             self._policy.begin(Begin(0.0, begin_monotonic_s), node.note, node.decided)
         self._looked_ns = 0
         self._by_fallback = self._alone = False
-        clock.process(self._fly(phase_of(scenario, drone)))
+        clock.process(self._fly(phase_s))
 
     @property
     def over(self) -> bool:

@@ -1,8 +1,6 @@
-"""The plane's rules on a bus, when in a frame each drone acts, and what the gates may not break."""
+"""The plane's rules on a bus, and what the gates may not break."""
 
 from __future__ import annotations
-
-import math
 
 import simpy
 
@@ -11,23 +9,16 @@ from sortie.fleet.plane import PlaneRules, equipment_of
 from sortie.policies.catalogue.baselines import silence
 from sortie.policies.verification.invariants import parse
 from sortie.scenarios.schema import Scenario
-from sortie.scenarios.streams import stream
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan
-from sortie.sim.engine.sortie import PHASE_SHARE
 from sortie.sim.results.record import Recorder
-
-
-def phase_of(scenario: Scenario, drone: int) -> float:
-    """The drone's moment within each frame, s."""
-    return PHASE_SHARE * scenario.frame_s * float(stream(scenario.seed, 0, drone, "phase").random())
 
 
 def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
     """The plane's rules on the bus: samples go whole, descriptors in full."""
     return PlaneRules(
         period_s=scenario.frame_s,
-        frames=math.ceil(round((end_s - begin_s) * scenario.context.rate_hz, 9)),  # as Scenario.frames
+        frames=scenario.model_copy(update={"duration_s": end_s - begin_s}).frames,
         degraded_after_periods=scenario.context.degraded_after_periods,
         detached_after_periods=scenario.context.detached_after_periods,
         dwell_s=scenario.policy.dwell_s,

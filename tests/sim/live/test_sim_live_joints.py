@@ -117,9 +117,9 @@ def content(sender: int, captured_s: float, order: Directive) -> bytes:
 
 @pytest.mark.parametrize(("sender", "ready_s"), [(1, 0.5), (2, 0.1)])
 def test_a_payload_is_late_by_its_sender_s_clock_delay_and_moment(sender: int, ready_s: float) -> None:
-    """The deadline of 0.3 s begins when the sender can be ready: its own delay, and a tenth of a frame, after the capture."""
+    """The deadline of 0.3 s begins when the sender can be ready: its own delay, and 10 ms, after the capture."""
     made, topic, order = node(MemoryBus()), Topic(FEATURES, sender, 0), directive(sender, 0)
-    last_s = 50.0 - (ready_s + 0.02 + 0.3)
+    last_s = 50.0 - (ready_s + 0.01 + 0.3)
     assert made._find_fault(content(sender, last_s + 0.005, order), topic) is None
     fault = made._find_fault(content(sender, last_s - 0.005, order), topic)
     assert fault is not None
