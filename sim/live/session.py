@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
@@ -18,6 +19,7 @@ from sortie.fleet import chart, peers
 from sortie.fleet.logs.geodesy import Origin
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.world import INSTANT_S
 from sortie.sim.export.endpoint import parse_address
 from sortie.sim.folders import RunError
 from sortie.sim.live.bench import Bench, FleetReports
@@ -75,12 +77,12 @@ def fly_live(
 
     Args:
         scenario: the scenario; its policy decides on every drone.
-        begin_s: the scenario's time at which the fleet begins.
+        begin_s: the scenario's time at which the fleet begins, at the begin of its frame.
         duration_s: how long it flies, s; None: to the scenario's end.
         loss: share of descriptors that each drone drops on arrival, 0 … 1.
         kill: a drone whose process is killed (SIGKILL), and the scenario's time when.
-        start: a drone and the scenario's time when its process joins the others. If it was killed before, it comes back;
-            otherwise it is not there before.
+        start: a drone and the scenario's time, at the begin of its frame, when its process joins the others. If it was
+            killed before, it comes back; otherwise it is not there before.
         domain: DDS domain, as `ROS_DOMAIN_ID`.
         key: the master key of 32 B, from which every drone gets its secrets; None: a new random one. Unused where the
             scenario's `context.authentication` is off.
@@ -113,8 +115,9 @@ def fly_live(
         scenario.model_copy(update={"duration_s": end_s}),
         lambda t_s: report_progress("flying for the context", t_s, end_s),
     )
+    begin_s = _frame_of(begin_s, scenario)
     if start is not None:
-        start = start[0], round(start[1] / scenario.frame_s) * scenario.frame_s
+        start = start[0], _frame_of(start[1], scenario)
     drones, master = scenario.fleet.drones, key or os.urandom(32)
     authentic = scenario.context.authentication
     bench, fleet = Bench(Bus(domain), drones), FleetReports()
@@ -178,6 +181,11 @@ def fly_live(
         )
     finally:
         _clean_up(flown)
+
+
+def _frame_of(t_s: float, scenario: Scenario) -> float:
+    """When the frame of this moment begins: a process replays whole frames, and its clock begins with the first."""
+    return math.floor(t_s / scenario.frame_s + INSTANT_S) * scenario.frame_s
 
 
 def _check(

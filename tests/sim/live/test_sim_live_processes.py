@@ -22,8 +22,9 @@ from sortie.sim.live.session import fly_live
 def fly(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
     """Flies for 0.2 s with processes that have sent these messages already; returns what the result is made of."""
 
-    def fly(*sent: list[object]) -> dict[str, Any]:
+    def fly(*sent: list[object], **options: Any) -> dict[str, Any]:
         theirs: list[Connection] = []
+        orders_of: list[session.Orders] = []
 
         def start(orders: session.Orders) -> session._Drone:
             ours, its = multiprocessing.Pipe()
@@ -32,6 +33,7 @@ def fly(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
             if sent[orders.drone] == [Ready(orders.drone)]:
                 its.close()  # it died
             theirs.append(its)
+            orders_of.append(orders)
             process = SimpleNamespace(
                 name=f"drone {orders.drone}", exitcode=0, join=lambda _=None: None, is_alive=lambda: False
             )
@@ -43,9 +45,9 @@ def fly(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
         monkeypatch.setattr(session, "summarise", lambda *of, **more: more)
         monkeypatch.setattr(session, "LAST_REPORT_S", 0.3)
         monkeypatch.setattr(session, "CONNECT_S", 0.5)
-        found = fly_live(example(f"fleet.drones={len(sent)}"), duration_s=0.2)
+        found = fly_live(example(f"fleet.drones={len(sent)}"), duration_s=0.2, **options)
         assert isinstance(found, dict)
-        return found
+        return {**found, "orders": orders_of}
 
     return fly
 
@@ -64,3 +66,12 @@ def test_a_process_that_hangs_is_lost_and_the_flight_ends(fly: Callable[..., dic
 def test_a_process_that_ends_while_others_start_is_named(fly: Callable[..., dict[str, Any]]) -> None:
     with pytest.raises(RunError, match=r"^drone 0 ended before the flight began$"):
         fly([Ready(0)], [])
+
+
+def test_a_process_that_begins_within_a_frame_begins_with_it(fly: Callable[..., dict[str, Any]]) -> None:
+    """What it replays and its clock would otherwise be up to half a frame apart: its stamps would be of the future."""
+    messages = [[Ready(i), report(i), Home(i)] for i in range(2)]
+    result = fly(*messages, begin_s=0.36, start=(1, 0.55))
+    moments = [(o.begin_s, o.end_s) for o in result["orders"]]
+    assert moments == [(pytest.approx(0.3), pytest.approx(0.56)), (pytest.approx(0.5), pytest.approx(0.56))]
+    assert result["begin_s"] == pytest.approx(0.3)
