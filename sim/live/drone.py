@@ -12,7 +12,8 @@ from sortie.fleet import chart, peers
 from sortie.fleet.agent import Agent
 from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.memory import PeerMemory
-from sortie.policies.contract import Directive, FleetView, PolicyError
+from sortie.policies.contract import Directive, FleetView
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import phase_of
 from sortie.sim.folders import RunError
@@ -103,8 +104,10 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
             _fly(orders, node, policy, senses, go, pipe)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # nobody is left to report to
-    except (PolicyError, RunError, OSError) as error:
-        pipe.send(Failed(drone, str(error)))
+    except SortieError as error:
+        pipe.send(Failed(drone, error))
+    except OSError as error:
+        pipe.send(Failed(drone, RunError(str(error))))
     finally:
         if policy is not None:
             policy.close()

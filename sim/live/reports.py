@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from sortie.fleet.staleness import LinkHealth
+from sortie.scenarios.errors import SortieError
 from sortie.sim.export.topics import TopicKind
 
 
@@ -111,7 +112,7 @@ class Home(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """The process failed; its error in one line."""
+    """The process failed; its error has one line."""
 
     drone: int
-    what: str
+    error: SortieError

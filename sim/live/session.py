@@ -17,7 +17,6 @@ from multiprocessing.process import BaseProcess
 
 from sortie.fleet import chart, peers
 from sortie.fleet.logs.geodesy import Origin
-from sortie.policies.contract import PolicyError
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.world import INSTANT_S
 from sortie.sim.export.endpoint import parse_address
@@ -101,7 +100,8 @@ def fly_live(
         The measurements. After Ctrl-C they are of the part that was flown, and `interrupted` is true.
 
     Raises:
-        RunError: options that do not fit the scenario, or processes that do not find one another.
+        RunError: options that do not fit the scenario, processes that do not find one another, or a vehicle that is not
+            heard.
         PolicyError: an unknown policy, or one that breaks its contract.
     """
     end_s = scenario.duration_s if duration_s is None else begin_s + duration_s
@@ -306,14 +306,14 @@ def _receive(pipe: Connection) -> object | None:
     """The next message of a process; None if the process is gone.
 
     Raises:
-        PolicyError: its policy failed.
+        SortieError: what stopped it, such as a policy that cannot be loaded or a vehicle that is not heard.
     """
     try:
         message: object = pipe.recv()
     except (EOFError, ConnectionResetError):
         return None
     if isinstance(message, Failed):
-        raise PolicyError(message.what)
+        raise message.error
     return message
 
 

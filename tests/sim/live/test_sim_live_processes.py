@@ -12,8 +12,9 @@ import pytest
 from memory_bus import MemoryBus
 from sim_examples import example
 
+from sortie.policies.contract import PolicyError
 from sortie.sim.folders import RunError
-from sortie.sim.live import session
+from sortie.sim.live import drone, session
 from sortie.sim.live.reports import Home, Ready, Report, SinceLastReport
 from sortie.sim.live.session import fly_live
 
@@ -75,3 +76,22 @@ def test_a_process_that_begins_within_a_frame_begins_with_it(fly: Callable[..., 
     moments = [(o.begin_s, o.end_s) for o in result["orders"]]
     assert moments == [(pytest.approx(0.3), pytest.approx(0.56)), (pytest.approx(0.5), pytest.approx(0.56))]
     assert result["begin_s"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("raised", "kind"),
+    [(RunError("no vehicle"), RunError), (PolicyError("no policy"), PolicyError), (OSError("no port"), RunError)],
+)
+def test_what_stops_a_process_is_raised_by_the_flight_as_what_it_is(
+    monkeypatch: pytest.MonkeyPatch, fly: Callable[..., dict[str, Any]], raised: Exception, kind: type[Exception]
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise raised
+
+    monkeypatch.setattr(drone, "Watchdog", fails)
+    monkeypatch.setattr(drone.signal, "signal", lambda *_: None)
+    ours, its = multiprocessing.Pipe()
+    drone.fly_one(SimpleNamespace(scenario=example(), drone=0, fallback=None, decide_within_s=None), its)  # type: ignore[arg-type]
+    with pytest.raises(kind, match=f"^{raised}$") as found:
+        fly([ours.recv()], [Ready(1)])
+    assert found.type is kind
