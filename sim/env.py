@@ -210,7 +210,7 @@ class _Flight:
         joins = [e for e in scenario.events if isinstance(e, DroneJoins)]
         self._joins_s = {e.drone: e.at_s for e in sorted(joins, key=lambda e: e.at_s)}  # the last time
         self._waiting = {drone for group in scenario.mission.groups for drone in group.reserve}
-        self._error: Exception | None = None
+        self._error: BaseException | None = None
         self._new: dict[str, pa.Table] = {}
         self._mission: pa.Table | None = None
         self._spent_j: dict[int, float] = {}
@@ -262,7 +262,7 @@ class _Flight:
             run_sortie(scenario, self.decide, seed, replication=replication, observer=self)
         except _Closed:
             pass
-        except Exception as error:
+        except BaseException as error:  # whatever ends the thread, or the caller would wait for ever
             self._error = error
         self.done = True
         self._mine.release()

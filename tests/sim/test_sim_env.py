@@ -253,14 +253,17 @@ def test_rewards_charge_for_what_the_ledger_says(rate_hz: float) -> None:
     assert [1e3 * totals[i] for i in range(3)] == pytest.approx([d["energy_j"] for d in spent["drones"].values()])
 
 
-def test_what_went_wrong_in_the_sortie_is_said_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [RuntimeError, SystemExit])
+def test_what_went_wrong_in_the_sortie_is_said_each_time(
+    monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
     def broken(*_: object, **__: object) -> None:
-        raise RuntimeError("planted")
+        raise error("planted")
 
     monkeypatch.setattr("sortie.sim.env.run_sortie", broken)
     e = env()
     for fly in (e.reset, lambda: e.step({})):
-        with pytest.raises(RuntimeError, match="planted"):
+        with pytest.raises(error, match="planted"):
             fly()
     e.close()
 
