@@ -357,8 +357,16 @@ class TeamEnv(gymnasium.Env[Obs, np.ndarray[Any, Any]]):
         return self._stacked(observations), {}
 
     def step(self, action: np.ndarray[Any, Any]) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        """Fly one step under these actions."""
-        rows = np.reshape(action, (len(self.drones.possible_agents), -1))
+        """Fly one step under these actions.
+
+        Raises:
+            ValueError: an action outside its space; nothing has been flown, the step may be tried again.
+        """
+        n, each = len(self.drones.possible_agents), self.drones.action_space("drone_0").shape[0]
+        if np.size(action) != n * each:
+            must = f"must be {n * each} whole numbers: those of each drone, one after the other"
+            raise ValueError(f"action: {np.asarray(action).tolist()}, {must}")
+        rows = np.reshape(action, (n, each))
         given = {a: rows[int(a.removeprefix("drone_"))] for a in self.drones.agents}
         observations, rewards, _, over, infos = self.drones.step(given)
         seen = [i["ap50"] for i in infos.values() if i["ap50"] is not None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -372,6 +373,15 @@ def test_the_fleet_as_one_agent() -> None:
     team.reset()
     assert team.step(action)[1] == next_one, "without a seed: drawn from the last one given"
     team.close()
+
+
+@pytest.mark.parametrize("action", [[0] * 5, None])
+def test_an_action_of_another_length_than_the_fleet_s_is_refused(action: Any) -> None:
+    team = TeamEnv(example(*SHORT))
+    with pytest.raises(
+        ValueError, match=rf"^action: {re.escape(str(action))}, must be 24 whole numbers: those of each drone"
+    ):
+        team.step(action)
 
 
 def test_many_fleets_fly_at_once() -> None:

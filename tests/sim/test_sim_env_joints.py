@@ -77,8 +77,11 @@ class _Told:
     possible_agents = ["drone_0", "drone_1", "drone_2"]  # noqa: RUF012
     agents = ["drone_0", "drone_2"]  # noqa: RUF012
 
+    def __init__(self, action_space: object) -> None:
+        self.action_space = action_space
+
     def step(self, given: dict[str, np.ndarray]) -> tuple:
-        assert {a: row.tolist() for a, row in given.items()} == {"drone_0": [0, 1], "drone_2": [4, 5]}
+        assert {a: row.tolist() for a, row in given.items()} == {"drone_0": [*range(8)], "drone_2": [*range(16, 24)]}
         seen = {a: np.full((3, 25), float(a[-1]), np.float32) for a in self.agents}
         infos = {
             "drone_0": {"ap50": 0.5, "sent_bytes": 10, "spent_j": 1.0},
@@ -89,8 +92,8 @@ class _Told:
 
 def test_a_team_s_figures_are_of_those_that_fly_and_its_reward_is_a_mean_over_all() -> None:
     team = TeamEnv(example("fleet.drones=3"))
-    team.drones = _Told()  # type: ignore[assignment]
-    seen, reward, landed, over, info = team.step(np.arange(6))
+    team.drones = _Told(team.drones.action_space)  # type: ignore[assignment]
+    seen, reward, landed, over, info = team.step(np.arange(24))
     assert [float(seen[k].max()) for k in range(3)] == [0.0, 0.0, 2.0]
     assert reward == pytest.approx(0.3)
     assert (landed, over) == (False, False)
