@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from time import perf_counter  # before a user's file may replace it in its module
 from typing import Protocol
@@ -131,11 +131,7 @@ def run_sortie(
         if progress is not None:
             progress(t_s)
 
-    with (
-        watched(limits.decision_s, f"{limits.decision_s:g} s (limits.decision_s)")
-        if policies.of_users or runs_user_code(scenario)
-        else nullcontext()
-    ):
+    with decisions_limited(scenario, policies):
         own = loaded(scenario)
         parts = build(scenario, policies, seed, replication, detector_of)
         files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited during the flight
@@ -145,6 +141,14 @@ def run_sortie(
         metrics = own_metrics(own, record)
     wall = {"wall_s": perf_counter() - begin_s, **record.wall}
     return dataclasses.replace(record, own_files=files, metrics=metrics, wall=wall)
+
+
+def decisions_limited(scenario: Scenario, policies: PolicyPlan) -> AbstractContextManager[None]:
+    """Within it, no call of a user's own code takes longer than `limits.decision_s`."""
+    if not (policies.of_users or runs_user_code(scenario)):
+        return nullcontext()
+    limit_s = scenario.limits.decision_s
+    return watched(limit_s, f"{limit_s:g} s (limits.decision_s)")
 
 
 @dataclass(frozen=True)

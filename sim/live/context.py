@@ -29,7 +29,7 @@ from sortie.policies.contract import PERSON_FLAG, PHASE_NAMES, Disc, TaskPhase
 from sortie.scenarios.schema import Lie, Scenario
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.pilot import plan_for
-from sortie.sim.engine.sortie import build, fly
+from sortie.sim.engine.sortie import build, decisions_limited, fly
 from sortie.sim.engine.steering import area_m
 from sortie.sim.engine.tracking import FleetTracking, TargetSeen
 from sortie.sim.engine.world import INSTANT_S, cars_in_reach
@@ -84,16 +84,18 @@ def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) 
     """Fly the scenario without a detector and without lies, and keep each drone's trace.
 
     Raises:
-        PolicyError: its policy is unknown or breaks its contract.
+        PolicyError: its policy is unknown, breaks its contract, or takes longer than `limits.decision_s`.
     """
     perception = scenario.perception.model_copy(update={"detector": "none"})
     honest = tuple(event for event in scenario.events if not isinstance(event, Lie))
     # a roster would shorten the goodputs to those of its members; the live drone makes its own
     context = scenario.context.model_copy(update={"roster": False})
     flown = scenario.model_copy(update={"perception": perception, "context": context, "events": honest})
-    parts = build(flown, plan_for(flown), flown.seed)
-    bounds = area_m(flown.fleet, parts.world.motion.bounds_m())
-    fly(parts, progress)
+    policies = plan_for(flown)
+    with decisions_limited(flown, policies):
+        parts = build(flown, policies, flown.seed)
+        bounds = area_m(flown.fleet, parts.world.motion.bounds_m())
+        fly(parts, progress)
     tables = parts.recorder.finish()
     return [
         _trace(scenario, drone, _only(parts.world.motion, drone), bounds, tables)

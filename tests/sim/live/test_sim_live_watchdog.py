@@ -19,6 +19,7 @@ from sortie.policies.contract import PolicyError, Representation
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
 from sortie.sim.live import watchdog
+from sortie.sim.live.context import traces
 from sortie.sim.live.policy_process import Begin, PolicyOrders
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
@@ -118,6 +119,14 @@ def test_a_policy_that_dies_gets_a_new_process(watched: Watched) -> None:
     assert watched.watchdog.restarts == 1
     assert watched.watchdog.pid not in (before, None)
     assert rung(watched.watchdog) == Representation.FEATURES
+
+
+def test_a_policy_that_hangs_in_the_simulated_flight_ends_it_by_the_scenario_s_limit(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(POLICY)
+    (tmp_path / "mode").write_text("hang")
+    sets = (f"policy={{name: '{tmp_path}/mine.py:decide'}}", "limits.decision_s=0.2", "duration_s=1")
+    with pytest.raises(PolicyError, match=r"no answer within 0\.2 s \(limits\.decision_s\)"):
+        traces(example(*sets))
 
 
 def test_a_policy_that_dies_between_loading_and_the_flight_gets_a_new_process(tmp_path: Path) -> None:
