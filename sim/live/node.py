@@ -220,6 +220,8 @@ class LiveNode:
     # --- sortie.fleet.agent.AgentLog --------------------------------------------------------------------
 
     def descriptor(self, t_s: float, descriptor: Descriptor, wire_bytes: int) -> None:
+        if self.is_muted():  # it was not published
+            return
         clock_s = t_s + self._memory.status.clock_skew_s
         self._late_s = max(self._late_s, clock_s - descriptor.stamp_ns * 1e-9)
 
