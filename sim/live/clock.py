@@ -29,6 +29,7 @@ class WallClock(simpy.Environment):
         super().schedule(event, priority, self.now - self._now + delay)
 
     def catch_up(self) -> None:
-        """Handle all events that are due."""
-        while self.peek() <= self.now:
+        """Handle all events that are due. Those that become due meanwhile are for the next call, so that none lasts for ever."""
+        due_s = self.now
+        while self.peek() <= due_s:
             self.step()

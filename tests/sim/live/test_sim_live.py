@@ -174,6 +174,25 @@ def test_a_late_event_finds_the_clock_at_the_time_it_is(monkeypatch: pytest.Monk
     assert seen == [53.0, 54.5]
 
 
+def test_a_clock_that_is_always_late_returns_after_each_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise a drone with a slow policy decides on and on, and reads no message."""
+    wall_s = [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: wall_s[0])
+    clock, frames = WallClock(0.0, 1000.0), []
+
+    def fly() -> Any:
+        for frame in range(5):
+            yield clock.timeout(max(0.0, frame - clock.now))
+            frames.append(frame)
+            wall_s[0] += 1.5  # the frame takes longer than its period
+
+    clock.process(fly())
+    for done in range(6):
+        assert len(frames) <= done
+        clock.catch_up()
+    assert len(frames) >= 4
+
+
 # --- a flight with a peer, and a process that is killed ----------------------------------------------
 
 
