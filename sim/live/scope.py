@@ -55,6 +55,7 @@ UNUSED = (
     "record.views",
     "record.disagreement",
     "record.beliefs",
+    "limits.run_s",  # it lasts as long as it is to last
     "metrics",
     "expect",
     "expect_decisions",

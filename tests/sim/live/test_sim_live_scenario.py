@@ -315,6 +315,7 @@ USED = {
     "perception": {"tracking_rate_hz", "compute_delay_s", "people", "thermal", "scene", "code_bytes"},
     "policy": {"name", "params", "dwell_s", "hysteresis", "changes", "commands", "invariants", "of_makes", "shield"},
     "record": set(),
+    "limits": {"decision_s"},
 }  # fmt: skip
 
 
