@@ -252,8 +252,10 @@ class Watchdog:
             pipe.close()
         if process is None:
             return ""
-        if kill:
-            process.kill()
+        end_s = time.monotonic() + _EXIT_S
+        while not kill and process.exitcode is None and time.monotonic() < end_s:
+            time.sleep(0.01)  # not by `join`: that waits on without a limit for a process that has closed its files
+        process.kill()  # unless it has ended
         process.join(_EXIT_S)
         code = process.exitcode
         return f"the policy's process ended with exit code {code}"
