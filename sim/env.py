@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import threading
+import weakref
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -97,6 +98,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         }
         self._episodes = 0
         self._flight: _Flight | None = None
+        self._end: weakref.finalize[..., SortieEnv] | None = None
         self._begun: tuple[int | None, int] | None = None
         self._steps: list[tuple[dict[int, np.ndarray[Any, Any]], list[str]]] = []
         """Actions and agents of each step of the episode, from which a copy flies it again."""
@@ -123,8 +125,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         self._episodes += 1
         self.agents = list(self.possible_agents)
         self._begun, self._steps = (seed, replication), []
-        self._flight = _Flight(self.scenario, seed, replication)
-        self._flight.advance()
+        self._begin(seed, replication)
         return {a: self._observe(a) for a in self.agents}, {a: {} for a in self.agents}
 
     def step(
@@ -152,21 +153,26 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     def _resumed(self) -> _Flight | None:
         """The flight; of a copy one that has flown the same steps."""
         if self._flight is None and self._begun is not None:
-            self._flight = _Flight(self.scenario, *self._begun)
-            self._flight.advance()
+            flight = self._begin(*self._begun)
             for step in self._steps:
-                self._flight.fly(*step)
+                flight.fly(*step)
         return self._flight
+
+    def _begin(self, seed: int | None, replication: int) -> _Flight:
+        self._flight = flight = _Flight(self.scenario, seed, replication)
+        self._end = weakref.finalize(self, flight.close)  # also where nobody closes the environment
+        flight.advance()
+        return flight
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the flight, which runs in a thread."""
-        return {**self.__dict__, "_flight": None}
+        return {**self.__dict__, "_flight": None, "_end": None}
 
     def close(self) -> None:
         """End the sortie's thread, and with it the episode."""
-        if self._flight is not None:
-            self._flight.close()
-        self._flight = self._begun = None
+        if self._end is not None:
+            self._end()
+        self._flight = self._begun = self._end = None
         self.agents = []
 
     def render(self) -> None:
@@ -252,7 +258,7 @@ class _Flight:
         self._closing = True
         if self._started and not self.done:
             self._theirs.release()
-        if self._started:
+        if self._started and threading.current_thread() is not self._thread:  # which may collect what nobody holds
             self._thread.join()
 
     def _fly(self, seed: int | None, replication: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import pickle
 import re
 import threading
@@ -109,6 +110,18 @@ def test_without_a_seed_episodes_differ_and_with_one_they_do_not() -> None:
     assert not np.array_equal(flight(e, None), flight(e, None))
     assert np.array_equal(flight(e, 5), flight(e, 5))
     e.close()
+
+
+def test_an_environment_that_nobody_holds_ends_its_sortie() -> None:
+    before = threading.active_count()
+    e = env()
+    e.reset(seed=1)
+    copied = copy.deepcopy(e)
+    copied.step({})
+    assert threading.active_count() > before
+    del e, copied
+    gc.collect()
+    assert threading.active_count() == before
 
 
 def test_a_closed_environment_has_no_agents_and_a_closed_fleet_is_over() -> None:
