@@ -135,10 +135,8 @@ class Watchdog:
         self._begin, self._loaded = begin, True
         try:
             self._pipe.send(begin)
-        except (
-            BrokenPipeError,
-            ConnectionResetError,
-        ):  # it ended after it was loaded; the first decision starts a new one
+        except (BrokenPipeError, ConnectionResetError):
+            # it ended after it was loaded; the first decision starts a new one
             self._end(kill=False)
 
     def __call__(self, view: FleetView) -> Sequence[Directive]:
