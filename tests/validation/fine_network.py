@@ -81,7 +81,7 @@ def ways(root: Path) -> Table:
             more = [replace(r, way=replace(r.way, label=label)) for label, r in names.items()]
             rows += [_way(name, r, [*found, *more]) for r in more]
     columns = [Column("network"), Column("shared"), Column("an ego receives in a frame", ",.2f", " kB"), Column("AP@0.5", ".3f")]  # fmt: skip
-    columns += [Column(f"over {other}", "+.1f", factor=100) for other in ("silence", "averaged boxes")]
+    columns += [Column(f"over {other}", "+.1f", factor=100) for other in ("silence", "averaged boxes, estimated poses")]
     about = (
         f"{len(frames)} frames of the test split of benchmark seed {BENCH_SEED}, five egos each; intervals over scenes."
     )
@@ -113,7 +113,7 @@ def other_fleets(store: Path) -> Table:
         found = difficulty_effects(weights, store, scenes=FLEET_SCENES, workers=2, rows=chosen)
         rows += [[name, *_fleet(effect), share] for effect, share in zip(found, seen, strict=True)]
     columns = [Column("network"), Column("parameter"), Column("moved to"), *(Column(n, ".3f") for n in ("AP alone", "AP sharing all"))]  # fmt: skip
-    columns += [Column("change", "+.3f"), Column("cars that any drone sees", ".0f", " %", 100)]
+    columns += [Column("change, points", "+.1f", factor=100), Column("cars that any drone sees", ".0f", " %", 100)]
     about = f"{FLEET_SCENES} scenes of seed {SEED}'s test layouts, one fleet-frame of five egos each. Change: of AP sharing all against the network's first row, paired by scene."
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
@@ -143,7 +143,7 @@ def flights() -> Table:
             ]
             rows.append([name, label, _interval(each), *over])
     columns = [Column("network"), Column("policy"), Column("AP of the full scene", ".3f")]
-    columns += [Column(f"over {other}", "+.1f", factor=100) for other in ("silence", "the same, poses as believed")]
+    columns += [Column(f"over {other}", "+.1f", factor=100) for other in ("silence", "the same, estimated poses")]
     about = f"`track_target` for 16 s, scored once a second; towns and seeds {TOWNS[0]} to {TOWNS[-1]}; intervals over flights."
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
