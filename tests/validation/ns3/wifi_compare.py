@@ -21,6 +21,8 @@ MENDED = {"exact": 1, "meet": 1}
 decoded as if that one were not there. Without `meet`, pairs agree on block acks in the crowd of the first payloads; some
 agreements are stuck afterwards, and the pair sends nothing from its 64th frame on."""
 
+SEEDS = tuple(range(1, 9))
+"""With three of them, chance alone moved a delivered share of 0.3 by up to 0.03 and a share of lost descriptors by 2 points."""
 LOADS = (
     Case("5 in a cross, 13 kB to all", payload_bytes=13_120, pairs=20, mcs=9, stop_s=6.0, load=0.06),
     Case("5 in a cross, 50 kB to all", payload_bytes=50_000, pairs=20, mcs=9, stop_s=6.0, load=0.24),
@@ -192,7 +194,7 @@ def loads_table(cases: Iterable[Case], seeds: Sequence[int], about: str) -> Tabl
     return Table(columns, rows, about)
 
 
-def tables(seeds: Sequence[int] = (1, 2, 3)) -> dict[str, Table]:
+def tables(seeds: Sequence[int] = SEEDS) -> dict[str, Table]:
     """What `docs/results/tables/ns3.json` stores."""
     about = (
         f"Seeds: {len(seeds)}. Every drone sends a descriptor of 208 B and its payloads ten times a second, at MCS 9 in the "

@@ -18,7 +18,7 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).parents[1])]
 
 from stored import Table
-from wifi_compare import loads_table
+from wifi_compare import SEEDS, loads_table
 from wifi_plan import FRAME_S, Case, pairs_of
 
 from sortie.radio import AirSettings
@@ -51,7 +51,7 @@ def drawn(seed: int, number: int) -> Case:
     return Case(name + words, pairs=pairs, load=of_alone, stop_s=6.0 if drones < 10 else 2.4, **case)
 
 
-def table(seed: int, plans: int, seeds: tuple[int, ...] = (1, 2, 3)) -> Table:
+def table(seed: int, plans: int, seeds: tuple[int, ...] = SEEDS) -> Table:
     """Drawn plans by both simulators."""
     about = (
         f"{plans} plans, drawn from the seed {seed}; {len(seeds)} seeds for each. The load is the offered payload over what "
