@@ -34,8 +34,8 @@ from typing import Any, Literal
 from sortie.policies.checks import check_directives, find_inexact, find_wrong_type
 from sortie.policies.contract import DETACHED_AFTER_PERIODS, Directive, FleetView, Policy, PolicyError
 from sortie.policies.verification.advice import advise
+from sortie.policies.verification.age_rule import older_views, raised_part, without_detached
 from sortie.policies.verification.confine import Reached
-from sortie.policies.verification.conformance import missing_links, older_views, raised_part, without_detached
 from sortie.policies.verification.courses import constants_of
 from sortie.policies.verification.invariants import (
     Invariant,
@@ -45,6 +45,7 @@ from sortie.policies.verification.invariants import (
     violations,
 )
 from sortie.policies.verification.own_constants import views_at
+from sortie.policies.verification.policy_rules import missing_links
 from sortie.policies.verification.search import (
     BUDGET_S,
     LEAST_VIEWS,
@@ -131,7 +132,7 @@ def keeps_contract(policy: Policy, view: Any) -> str | None:
 
 
 def only_falls_with_age(policy: Policy, view: Any) -> str | None:
-    """Raising any ages raises no directive's representation, budget or rate (`conformance.age_monotone`)."""
+    """Raising any ages raises no directive's representation, budget or rate (`policy_rules.age_monotone`)."""
     before = _exactly(policy(view.now()))
     for older in view.older():
         after = policy(older)

@@ -10,7 +10,7 @@ from typing import Any
 
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import PHASE_NAMES, Directive, FleetView, Policy, PolicyError, TaskPhase
-from sortie.policies.verification.conformance import raised_part
+from sortie.policies.verification.age_rule import raised_part
 from sortie.policies.verification.proof import RepeatableView
 from sortie.policies.verification.views import to_json
 from sortie.scenarios.schema import Scenario

@@ -28,7 +28,7 @@ from sortie.policies.contract import (
     Viewpoint,
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
-from sortie.policies.verification.conformance import raised_part
+from sortie.policies.verification.age_rule import raised_part
 from sortie.policies.verification.enforced import Cap, Steps, effective, judge, put_right
 from sortie.policies.verification.invariants import (
     Invariant,

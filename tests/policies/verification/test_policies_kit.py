@@ -16,7 +16,8 @@ from policies_examples import fleet_of
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, boxes_across_networks
 from sortie.policies.verification import conformance
-from sortie.policies.verification.conformance import RULES, Check, conform, failing
+from sortie.policies.verification.conformance import Check, conform, failing
+from sortie.policies.verification.policy_rules import RULES
 from sortie.policies.verification.views import ViewError, draw_view, draw_views, from_json, shrink, to_json
 
 FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS

@@ -19,8 +19,9 @@ from policies_examples import fleet_of
 from sortie.policies.contract import Directive, FleetView, Reposition, Representation, looks_from
 from sortie.policies.registry import resolve
 from sortie.policies.verification.confine import Reached
-from sortie.policies.verification.conformance import RULES, conform
+from sortie.policies.verification.conformance import conform
 from sortie.policies.verification.instrument import instrumented
+from sortie.policies.verification.policy_rules import RULES
 from sortie.policies.verification.source_checks import compiled
 from sortie.policies.verification.symbols import Refused
 from sortie.policies.verification.views import draw_view, draw_views, shrink

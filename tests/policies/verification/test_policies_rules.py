@@ -30,8 +30,10 @@ from sortie.policies.checks import check_directives, find_inexact
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Policy, PolicyError, Representation
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.registry import POLICIES, resolve
+from sortie.policies.verification.age_rule import raised_part, without_detached
 from sortie.policies.verification.confine import Reached, confined
-from sortie.policies.verification.conformance import RULES, full_view, raised_part, without_detached
+from sortie.policies.verification.conformance import full_view
+from sortie.policies.verification.policy_rules import RULES
 from sortie.policies.verification.views import draw_view, draw_views
 from sortie.scenarios.reading.load import ScenarioError, loads
 

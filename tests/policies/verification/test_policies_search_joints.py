@@ -29,9 +29,9 @@ from policies_examples import fleet_of
 from sortie.policies.contract import PERSON_FLAG, Directive, Disc, PolicyError, Representation, Roster, TaskPhase
 from sortie.policies.registry import resolve
 from sortie.policies.verification import pure
+from sortie.policies.verification.age_rule import older_views, raised_part, without_detached
 from sortie.policies.verification.axes import decisions_of, observe
 from sortie.policies.verification.confine import Reached, confined
-from sortie.policies.verification.conformance import older_views, raised_part, without_detached
 from sortie.policies.verification.invariants import WORDS, Scope
 from sortie.policies.verification.kept import fingerprint
 from sortie.policies.verification.outside import Outside

@@ -9,8 +9,9 @@ import pytest
 
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.verification import search
-from sortie.policies.verification.conformance import RULES, TIMED, conform
+from sortie.policies.verification.conformance import TIMED, conform
 from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.policy_rules import RULES
 from sortie.policies.verification.proof import TRIED_LARGE, prove
 from sortie.policies.verification.search import Budget
 from sortie.policies.verification.views import draw_views

@@ -9,7 +9,7 @@ from cli_examples import command
 
 from sortie.policies.contract import TaskPhase
 from sortie.policies.registry import resolve
-from sortie.policies.verification.conformance import RULES
+from sortie.policies.verification.policy_rules import RULES
 from sortie.policies.verification.subject import own_invariants
 from sortie.policies.verification.views import draw_views, from_json, to_json
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug

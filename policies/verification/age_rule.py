@@ -1,0 +1,59 @@
+"""The plane's rule that age only reduces: makes views with older descriptors, and finds directives that are higher there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from sortie.policies.contract import Directive, FleetView
+
+
+def older_views(view: FleetView) -> Iterator[tuple[tuple[int, ...], float, FleetView]]:
+    """Views in which one descriptor, or all, are older: whose age is raised, by how many seconds, and the view."""
+    for periods in (1.0, 3.5, 10.5, 1000.0):
+        add_s = periods * view.period_s
+        for who in [*((i,) for i in view.age_s), tuple(view.age_s)]:
+            yield who, add_s, view._replace(age_s={i: a + add_s * (i in who) for i, a in view.age_s.items()})
+
+
+def without_detached(view: FleetView, older: FleetView) -> FleetView:
+    """A view without the peers that are detached in an older one."""
+    left = older.attached.descriptors
+    if len(left) == len(view.descriptors):
+        return view
+    return view._replace(
+        descriptors={i: d for i, d in view.descriptors.items() if i in left},
+        age_s={i: a for i, a in view.age_s.items() if i in left},
+    )
+
+
+def raised_part(
+    before: Iterable[Directive], after: Iterable[Directive], without: Iterable[Directive] = ()
+) -> str | None:
+    """The first directive of `after` that is higher than that of `before`, and than that of `without` if there is one.
+
+    Higher is a higher representation, a higher budget of the same representation, or a higher rate.
+    """
+    usual, instead = by_peer(before), by_peer(without)
+    for d in after:
+        raised = _rise(usual.get(d.destination), d)
+        if raised and (d.destination not in instead or _rise(instead[d.destination], d)):
+            return f"directive {d.source}→{d.destination}: {raised}"
+    return None
+
+
+def _rise(old: Directive | None, d: Directive) -> str | None:
+    """In what a directive is higher than the one before."""
+    if old is None:
+        return "there was none before" if d.representation > 0 else None
+    if d.representation > old.representation:
+        return f"representation rises from {old.representation:d} to {d.representation:d}"
+    if d.representation == old.representation and d.rho > old.rho:
+        return f"rho rises from {old.rho} to {d.rho}"
+    if d.rate_hz > old.rate_hz:
+        return f"rate_hz rises from {old.rate_hz} to {d.rate_hz}"
+    return None
+
+
+def by_peer(directives: Iterable[Directive]) -> dict[int, Directive]:
+    """Directives by their destinations."""
+    return {d.destination: d for d in directives}
