@@ -362,16 +362,18 @@ def for_policy(frame: Any) -> bool:
     The checks ask for `_text`, of which they know what becomes. Sortie's own policies and errors put texts into reasons alone.
     """
     home = str(frame.f_globals.get("__name__", ""))
-    is_checks = home == "sortie.policies.verification.call_checks"
-    return is_checks or is_users(home) or home.partition(".")[0] in sys.stdlib_module_names
+    return home in _CHECKS or is_users(home) or home.partition(".")[0] in sys.stdlib_module_names
+
+
+_CHECKS = {f"sortie.policies.verification.{m}" for m in ("call_checks", "value_checks")}
 
 
 class Text(str):
     """The text of a number with a known range. It can be used as a reason; any other use raises `Refused`.
 
     Sortie's own f-strings and `join` make plain text of it. The plain text has a mark instead of the number, so code that
-    reads a number there fails. The checks (`call_checks`) keep a policy's text a `Text`, and refuse compiled code that would
-    read what is stored.
+    reads a number there fails. The checks keep a policy's text a `Text` (`value_checks`), and refuse compiled code that would
+    read what is stored (`call_checks`).
     """
 
     _path: Path

@@ -10,7 +10,8 @@ LATER = 1_000_003
 
 TEXTS = (
     "bad = f'{soc:.7f}' in 'K'", "bad = operator.contains('K', f'{soc:.7f}')", "bad = ascii(soc) == 'K'", "bad = f'{soc!a}' == 'K'",
-    "bad = ascii([soc]) == '[K]'", "bad = '%a' % {0: soc} == '{0: K}'", "bad = repr([f'{soc:.7f}']) == \"['K']\"",
+    "bad = ascii([soc]) == '[K]'", "bad = '%a' % {0: soc} == '{0: K}'", "bad = operator.mod('%a', {0: soc}) == '{0: K}'",
+    "bad = repr([f'{soc:.7f}']) == \"['K']\"",
     "bad = '%.12s' % {0: soc} == '{0: 0.412345'", "bad = f'{[soc]!s:.10}' == '[K'", "bad = '{!s:.10}'.format([soc]) == '[K'",
     "bad = bytes(f'{soc:.7f}', 'utf8') == b'K'", "bad = bytearray(str(soc), 'utf8') == b'K'", "bad = not 'K'.replace(str(soc), '')",
     "bad = not 'K'.removeprefix(str(soc))", "bad = str.startswith(str(soc), 'K')", "bad = any(map(str.endswith, [str(soc)], ['4123457']))",
