@@ -113,15 +113,16 @@ def test_without_a_seed_episodes_differ_and_with_one_they_do_not() -> None:
 
 
 def test_an_environment_that_nobody_holds_ends_its_sortie() -> None:
-    before = threading.active_count()
+    before = set(threading.enumerate())
     e = env()
     e.reset(seed=1)
     copied = copy.deepcopy(e)
     copied.step({})
-    assert threading.active_count() > before
+    begun = [thread for thread in threading.enumerate() if thread not in before]
+    assert begun
     del e, copied
     gc.collect()
-    assert threading.active_count() == before
+    assert not [thread.name for thread in begun if thread.is_alive()]
 
 
 def test_a_closed_environment_has_no_agents_and_a_closed_fleet_is_over() -> None:
