@@ -98,6 +98,8 @@ class ClosedLoop:
     def _ask(self, view: FleetView) -> Sequence[Directive]:
         try:
             directives = self._policy(view)
+        except PolicyError:
+            raise
         except Exception as error:
             raise PolicyError(f"raises {describe_error(error)}") from error
         check_directives(directives, view)

@@ -306,3 +306,11 @@ def test_a_flight_of_the_scenario_ends_with_the_time(monkeypatch: pytest.MonkeyP
     (verdict,) = judge_over_time(subject, rules, drones=2, budget_s=60, scenario=base, courses=1, flights=5)
     assert len(flown_s) == 3
     assert verdict.what.startswith("1 courses of up to 2 drones keep it, at")
+
+
+def test_an_error_of_the_contract_keeps_its_text_in_the_loop() -> None:
+    def refuses(view: FleetView) -> list[Directive]:
+        raise PolicyError("gone")
+
+    with pytest.raises(PolicyError, match=r"^gone$"):
+        ClosedLoop(refuses, parse("climbs_in(dwell) <= 1"), TIMES).step(next(STILL.views()), 0.0)

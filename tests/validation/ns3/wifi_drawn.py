@@ -64,8 +64,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--plans", type=int, default=12)
+    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="runs of each plan")
     asked = parser.parse_args()
-    sys.stdout.write(table(asked.seed, asked.plans).markdown() + "\n")
+    sys.stdout.write(table(asked.seed, asked.plans, tuple(range(1, asked.seeds + 1))).markdown() + "\n")
 
 
 if __name__ == "__main__":
