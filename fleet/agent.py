@@ -25,7 +25,7 @@ from sortie.fleet.messages.wire import decode_descriptor, decode_directive, enco
 from sortie.fleet.peers import loops
 from sortie.fleet.plane import PlaneRules
 from sortie.fleet.senses import Sensed
-from sortie.fleet.staleness import LinkHealth, cap_by_age, health
+from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age, health
 from sortie.fleet.trust import JUDGED_EVERY_S, Standing
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture
@@ -43,7 +43,7 @@ from sortie.policies.contract import (
 )
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
 from sortie.policies.geometry import places_loop
-from sortie.policies.verification.enforced import Cap, Steps
+from sortie.policies.verification.enforced import Ceilings, Steps
 
 _FRESH = LinkHealth.FRESH
 _NOTHING = nothing(0, 1, "")[2:8]
@@ -102,7 +102,7 @@ class AgentLog(Protocol):
     def alert(self, t_s: float, drone: int, known: bool) -> None: ...
 
 
-Guard = Callable[[FleetView, Sequence[Steps], Cap], Sequence[Directive]]
+Guard = Callable[[FleetView, Sequence[Steps], Ceilings], Sequence[Directive]]
 """Judges what staleness and damping left of every link's directive, and returns what the gates are to enforce."""
 
 
@@ -419,13 +419,13 @@ class Agent:
         me = self.drone
         fidelity = {peer: self._health(age_s) for peer, age_s in view.age_s.items() if peer != me}
 
-        def cap(directive: Directive) -> Directive:
-            peer = directive.destination
-            return cap_by_age(directive, fidelity[peer], view.age_s[peer])
-
         asked = [asked_of.get(peer) or nothing(me, peer, "the policy gave no directive") for peer in fidelity]
-        steps = [Steps(d, cap(d), self._links[d.destination].state.enforced) for d in asked]
-        for step, directive in zip(steps, guard(view, steps, cap), strict=True):
+        steps = [
+            Steps(d, cap_by_age(d, fidelity[peer], view.age_s[peer]), self._links[peer].state.enforced)
+            for peer, d in zip(fidelity, asked, strict=True)
+        ]
+        ceilings = {peer: CEILING[link] for peer, link in fidelity.items()}
+        for step, directive in zip(steps, guard(view, steps, ceilings), strict=True):
             peer = directive.destination
             self._put_in_force(self._links[peer], step.asked, directive, fidelity[peer])
 

@@ -6,9 +6,11 @@ A descriptor older than 3 periods degrades the link to its peer, one older than 
 
 from __future__ import annotations
 
+import operator
 from enum import IntEnum
 
 from sortie.policies.contract import ROUNDING_PERIODS, Directive, Representation
+from sortie.policies.verification.links import LEVEL, RATE_HZ, Ceiling, nothing_but_duty
 
 DEGRADED_RATE_HZ = 2.0
 """A degraded link carries detections at most this often, as the worked policy's lowest rung does."""
@@ -32,6 +34,17 @@ def health(
     if periods > detached_after_periods:
         return LinkHealth.DETACHED
     return LinkHealth.DEGRADED if periods > degraded_after_periods else LinkHealth.FRESH
+
+
+CEILING: dict[LinkHealth, Ceiling] = {
+    LinkHealth.FRESH: (),
+    LinkHealth.DEGRADED: (
+        (LEVEL, (operator.le, Representation.DETECTIONS.level)),
+        (RATE_HZ, (operator.le, DEGRADED_RATE_HZ)),
+    ),
+    LinkHealth.DETACHED: nothing_but_duty(),
+}
+"""What a shield may give a link: nothing else than what `cap_by_age` leaves as it is."""
 
 
 def cap_by_age(directive: Directive, link: LinkHealth, age_s: float | None) -> Directive:

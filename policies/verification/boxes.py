@@ -6,22 +6,25 @@ Such lines make a box. It is built once for each set of lines that apply, and se
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 from sortie.policies.contract import Representation
-from sortie.policies.verification.compiled import Compare, Context, Rule
-from sortie.policies.verification.links import AT, DUTY, HIGHEST, LEVEL, RATE_HZ, ROI, Link
+from sortie.policies.verification.compiled import Context, Rule, Ways
+from sortie.policies.verification.links import AT, DUTY, HIGHEST, LEVEL, ROI, Ceiling, Compare, Limit, Link
 from sortie.scenarios.representation import AT_LEVEL
 
 _FIRST_LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0)
 _PLAIN = frozenset({float, int, Representation})
-Limit = tuple[Compare, float]
-"""A comparison that a field must satisfy, and its other side."""
 Wanted = dict[int, float]
 """Values of fields, by their places in a link."""
+
+
+Known = dict[Any, tuple[Link, tuple[int, ...], "dict[Box, Link | None]"]]
+"""By a link's fields: the first link that had them, the lines that it breaks, and the nearest link, by the box within which
+it is to be."""
 
 
 class Box:
@@ -30,16 +33,14 @@ class Box:
     Args:
         rules: the lines, all of which apply.
         sides: the other side of each part that bounds a field, in the order of the lines.
-        most: the highest level and rate, beside the bounds of the lines.
+        ceiling: beside the bounds of the lines.
     """
 
-    __slots__ = ("_bounded", "_checks", "_others", "limits", "parts", "rules", "shared")
+    __slots__ = ("_bounded", "_checks", "_others", "known", "parts", "room", "rules", "shared")
 
-    def __init__(self, rules: Sequence[Rule], sides: Iterable[float], most: tuple[float, float] | None = None) -> None:
+    def __init__(self, rules: Sequence[Rule], sides: Iterable[float], ceiling: Ceiling = ()) -> None:
         self.rules = rules
-        limits: dict[int, tuple[Limit, ...]] = {}
-        if most is not None:
-            limits = {LEVEL: ((operator.le, most[0]),), RATE_HZ: ((operator.le, most[1]),)}
+        limits: dict[int, tuple[Limit, ...]] = {at: (limit,) for at, limit in ceiling}
         self._checks: list[tuple[int, Compare, float, int]] = []
         values = iter(sides)
         parts = []
@@ -51,21 +52,24 @@ class Box:
                     (at,), limit = part.bound.fields, (part.bound.compare, next(values))
                     self._checks.append((at, *limit, number))
                     limits[at] = (*limits.get(at, ()), limit)
-        self.limits = [Values(at, limits.get(at, ())) for at in AT.values()]
-        """What each field may be, by its place."""
-        self._bounded = [(at, self.limits[at].limits, self.limits[at]) for at in limits]
+        self.room = Room([Values(at, limits.get(at, ())) for at in AT.values()])
+        self._bounded = [(at, self.room.values[at]) for at in limits]
         self.parts = tuple([part for part, _ in parts])
         """The parts that are no bounds of one field, or have another bound for each link."""
         self._others = [(part.holds, number) for part, number in parts]
         self.shared = not any(part.of_peer or part.of_links for part, _ in parts)
         """Whether equal links to different peers get the same correction."""
+        lasts = self.shared and not any(part.of_view for part, _ in parts)
+        self.known: tuple[Known, Known] | None = ({}, {}) if lasts else None
+        """Where corrections depend on nothing but a link's fields, and on whether its sender has a region: those found so
+        far, of senders without and with one. Policies mostly decide what they decided before."""
 
     def clipped(self, link: Link) -> dict[int, float | None]:
         """The nearest values of the fields that must change for the bounds; None for a field without an allowed value."""
         wanted: dict[int, float | None] = {}
-        for at, limits, values in self._bounded:
+        for at, values in self._bounded:
             now = link[at]
-            for compare, value in limits:
+            for compare, value in values.limits:
                 if not compare(now, value):
                     wanted[at] = values.other_than(now)
                     break
@@ -82,15 +86,14 @@ class Box:
         return link[:-1] if self.shared and _are_plain(link[:-2]) else None
 
 
-def box_of(rules: tuple[Rule, ...], sides: tuple[float, ...], most: tuple[float, float] | None) -> Box:
+def box_of(rules: tuple[Rule, ...], sides: tuple[float, ...], ceiling: Ceiling) -> Box:
     """The box of some lines. Equal plain arguments give one object."""
-    plain = _are_plain(sides) and (most is None or _are_plain(most))
-    return _plain_box(rules, sides, most) if plain else Box(rules, sides, most)
+    return _plain_box(rules, sides, ceiling) if _are_plain(sides) else Box(rules, sides, ceiling)
 
 
 @lru_cache(maxsize=512)
-def _plain_box(rules: tuple[Rule, ...], sides: tuple[float, ...], most: tuple[float, float] | None) -> Box:
-    return Box(rules, sides, most)
+def _plain_box(rules: tuple[Rule, ...], sides: tuple[float, ...], ceiling: Ceiling) -> Box:
+    return Box(rules, sides, ceiling)
 
 
 class Values:
@@ -123,6 +126,40 @@ class Values:
         if now > values[-1]:
             return values[-1]
         return values[0] if now < values[0] else min(values, key=lambda v: abs(v - now))
+
+
+class Room:
+    """What each field may be, by its place."""
+
+    __slots__ = ("_ways", "values")
+
+    def __init__(self, values: Sequence[Values]) -> None:
+        self.values = values
+        self._ways: dict[Ways, list[Way]] = {}
+
+    def within(self, ways: Ways) -> list[Way]:
+        """Where each of some alternatives holds too. They are bounds by plain numbers, so this is worked out once."""
+        found = self._ways.get(ways)
+        if found is None:
+            found = self._ways[ways] = [self._narrowed(way) for way in ways.limits or ()]
+        return found
+
+    def _narrowed(self, way: Iterable[tuple[int, Limit]]) -> Way:
+        narrowed: dict[int, Values] = {}
+        for at, limit in way:
+            before = narrowed.get(at, self.values[at])
+            values = before.within(limit)
+            if values is not before:
+                narrowed[at] = values
+        return self.having(narrowed), tuple(narrowed.items())
+
+    def having(self, narrowed: Mapping[int, Values]) -> Room:
+        """The same with other values of some fields."""
+        return Room([narrowed.get(at, values) for at, values in enumerate(self.values)]) if narrowed else self
+
+
+Way = tuple[Room, tuple[tuple[int, Values], ...]]
+"""A room within another one, and the fields that are narrower there."""
 
 
 def _within(values: Values, limit: Limit) -> Values:

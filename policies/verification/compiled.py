@@ -24,16 +24,24 @@ from sortie.policies.verification.invariants import (
     Number,
     walk,
 )
-from sortie.policies.verification.links import AT, Link, as_link
+from sortie.policies.verification.links import AT, Compare, Limit, Link, as_link
 from sortie.policies.verification.words import DECISIONS, WORDS
 from sortie.scenarios.plain_sum import plain_sum
 
 Ask = Callable[["Context", Link], Any]
 """The value of an expression in a context, for one link."""
-Compare = Callable[[Any, Any], Any]
 _COMPARE: dict[str, Compare] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq, "!=": operator.ne,
 }  # fmt: skip
+_FIELD: dict[str, Callable[[int, float], Ask]] = {
+    "<": lambda at, bound: lambda _, link: link[at] < bound,
+    "<=": lambda at, bound: lambda _, link: link[at] <= bound,
+    ">": lambda at, bound: lambda _, link: link[at] > bound,
+    ">=": lambda at, bound: lambda _, link: link[at] >= bound,
+    "==": lambda at, bound: lambda _, link: link[at] == bound,
+    "!=": lambda at, bound: lambda _, link: link[at] != bound,
+}
+"""A field compared with a number, asked most often."""
 _ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {"+": operator.add, "-": operator.sub, "*": operator.mul}
 _OPPOSITE = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "==": "!=", "!=": "=="}
 _MIRRORED = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "==": "==", "!=": "!="}
@@ -86,20 +94,33 @@ class Claim(NamedTuple):
     """Of a claim about one field: how the field compares with `value`."""
     value: Ask | None = None
     """Of a claim about one field: the other side, which depends on no field of the link."""
+    number: float | None = None
+    """The same where it is a plain number."""
     gap: Ask | None = None
     """Of a comparison of several fields: left side less right side."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Ways:
+    """Alternatives: something holds where all claims of one of them hold."""
+
+    claims: tuple[tuple[Claim, ...], ...]
+    limits: tuple[tuple[tuple[int, Limit], ...], ...] | None
+    """The same as bounds of fields, by their places; None where a claim is more than a field compared with a number."""
 
 
 class Part(NamedTuple):
     """A part of a requirement that must hold by itself."""
 
     holds: Ask
-    ways: tuple[tuple[Claim, ...], ...]
-    """The requirement holds where all claims of one of these hold."""
-    exempt: tuple[tuple[Claim, ...], ...]
-    """Where all claims of one of these hold, the line's condition on the directive is false."""
+    ways: Ways
+    """How the requirement holds."""
+    exempt: Ways | None
+    """How the line's condition on the directive becomes false; None without one."""
     bound: Claim | None
     """The claim about one field that the whole part is, if its other side is the same for all links."""
+    of_view: bool
+    """Whether it depends on the view, otherwise than through a peer."""
     of_peer: bool
     """Whether it depends on the peer otherwise than through the link's directive."""
     of_links: bool
@@ -162,15 +183,23 @@ def _part(required: Node, conditions: Sequence[Node]) -> Part:
         node = Logic("or", (*[Logic("not", (condition,)) for condition in conditions], required))
     ways = _quick_first(_ways(required, True))
     exempt = _quick_first(way for condition in conditions for way in _ways(condition, False))
-    bound = ways[0][0] if len(ways) == 1 and len(ways[0]) == 1 and not exempt else None
-    of_peer, of_links = _is_of_peer(node), any(isinstance(n, LinksTerm) for n in walk(node))
-    simple = bound is not None and bound.value is not None and not of_peer and not of_links
-    return Part(_ask(node), ways, exempt, bound if simple else None, of_peer, of_links)
+    bound = ways.claims[0][0] if len(ways.claims) == 1 and len(ways.claims[0]) == 1 and not exempt.claims else None
+    of_view, of_peer = _is_of_view(node), _is_of_peer(node)
+    of_links = any(isinstance(n, LinksTerm) for n in walk(node))
+    if bound is not None and (bound.value is None or of_peer or of_links):
+        bound = None
+    return Part(_ask(node), ways, exempt if exempt.claims else None, bound, of_view, of_peer, of_links)
 
 
-def _quick_first(ways: Iterable[tuple[Claim, ...]]) -> tuple[tuple[Claim, ...], ...]:
+def _quick_first(ways: Iterable[tuple[Claim, ...]]) -> Ways:
     """The claims that a view or another drone decides come first."""
-    return tuple(tuple(sorted(way, key=lambda claim: len(claim.fields))) for way in ways)
+    found = tuple(tuple(sorted(way, key=lambda claim: len(claim.fields))) for way in ways)
+    limits = [
+        tuple([(c.fields[0], (c.compare, c.number)) for c in way if c.compare is not None and c.number is not None])
+        for way in found
+    ]
+    plain = all(len(bounds) == len(way) for bounds, way in zip(limits, found, strict=True))
+    return Ways(found, tuple(limits) if plain else None)
 
 
 def _ways(node: Node, wanted: bool) -> tuple[tuple[Claim, ...], ...]:
@@ -202,13 +231,16 @@ def _claim_of(node: Node, wanted: bool) -> Claim:
     fields = tuple(dict.fromkeys(AT[n.word] for n in walk(node) if isinstance(n, Name) and n.word in DECISIONS))
     if isinstance(node, Name):
         holds = _ask(node) if wanted else _not(_ask(node))
-        return Claim(holds, fields, operator.eq, lambda _, __: float(wanted)) if fields else Claim(holds, ())
+        if not fields:
+            return Claim(holds, ())
+        return Claim(holds, fields, operator.eq, lambda _, __: float(wanted), float(wanted))
     if isinstance(node, Binary) and node.sign in _COMPARE and not any(isinstance(n, LinksTerm) for n in walk(node)):
         sign = node.sign if wanted else _OPPOSITE[node.sign]
         holds = _binary(sign, node.left, node.right)
         for side, other, how in ((node.left, node.right, sign), (node.right, node.left, _MIRRORED[sign])):
             if isinstance(side, Name) and fields == (AT.get(side.word),) and not _depends(other):
-                return Claim(holds, fields, _COMPARE[how], _ask(other))
+                number = other.value if isinstance(other, Number) else None
+                return Claim(holds, fields, _COMPARE[how], _ask(other), number)
         return Claim(holds, fields, gap=_binary("-", node.left, node.right))
     return Claim(_ask(node) if wanted else _not(_ask(node)), fields)
 
@@ -219,6 +251,10 @@ def _not(ask: Ask) -> Ask:
 
 def _of_peer(word: str) -> bool:
     return word not in DECISIONS and word in WORDS and WORDS[word].of_link
+
+
+def _is_of_view(node: Node) -> bool:
+    return any(isinstance(n, Name) and n.word not in DECISIONS and not _of_peer(n.word) for n in walk(node))
 
 
 def _is_of_peer(node: Node) -> bool:
@@ -291,9 +327,8 @@ def _logic(word: str, parts: tuple[Ask, ...]) -> Ask:
 
 def _binary(sign: str, left: Node, right: Node) -> Ask:
     compare = _COMPARE.get(sign)
-    if compare is not None and isinstance(left, Name) and left.word in DECISIONS and isinstance(right, Number):
-        at, bound = AT[left.word], right.value
-        return lambda _, link: compare(link[at], bound)
+    if sign in _FIELD and isinstance(left, Name) and left.word in DECISIONS and isinstance(right, Number):
+        return _FIELD[sign](AT[left.word], right.value)
     a = _ask(left)
     if compare is not None and isinstance(right, Number):
         value = right.value

@@ -25,7 +25,7 @@ from typing import NamedTuple
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.verification.invariants import Invariant, describe_directives, violations
 from sortie.policies.verification.past import Past
-from sortie.policies.verification.shield import Cap as Cap
+from sortie.policies.verification.shield import Ceilings as Ceilings
 from sortie.policies.verification.shield import enforce
 
 POLICY, STALENESS, DAMPING, NO_PEER = "policy", "staleness", "damping", "no peer"
@@ -62,11 +62,15 @@ def effective(directive: Directive) -> Directive:
 
 
 def put_right(
-    rules: Sequence[Invariant], view: FleetView, damped: Sequence[Directive], fresh: Sequence[Directive], cap: Cap
+    rules: Sequence[Invariant],
+    view: FleetView,
+    damped: Sequence[Directive],
+    fresh: Sequence[Directive],
+    ceilings: Ceilings | None,
 ) -> list[Directive]:
-    """The nearest directives that keep the rules within what ages allow; those that nothing can mend stay as they are."""
+    """The nearest directives that keep the rules below their ceilings; those that nothing can mend stay as they are."""
     acting = [effective(d) for d in damped]
-    shielded = enforce(rules, view, acting, fresh, cap)
+    shielded = enforce(rules, view, acting, fresh, ceilings)
     return [before if after == seen else after for before, seen, after in zip(damped, acting, shielded, strict=True)]
 
 

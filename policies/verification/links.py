@@ -5,7 +5,8 @@ The shield works on these. Only what replaces a directive becomes one again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import operator
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, Representation
@@ -36,6 +37,17 @@ AT = {word: at for at, word in enumerate(DECISIONS)}
 LEVEL, RHO, RATE_HZ, _, _, DUTY, ROI = AT.values()
 HIGHEST = tuple([1.0 if word in ("duty", "roi") else DIRECTIVE_BOUNDS[word].high for word in AT])
 """The upper bound of each field; the lower one is 0."""
+Compare = Callable[[Any, Any], Any]
+Limit = tuple[Compare, float]
+"""A comparison that a field must satisfy, and its other side."""
+Ceiling = tuple[tuple[int, Limit], ...]
+"""What a link may carry at most, for instance by the age of what is known about its peer: limits of fields, by their places."""
+
+
+def nothing_but_duty() -> Ceiling:
+    """The ceiling of a link that carries nothing. Its sender's duty cycle is still free."""
+    rests = as_link(Directive(0, 0))
+    return tuple([(at, (operator.eq, float(rests[at]))) for at in AT.values() if at != DUTY])
 
 
 def as_link(directive: Directive) -> Link:

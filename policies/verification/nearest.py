@@ -13,22 +13,32 @@ import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from sortie.policies.verification.boxes import Box, Limit, Values, allowed_any, near
-from sortie.policies.verification.compiled import Claim, Context, Part
-from sortie.policies.verification.links import HIGHEST, LEVEL, RATE_HZ, RHO, ROI, Far, Link, changed, distance, further
+from sortie.policies.verification.boxes import Box, Room, Values, allowed_any, near
+from sortie.policies.verification.compiled import Claim, Context, Part, Ways
+from sortie.policies.verification.links import (
+    HIGHEST,
+    LEVEL,
+    RATE_HZ,
+    RHO,
+    ROI,
+    Far,
+    Limit,
+    Link,
+    changed,
+    distance,
+    further,
+)
 
 MOST = 64
 """How many boxes are tried for one link. If none of them keeps all lines, the link stays as it is."""
-_Limits = Sequence[Values]
-"""What each field may be, by its place."""
 _Named = Mapping[int, float]
 """The values of fields that are named, by their places; other fields may follow them."""
-_Way = tuple[_Limits, _Named]
-"""Tighter limits, and the values that are named beside those before."""
-_Try = tuple[int, Far | None, int, _Limits, _Named, Link, _Named, Part | None]
+_Way = tuple[Room, _Named]
+"""A smaller room, and the values that are named beside those before."""
+_Try = tuple[int, Far | None, int, Room | None, _Named, Link, _Named, Ways | None]
 """A box within the box: how many conditions it makes false; how far its nearest link is, or a lower bound of that, and None
-where nothing else is as good; a number; its limits and named values; a link, and the values by which its nearest link differs
-from that; and the part whose condition is to be made false."""
+where nothing else is as good; a number; its room and named values; a link, and the values by which its nearest link differs
+from that; and how a condition is to be made false. Without a room it is the link."""
 
 
 def nearest(
@@ -36,53 +46,60 @@ def nearest(
     box: Box,
     also: tuple[Part, ...],
     context: Context,
-    allowed: Callable[[Link], bool],
 ) -> Link | None:
-    """The nearest link in the box that keeps the parts `also` and is allowed; None if none was found.
+    """The nearest link in the box that keeps the parts `also`; None if none was found.
 
     Args:
         before: the link.
         box: the lines that apply to it.
         also: parts of lines about several links.
         context: what all are judged on.
-        allowed: which links may replace others.
     """
     named: Any = box.clipped(before)
     if None in named.values():
         return None
     parts, region, number = box.parts + also, context.me.region, 0
     queue: list[_Try] = []
-    this: _Try = (0, _HERE, 0, box.limits, named, before, named, None)
+    this: _Try = (0, _HERE, 0, box.room, named, before, named, None)
     for _ in range(MOST):
-        exempted, far, _, limits, named, base, changes, exempts = this
-        if not limits:
+        exempted, far, _, room, named, base, changes, exempts = this
+        if room is None:
             return base
         after = changed(base, changes, region)
         ways: Sequence[_Way] = ()
         if after is None:
             pass
         elif exempts is not None:
-            ways = _mended(before, exempts.exempt, limits, named, context, after)
-        elif LEVEL in named and (back := _put_back(limits, named, before, after)) is not None:
+            ways = _mended(before, exempts, room, named, context, after)
+        elif (RHO not in named or RATE_HZ not in named) and (back := _put_back(room, named, before, after)) is not None:
             ways = back
-        elif (broken := _first_broken(parts, context, after)) is not None:
-            ways = _mended(before, broken.ways, limits, named, context, after)
-            if broken.exempt:
+        else:
+            for part in parts:
+                if not part.holds(context, after):
+                    ways = _mended(before, part.ways, room, named, context, after)
+                    if part.exempt is not None:
+                        number += 1
+                        far = far or further(_HERE, before, named)
+                        heapq.heappush(queue, (exempted + 1, far, number, room, named, after, _NO_CHANGE, part.exempt))
+                    break
+            else:
+                if not queue or (queue[0][:2] >= this[:2] and not _follows(before, named, after)):
+                    return after
                 number += 1
-                far = far or further(_HERE, before, named)
-                heapq.heappush(queue, (exempted + 1, far, number, limits, named, after, _NO_CHANGE, broken))
-        elif allowed(after):
-            if not queue or (queue[0][:2] >= this[:2] and not _follows(before, named, after)):
-                return after
-            number += 1
-            found = distance(before, after)
-            heapq.heappush(queue, (exempted, found, number, (), named, after, _NO_CHANGE, None))
+                found = distance(before, after)
+                heapq.heappush(queue, (exempted, found, number, None, named, after, _NO_CHANGE, None))
         # The only way is followed at once, without its distance, where all in the queue makes more conditions false.
         only = len(ways) == 1 and (not queue or queue[0][0] > exempted)
+        here = None if only or not ways else further(_HERE, before, named)
         for tighter, changes in ways:
             number += 1
             names = {**named, **changes}
-            far = None if only else further(_HERE, before, names)
+            if here is None:
+                far = None
+            elif len(names) == len(named) + len(changes):
+                far = further(here, before, changes)
+            else:  # a value takes another one's place
+                far = further(_HERE, before, names)
             if after is None or LEVEL in changes:  # other fields may follow, or no longer follow
                 this = (exempted, far, number, tighter, names, before, names, None)
             else:
@@ -105,70 +122,69 @@ def _follows(before: Link, named: _Named, after: Link) -> bool:
     return LEVEL in named and any(at not in named and before[at] != after[at] for at in (RHO, RATE_HZ))
 
 
-def _put_back(limits: _Limits, named: _Named, before: Link, after: Link) -> Sequence[_Way] | None:
+def _put_back(room: Room, named: _Named, before: Link, after: Link) -> Sequence[_Way] | None:
     """How to put back a field that followed the representation out of the box; None if none did."""
     for at in (RHO, RATE_HZ):
         now = after[at]
-        if at not in named and now != before[at] and limits[at].nearest(now) != now:
+        if at not in named and now != before[at] and room.values[at].nearest(now) != now:
             # A link that is to carry something keeps a rate; cells stay as near to what they were as may be.
-            value = limits[at].nearest(now if at == RATE_HZ else before[at])
-            return () if value is None else ((limits, {at: value}),)
+            value = room.values[at].nearest(now if at == RATE_HZ else before[at])
+            return () if value is None else ((room, {at: value}),)
     return None
 
 
-def _first_broken(parts: Iterable[Part], context: Context, link: Link) -> Part | None:
-    for part in parts:
-        if not part.holds(context, link):
-            return part
-    return None
-
-
-def _mended(
-    before: Link,
-    ways: Iterable[Sequence[Claim]],
-    within: _Limits,
-    named: _Named,
-    context: Context,
-    after: Link,
-) -> list[_Way]:
-    """The limits with which all claims of a way hold; none of a way that another drone or the view decides against."""
+def _mended(before: Link, ways: Ways, room: Room, named: _Named, context: Context, after: Link) -> list[_Way]:
+    """The rooms in which all claims of a way hold; none of a way that another drone or the view decides against."""
     found: list[_Way] = []
-    changes: dict[int, float]
-    for way in ways:
-        limits, changes, tied = list(within), {}, None
+    if ways.limits is not None:
+        for smaller, fields in room.within(ways):
+            if (changes := _nearest_in(fields, before, named)) is not None:
+                found.append((smaller, changes))
+        return found
+    for way in ways.claims:
+        tighter: dict[int, Values] = {}
+        tied = None
         for claim in way:
             if claim.value is not None and claim.compare is not None:
                 (at,) = claim.fields
-                values = limits[at].within((claim.compare, claim.value(context, after)))
-                if values is not limits[at]:
-                    limits[at], now = values, before[at]
-                    value = values.nearest(now)
-                    if value is None:
-                        break
-                    if value != now or at in named or at in changes:
-                        changes[at] = value
+                values = tighter.get(at, room.values[at]).within((claim.compare, claim.value(context, after)))
+                if values is not room.values[at]:
+                    tighter[at] = values
             elif not claim.holds(context, after):
                 if not claim.fields:
                     break
                 tied = tied or claim
         else:
-            if tied is None or limits != within:
-                found.append((limits, changes))
-            else:
-                found += _untied(tied, limits, context, after)
+            if tied is not None and not tighter:
+                found += _untied(tied, room, context, after)
+            elif (changes := _nearest_in(tighter.items(), before, named)) is not None:
+                found.append((room.having(tighter), changes))
     return found
 
 
-def _untied(tied: Claim, limits: _Limits, context: Context, after: Link) -> Iterator[_Way]:
+def _nearest_in(fields: Iterable[tuple[int, Values]], before: Link, named: _Named) -> dict[int, float] | None:
+    """The values nearest to those before, of fields that must change or are named; None if a field has none."""
+    changes: dict[int, float] = {}
+    for at, values in fields:
+        now = before[at]
+        value = values.nearest(now)
+        if value is None:
+            return None
+        if value != now or at in named:
+            changes[at] = value
+    return changes
+
+
+def _untied(tied: Claim, room: Room, context: Context, after: Link) -> Iterator[_Way]:
     """The ways to keep a claim about several fields by a change of one of them."""
-    values = [(at, _solved(tied, at, limits[at].limits, context, after)) for at in tied.fields]
-    if all(value is None for _, value in values):  # one field is not enough
-        values = [(at, v) for at in tied.fields for v in _helping(tied, at, limits[at].limits, context, after)]
-    for at, value in values:
+    limits = [values.limits for values in room.values]
+    changes = [(at, _solved(tied, at, limits[at], context, after)) for at in tied.fields]
+    if all(value is None for _, value in changes):  # one field is not enough
+        changes = [(at, v) for at in tied.fields for v in _helping(tied, at, limits[at], context, after)]
+    for at, value in changes:
         if value is not None:
-            tighter, side = list(limits), operator.le if value < after[at] else operator.ge
-            tighter[at] = limits[at].within((side, value))
-            yield tighter, {at: value}
+            side = operator.le if value < after[at] else operator.ge
+            yield room.having({at: room.values[at].within((side, value))}), {at: value}
 
 
 def _solved(claim: Claim, at: int, limits: Sequence[Limit], context: Context, after: Link) -> float | None:

@@ -15,26 +15,27 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import repeat
 from typing import Any, NamedTuple
 
 from sortie.policies.checks import check_directives
-from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetView, Policy, Representation
-from sortie.policies.verification.boxes import Box, box_of
-from sortie.policies.verification.compiled import Context, Part, Rule, compiled
+from sortie.policies.contract import Directive, Disc, FleetView, Policy
+from sortie.policies.verification.boxes import Box, Known, box_of
+from sortie.policies.verification.compiled import Context, Rule, compiled
 from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, Recent, just_heard
-from sortie.policies.verification.links import Far, Link, as_directive, as_link, distance
+from sortie.policies.verification.links import Ceiling, Far, Link, as_directive, as_link, distance
 from sortie.policies.verification.nearest import nearest
 from sortie.policies.verification.words import CHANGES
-from sortie.scenarios.representation import LEVELS, NAME_OF
+from sortie.scenarios.representation import NAME_OF
 
 MARK = "shield: "
 MOST_CHANGES = 128
 """How many changes of links are tried in a decision, beside one of each link for each line about several links that is broken."""
-Cap = Callable[[Directive], Directive]
-"""A directive as far as something allows it, such as the age of its peer's descriptor."""
+Ceilings = Mapping[int, Ceiling]
+"""What the link to each peer may carry at most."""
+_MOST_KNOWN = 1024
 _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
 
 
@@ -104,7 +105,7 @@ def enforce(
     view: FleetView,
     decided: Sequence[Directive],
     fresh: Sequence[Directive] = (),
-    cap: Cap | None = None,
+    ceilings: Ceilings | None = None,
 ) -> list[Directive]:
     """The directives; those that break a rule are replaced by the nearest ones that keep all rules.
 
@@ -113,7 +114,7 @@ def enforce(
         view: the policy's input.
         decided: its output.
         fresh: its output at age 0, if a rule needs it.
-        cap: gives a directive as far as it is allowed; None allows all.
+        ceilings: what the replacements may carry; None allows all.
     """
     me = view.me
     if me is None or not rules or not decided:
@@ -122,12 +123,12 @@ def enforce(
     known = {d.destination: as_link(d) for d in fresh}
     was = [as_link(d) for d in decided]
     context = Context(view, me, was, known)
-    boxes = _Boxes([line for line in lines if not line.of_links], context, decided, cap)
+    boxes = _Boxes([line for line in lines if not line.of_links], context, ceilings)
     directives, links, all_kept = _keep_alone(context, decided, boxes)
     several = [line for line in lines if line.of_links]
     if several:
         if any(line.of_link for line in several):
-            boxes = _Boxes([line for line in lines if line.of_link], context, decided, cap)
+            boxes = _Boxes([line for line in lines if line.of_link], context, ceilings)
         together = _Together(Context(view, me, links, known), was, several, boxes)
         all_kept = together.keep_all() and all_kept
         links = together.change(directives, decided)
@@ -150,27 +151,38 @@ def _keep_alone(
     """The directives, those changed that break a line about one link; as links too; and whether all of these lines are kept."""
     directives, links, all_kept = list(decided), list(context.links), True
     region = context.me.region
-    seen: dict[Any, tuple[tuple[int, ...], dict[Box, Link | None]]] = {}
+    seen: dict[Box, Known] = {}
     for k, link in enumerate(context.links):
         box = boxes.of[k]
-        key = box, box.key(link) or k
-        known = seen.get(key)
+        of_box = seen.setdefault(box, {}) if box.known is None else box.known[region is not None]
+        key = box.key(link)
+        known = of_box.get(key) if key is not None else None
         if known is None:
-            known = seen[key] = box.broken(context, link), {}
-        broken, nearest_to = known
+            known = link, box.broken(context, link), {}
+            if key is not None:
+                if len(of_box) == _MOST_KNOWN:
+                    of_box.clear()
+                of_box[key] = known
+        first, broken, nearest_to = known
         if broken:
-            within = boxes.capped(k)
+            within = boxes.within(k)
             if within not in nearest_to:
-                nearest_to[within] = boxes.nearest(k, within, (), context)
+                nearest_to[within] = nearest(first, within, (), context)
             after = nearest_to[within]
             if after is None:
                 all_kept = False
                 continue
-            if after.destination != link.destination:
-                after = Link(*after[:-1], link.destination)
+            if first is not link:
+                after = _alike(first, after, link)
             directives[k] = _replaced(decided[k], link, after, region, _texts(box, broken))
             links[k] = after
     return directives, links, all_kept
+
+
+def _alike(first: Link, after: Link, link: Link) -> Link:
+    """A link with equal fields as the first one, changed as that one was: what stays is its own (5 is not written as 5.0)."""
+    fields = [own if now is was else now for was, now, own in zip(first, after, link, strict=True)]
+    return tuple.__new__(Link, fields)
 
 
 @lru_cache(maxsize=1024)
@@ -181,56 +193,31 @@ def _texts(box: Box, broken: tuple[int, ...]) -> str:
 class _Boxes:
     """What the lines about one link each allow each link. Links to which the same lines apply share a box."""
 
-    def __init__(self, lines: Sequence[Rule], context: Context, decided: Sequence[Directive], cap: Cap | None) -> None:
-        self._decided, self._context, self._cap = decided, context, cap
+    def __init__(self, lines: Sequence[Rule], context: Context, ceilings: Ceilings | None) -> None:
+        self._context, self._ceilings = context, ceilings
         some = context.links[0]
         self._lines = [r for r in lines if r.when_of_view is None or r.when_of_view(context, some)]
         self._boxes: dict[Any, Box] = {}
         asked = [r.when_of_peer for r in self._lines if r.when_of_peer is not None]
         answers = [map(bool, map(when, repeat(context), context.links)) for when in asked]
         self._applies = list(zip(*answers, strict=True)) if asked else [()] * len(context.links)
-        self.of = [self._box(applies, None) for applies in self._applies]
+        of = {applies: self._box(applies, ()) for applies in set(self._applies)}
+        self.of = [of[applies] for applies in self._applies]
 
-    def capped(self, k: int) -> Box:
-        """A link's box within what it is allowed at most."""
-        if self._cap is None:
-            return self.of[k]
-        link = self._decided[k]
-        full = Directive(link.source, link.destination, Representation.RAW, 1.0, None, _MOST_HZ)
-        most = self._cap(full)
-        if most is full:
-            return self.of[k]
-        return self._box(self._applies[k], (float(LEVELS[most.representation]), most.rate_hz))
+    def within(self, k: int) -> Box:
+        """A link's box below its ceiling."""
+        ceiling = () if self._ceilings is None else self._ceilings[self._context.links[k].destination]
+        return self._box(self._applies[k], ceiling) if ceiling else self.of[k]
 
-    def _box(self, applies: tuple[bool, ...], most: tuple[float, float] | None) -> Box:
-        key = applies, most
+    def _box(self, applies: tuple[bool, ...], ceiling: Ceiling) -> Box:
+        key = applies, ceiling
         if key not in self._boxes:
             answers = iter(applies)
             rules = tuple([r for r in self._lines if r.when_of_peer is None or next(answers)])
             some = self._context.links[0]
-            self._boxes[key] = box_of(
-                rules, tuple([side(self._context, some) for r in rules for side in r.sides]), most
-            )
+            sides = tuple([side(self._context, some) for r in rules for side in r.sides])
+            self._boxes[key] = box_of(rules, sides, ceiling)
         return self._boxes[key]
-
-    def nearest(self, k: int, box: Box, also: tuple[Part, ...], context: Context) -> Link | None:
-        """The link nearest to the decided one that keeps its lines and other parts, and is allowed."""
-        cap, before = self._cap, self._context.links[k]
-        if cap is None or box is self.of[k]:
-            return nearest(before, box, also, context, _any)
-
-        def allowed(link: Link) -> bool:
-            directive = as_directive(self._decided[k], before, link, context.me.region, "")
-            return cap(directive) == directive
-
-        return nearest(before, box, also, context, allowed)
-
-
-def _any(_: Link) -> bool:
-    return True
-
-
-_MOST_HZ = DIRECTIVE_BOUNDS["rate_hz"].high
 
 
 _Asked = tuple[int, int | None]
@@ -349,7 +336,7 @@ class _Together:
         found: list[_Change] = []
         for k in links:
             if k not in this.keeps:
-                box = self._boxes.capped(k)
+                box = self._boxes.within(k)
                 key = id(box), box.key(self._decided[k]) if self._alike else None
                 if key[1] is None or key not in alike:  # another link would change by as much
                     alike.add(key)
@@ -370,9 +357,9 @@ class _Together:
     def _change(self, this: _Plan, k: int, numbers: tuple[int, ...]) -> list[_Change]:
         """The nearest change by which a link keeps these lines, if there is one."""
         self._count += 1
-        before, now, box = self._decided[k], this.context.links[k], self._boxes.capped(k)
+        before, now, box = self._decided[k], this.context.links[k], self._boxes.within(k)
         parts = tuple([part for n in numbers for part in self._lines[n].parts])
-        after = self._boxes.nearest(k, box, parts, this.context)
+        after = nearest(before, box, parts, this.context)
         if after is None or after == now:
             return []
         was, is_now = (0, 0.0) if now is before else distance(before, now), distance(before, after)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from sortie.fleet.staleness import cap_by_age, health
+from sortie.fleet.staleness import CEILING, cap_by_age, health
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, nothing
 from sortie.policies.damping import DampedLink, damp
@@ -79,19 +79,16 @@ class ClosedLoop:
             if peer != me
         }
 
-        def cap(directive: Directive) -> Directive:
-            peer = directive.destination
-            return cap_by_age(directive, fidelity[peer], view.age_s[peer])
-
         asked_of, steps = {d.destination: d for d in decided}, []
         for peer in fidelity:
             asked = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive")
             link = self._links.get(peer) or DampedLink(nothing(me, peer, ""))
-            by_age = cap(asked)
+            by_age = cap_by_age(asked, fidelity[peer], view.age_s[peer])
             link = self._links[peer] = damp(link, by_age, now_s, times.dwell_s)
             steps.append(Steps(asked, by_age, link.enforced))
         damped = [s.damped for s in steps]
-        self.enforced = put_right(self._rules, view, damped, fresh, cap) if times.shielded else damped
+        ceilings = {peer: CEILING[link] for peer, link in fidelity.items()}
+        self.enforced = put_right(self._rules, view, damped, fresh, ceilings) if times.shielded else damped
         self.past.note(now_s, [effective(d) for d in self.enforced])
         return judge(self._rules, view, steps, self.enforced, fresh, self.past)
 

@@ -29,7 +29,7 @@ from sortie.policies.contract import (
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
 from sortie.policies.verification.age_rule import raised_part
-from sortie.policies.verification.enforced import Cap, Steps, effective, judge, put_right
+from sortie.policies.verification.enforced import Ceilings, Steps, effective, judge, put_right
 from sortie.policies.verification.invariants import (
     Invariant,
     InvariantError,
@@ -305,10 +305,10 @@ class Pilot:
         """Has the last word on what the gates enforce; None where there are no invariants."""
         return self._keep_invariants if self._rules else None
 
-    def _keep_invariants(self, view: FleetView, links: Sequence[Steps], cap: Cap) -> Sequence[Directive]:
+    def _keep_invariants(self, view: FleetView, links: Sequence[Steps], ceilings: Ceilings) -> Sequence[Directive]:
         """Judge what the gates are to enforce. With a shield, links are put right within what their ages allow."""
         damped = [link.damped for link in links]
-        enforced = put_right(self._rules, view, damped, self._fresh, cap) if self._shielded else damped
+        enforced = put_right(self._rules, view, damped, self._fresh, ceilings) if self._shielded else damped
         replaced = {d.destination: d for before, d in zip(damped, enforced, strict=True) if d is not before}
         for peer, directive in replaced.items():
             if directive != self._replaced.get(peer):

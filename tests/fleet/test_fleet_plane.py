@@ -11,8 +11,9 @@ from sortie.fleet import gate
 from sortie.fleet.coverage import footprint_radius_m, pack_grid, unpack_grid
 from sortie.fleet.gate import Gate, make_payload
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
-from sortie.fleet.staleness import LinkHealth, cap_by_age, health
+from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age, health
 from sortie.policies.contract import Directive, Disc, Representation
+from sortie.policies.verification.links import as_link
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 ORIGIN = (0.0, 0.0, 0.0)
@@ -45,6 +46,18 @@ def test_a_degraded_link_carries_detections_slowly_and_a_detached_one_nothing() 
     assert detached.representation == Representation.NONE
     assert detached.reason == "detached: never heard"
     assert cap_by_age(FULL, LinkHealth.FRESH, 0.1) is FULL
+
+
+NUMBERS = st.sampled_from([0.0, 0.1, 0.5, 1.0, 2.0, 5.0])
+
+
+@given(st.builds(Directive, st.just(0), st.just(1), st.sampled_from(Representation), st.sampled_from([0.0, 0.5]),
+                 st.sampled_from([None, Disc(0.0, 0.0, 5.0)]), NUMBERS, NUMBERS, st.sampled_from([0.5, 1.0])),
+       st.sampled_from(LinkHealth))  # fmt: skip
+def test_a_ceiling_allows_the_directives_that_age_leaves_as_they_are(asked: Directive, health: LinkHealth) -> None:
+    link = as_link(asked)
+    below = all(compare(link[at], value) for at, (compare, value) in CEILING[health])
+    assert below == (cap_by_age(asked, health, 0.5) == asked)
 
 
 @given(st.sampled_from(Representation), st.floats(0, 30), st.floats(0, 1), st.floats(0, 20), st.floats(0, 20))

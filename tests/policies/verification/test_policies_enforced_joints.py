@@ -9,6 +9,8 @@
 
 from __future__ import annotations
 
+import operator
+
 import pytest
 from policies_examples import fleet_of
 
@@ -18,12 +20,14 @@ from sortie.policies.verification.enforced import (
     NO_PEER,
     POLICY,
     STALENESS,
+    Ceilings,
     Steps,
     effective,
     judge,
     put_right,
 )
 from sortie.policies.verification.invariants import parse, violations
+from sortie.policies.verification.links import LEVEL, RATE_HZ
 from sortie.policies.verification.past import Past
 from sortie.policies.verification.shield import enforce, shield
 
@@ -36,10 +40,6 @@ def link(peer: int, rung: Representation = FEATURES, rate_hz: float = 5.0, rho: 
     return Directive(0, peer, rung, rho if rung == FEATURES else 0.0, rate_hz=rate_hz, reason="r")
 
 
-def all_allowed(directive: Directive) -> Directive:
-    return directive
-
-
 def test_a_gate_at_0_hz_acts_as_one_that_sends_nothing() -> None:
     resting = link(1, rate_hz=0.0)
     assert effective(resting) == resting._replace(representation=NONE, rho=0.0)
@@ -49,45 +49,39 @@ def test_a_gate_at_0_hz_acts_as_one_that_sends_nothing() -> None:
 
 def test_what_keeps_the_lines_stays_as_it_is_written() -> None:
     damped = [link(1, rate_hz=0.0), link(2), link(3, NONE, 0.0)]
-    kept = put_right(parse("representation <= features"), VIEW, damped, (), all_allowed)
+    kept = put_right(parse("representation <= features"), VIEW, damped, (), None)
     assert all(a is b for a, b in zip(kept, damped, strict=True))
 
 
 def test_a_link_that_rests_is_put_right_as_one_that_carries_nothing() -> None:
     damped = [link(1, rate_hz=0.0), link(2), link(3)]
-    first, *rest = put_right(parse("representation >= detections"), VIEW, damped, (), all_allowed)
+    first, *rest = put_right(parse("representation >= detections"), VIEW, damped, (), None)
     assert (first.representation, first.rho, first.rate_hz) == (DETECTIONS, 0.0, 2.0)
     assert rest == damped[1:]
 
 
 def test_a_limit_is_each_links_own() -> None:
-    def cap(directive: Directive) -> Directive:
-        if directive.destination == 1 and directive.representation > NONE:
-            return directive._replace(representation=NONE, rho=0.0, rate_hz=0.0)
-        return directive._replace(rate_hz=min(directive.rate_hz, 4.0)) if directive.destination == 2 else directive
-
+    ceilings: Ceilings = {1: ((LEVEL, (operator.le, 0.0)),), 2: ((RATE_HZ, (operator.le, 4.0)),), 3: ()}
     damped = [link(peer, NONE, 0.0) for peer in (1, 2, 3)]
-    first, second, third = put_right(parse("rate_hz >= 3 and representation >= features"), VIEW, damped, (), cap)
+    first, second, third = put_right(parse("rate_hz >= 3 and representation >= features"), VIEW, damped, (), ceilings)
     assert first is damped[0]  # nothing that is allowed mends it
     assert [(d.representation, d.rate_hz) for d in (second, third)] == [(FEATURES, 3.0)] * 2
-    slow = put_right(parse("rate_hz >= 5"), VIEW, [link(2, rate_hz=1.0), link(3, rate_hz=1.0)], (), cap)
+    slow = put_right(parse("rate_hz >= 5"), VIEW, [link(2, rate_hz=1.0), link(3, rate_hz=1.0)], (), ceilings)
     assert [d.rate_hz for d in slow] == [1.0, 5.0]
 
 
 def test_at_the_gate_a_line_compares_with_what_the_policy_decides_at_age_0() -> None:
     damped = [link(peer, rate_hz=10.0) for peer in (1, 2, 3)]
     fresh = [link(1, rate_hz=2.0), link(2, rate_hz=10.0), link(3, rate_hz=5.0)]
-    found = put_right(parse("rate_hz <= fresh.rate_hz"), VIEW, damped, fresh, all_allowed)
+    found = put_right(parse("rate_hz <= fresh.rate_hz"), VIEW, damped, fresh, None)
     assert [d.rate_hz for d in found] == [2.0, 10.0, 5.0]
 
 
 def test_a_line_about_age_is_kept_on_links_to_who_is_gone() -> None:
     damped = [link(peer) for peer in (1, 2, 3)]
-    found = put_right(parse("when age_s > 1: rate_hz <= 2"), GONE, damped, (), all_allowed)
+    found = put_right(parse("when age_s > 1: rate_hz <= 2"), GONE, damped, (), None)
     assert [d.rate_hz for d in found] == [5.0, 5.0, 2.0]
-    both = put_right(
-        parse("when age_s > 1: rate_hz <= 2\nwhen age_s <= 1: rate_hz >= 7"), GONE, damped, (), all_allowed
-    )
+    both = put_right(parse("when age_s > 1: rate_hz <= 2\nwhen age_s <= 1: rate_hz >= 7"), GONE, damped, (), None)
     assert [d.rate_hz for d in both] == [7.0, 7.0, 2.0]
 
 

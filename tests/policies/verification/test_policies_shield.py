@@ -12,6 +12,7 @@ from policies_examples import fleet_of, planted
 from sortie.policies.catalogue.baselines import everyone, silence
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, Disc, FleetView, Policy, Representation, TaskPhase
+from sortie.policies.verification.boxes import _plain_box
 from sortie.policies.verification.conformance import conform, failing
 from sortie.policies.verification.invariants import InvariantError, just_heard, parse, violations
 from sortie.policies.verification.links import as_link, distance
@@ -222,6 +223,31 @@ def test_what_a_shield_keeps_between_decisions_does_not_change_its_answers() -> 
         after = {d.destination: d for d in enforce(rules, view, decided)}
         assert [after[p].rate_hz for p in (1, 2)] == [10 * own, 10 * own]
         assert (after[low].rho, after[3 - low].rho) == (0.1, 0.4)
+
+
+@pytest.mark.parametrize(
+    "line", ["rho <= 0.5", "rate_hz <= 10 * battery or rho == 1", "roi or rate_hz <= 1 and rho <= 0.2"]
+)
+@pytest.mark.parametrize("seed", range(6))
+def test_a_decision_does_not_depend_on_what_was_decided_before(seed: int, line: str) -> None:
+    """The same numbers as other types, from a drone with a region and from one without, at another charge."""
+    draw = Random(seed)
+    text, view = f"{some_lines(draw)}\n{line}", fleet_of(3)
+    decided = [draw.choice(on_the_grid(Directive(view.ego, peer))) for peer in view.peers]
+    decided = [d._replace(rate_hz=float(draw.randint(0, 12)), fusion_weight=0.0) for d in decided]
+    cases = []
+    for region, charge in itertools.product((Disc(0.0, 0.0, 50.0), None), (0.9, 0.2)):
+        me = view.me._replace(region=region, battery_soc=charge)
+        seen = view._replace(descriptors={**view.descriptors, view.ego: me})
+        of_drone = [d._replace(roi=region if d.roi else None) for d in decided]
+        whole = [d._replace(rate_hz=int(d.rate_hz), fusion_weight=-0.0) for d in of_drone]
+        cases += [(seen, of_drone), (seen, whole)]
+    alone = []
+    for seen, links in cases:
+        _plain_box.cache_clear()  # nothing is remembered
+        alone.append(repr(enforce(parse(text), seen, links)))
+    for k in draw.choices(range(len(cases)), k=40):
+        assert repr(enforce(parse(text), *cases[k])) == alone[k], text
 
 
 def test_links_that_share_a_correction_keep_their_own_region_and_reason() -> None:
