@@ -165,13 +165,17 @@ def judge(
         standing = before[peer]
         doubt = ""
         if peer != ego:
-            came = arrivals.get(peer, ()) if claim.counts(ego) else ()  # who leaves the ego out claims no goodput to it
+            came = arrivals.get(peer)
             others_fell = 0.0
             if peer not in stations:
                 others_fell = _median_without(by_fall, fell_per_s[peer]) * standing.elapsed
             doubt = (
                 (_coverage_doubt(cells[peer], peer in looking) if cells else "")
-                or goodput_doubt(claim.goodput_to(ego), came, goodput_step_mbps)
+                or (
+                    goodput_doubt(claim.goodput_to(ego), came, goodput_step_mbps)
+                    if came and claim.counts(ego)  # who leaves the ego out claims no goodput to it
+                    else ""
+                )
                 or battery_doubt(
                     claim.battery_soc,
                     standing.least_soc,

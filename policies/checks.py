@@ -62,10 +62,12 @@ def differing(before: Sequence[Directive], directives: Sequence[Directive], view
     if (type(directives) is not tuple and type(directives) is not list) or len(before) != len(directives):
         return None
     moved = list(map(operator.is_not, directives, before))
-    changed, were = list(compress(directives, moved)), {d.destination: d for d in compress(before, moved)}
-    if not _is_plainly_valid(changed, view) or {d.destination for d in changed} != were.keys():
+    changed, were = list(compress(directives, moved)), list(compress(before, moved))
+    old = set(map(id, were))
+    new = [d for d in changed if id(d) not in old]  # others have only another place in the answer
+    if not _is_plainly_valid(new, view) or {d.destination for d in changed} != {d.destination for d in were}:
         return None
-    return [d for d in changed if d is not were[d.destination]]  # others have only another place in the answer
+    return new
 
 
 def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:

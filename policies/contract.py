@@ -381,7 +381,8 @@ def looks_from(viewpoint: Callable[..., Reposition | None]) -> Callable[[AnyPoli
 
 OTHER_NETWORK = "another network: it cannot fuse this drone's maps"
 # slow to look up, each time
-_FEATURES, _CODES, _DETECTIONS = Representation.FEATURES, Representation.CODES, Representation.DETECTIONS
+_NONE, _FEATURES = Representation.NONE, Representation.FEATURES
+_CODES, _DETECTIONS = Representation.CODES, Representation.DETECTIONS
 
 
 def boxes_across_networks(policy: AnyPolicy) -> AnyPolicy:
@@ -395,10 +396,13 @@ def boxes_across_networks(policy: AnyPolicy) -> AnyPolicy:
     def decide(view: FleetView, **params: object) -> Sequence[Directive]:
         directives = policy(view, **params)
         foreign = [
-            (d.representation == _FEATURES and not view.shares_features_with(d.destination))
-            or (d.representation == _CODES and not view.shares_codes_with(d.destination))
+            d[2] is not _NONE  # as most links carry nothing
+            and (
+                (d[2] == _FEATURES and not view.shares_features_with(d.destination))
+                or (d[2] == _CODES and not view.shares_codes_with(d.destination))
+            )
             for d in directives
-        ]  # fmt: skip
+        ]
         if not any(foreign):
             return directives
         return [
