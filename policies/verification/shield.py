@@ -35,7 +35,8 @@ MOST_CHANGES = 128
 """How many changes of links are tried in a decision, beside one of each link for each line about several links that is broken."""
 Ceilings = Mapping[int, Ceiling]
 """What the link to each peer may carry at most."""
-_MOST_KNOWN = 1024
+_MOST_KNOWN = 512
+"""Corrections that a box remembers, of senders with a region and without one each."""
 _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
 
 
