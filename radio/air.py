@@ -227,7 +227,7 @@ class Air:
 
     # --- context ---------------------------------------------------------------------------------
 
-    def broadcast(self, sender: int, payload_bytes: int, on_heard: OnHeard) -> None:
+    def broadcast(self, sender: int, payload_bytes: int, on_heard: OnHeard, in_s: float | None = None) -> None:
         """Put one group-addressed frame on the air: no ack, no retry, basic rate.
 
         Args:
@@ -235,13 +235,17 @@ class Air:
             payload_bytes: 1 … 2200.
             on_heard: called once, at the frame's end, with the ids of the drones that received it, ascending
                 (none if it collided).
+            in_s: time until it reaches the radio, ≥ 0; None is the drone's own phase (see `publish_spread`).
 
         Raises:
             ValueError: if an argument is out of its bounds.
         """
         if sender in self._gone:
             return
-        self.medium.announce(self._broadcasts.frame(sender, payload_bytes, on_heard), self._broadcasts.phase_s[sender])
+        if in_s is not None and not in_s >= 0.0:
+            raise ValueError(f"in_s is {in_s!r}, must be at least 0")
+        frame = self._broadcasts.frame(sender, payload_bytes, on_heard)
+        self.medium.announce(frame, self._broadcasts.phase_s[sender] if in_s is None else in_s)
 
     # --- data ------------------------------------------------------------------------------------
 
