@@ -22,7 +22,7 @@ import simpy
 from numpy.typing import ArrayLike, NDArray
 
 from sortie.radio.channel.earshot import LinkList
-from sortie.radio.channel.snr import SQUARE, Channel, FloatArray, Jammer
+from sortie.radio.channel.snr import SQUARE, Channel, FloatArray, Jammer, linear
 from sortie.radio.channel.traces import read_links
 from sortie.radio.counters import Counters
 from sortie.radio.goodput import Goodput
@@ -122,7 +122,7 @@ class Air:
         self._links: LinkList | None = None
         self._link_lists: tuple[NDArray[np.int64], NDArray[np.int64]]
         self._service = Service(settings, self.channel.noise_dbm)
-        self._uses: dict[tuple[int, int], tuple[int, Use]] = {}  # of each link with unicast traffic, and its frame
+        self._uses: dict[tuple[int, int], tuple[int, Use, float]] = {}  # in this frame, of links with unicast traffic
         self._rows_db: tuple[list[list[float]], list[list[float]]] | None = None  # of this frame, made at first use
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
@@ -141,8 +141,7 @@ class Air:
             self._overrides.advance(extra_loss_db, self.channel.noise_rise_db(jammers) if jammers else None)
         if self._routes is not None:
             self._routes.renew(self.link_mbps())
-        for sender in range(self._n):
-            self._drained(sender)  # what has arrived so far went over the links as they were
+        self._book_all()  # what has arrived so far went over the links as they were
         self._retune()
         self._set_links()
 
@@ -154,44 +153,45 @@ class Air:
             begin = np.asarray(links.begin, np.int64)
             receiver = links.receiver if links.is_square else links.receiver[links.by_sender]
             self._link_lists = begin, np.ascontiguousarray(receiver, np.int64)
-        sender, receiver = links.sender, links.receiver
-        snr_db, extra = self.channel.now.snr_db, None
-        if given is not None:
+        extra = None
+        if given is None:
+            gain = self.channel.now.gain
+        else:
+            sender, receiver = links.sender, links.receiver
             square_db, traced, loss = given.snr_db(self.channel.snr_db), given.traced, given.group_loss()
             answers = traced.T & ~traced  # the way back of a traced link carries answers, and descriptors by its SNR
             loss[answers & (square_db < self._service.least_snr_db)] = 1.0
-            snr_db = np.where(traced | answers, HEARD_DB, square_db)[sender, receiver]
+            gain = linear(np.where(traced | answers, HEARD_DB, square_db)[sender, receiver])
             extra = loss[sender, receiver]
         if not links.is_square:
-            snr_db = snr_db[links.by_sender]
+            gain = gain[links.by_sender]
             extra = None if extra is None else extra[links.by_sender]
-        gain = np.nan_to_num(10.0 ** (np.asarray(snr_db, float) / 10.0))
         self.medium.set_links(*self._link_lists, gain, is_square=links.is_square, frame=self.channel.frame, extra=extra)
 
     def _retune(self) -> None:
         """The links, or who is there, have changed: find out anew how those with traffic are used."""
         self._uses = {}
-        for sender in range(self._n):
-            for k, s in enumerate(self.medium.queued(sender)):
-                use = self._use(s.sender, s.receiver)
+        for queue in self.medium.queues():
+            for k, s in enumerate(queue):
+                _, use, snr_db = self._use(s.sender, s.receiver)
                 if k == 0:
-                    self._service.begin(s, use, self._env.now, fresh=False)
+                    self._service.begin(s, use, snr_db, self._env.now, fresh=False)
 
-    def _use(self, sender: int, receiver: int) -> Use:
-        """How a link is used in this frame."""
+    def _use(self, sender: int, receiver: int) -> tuple[int, Use, float]:
+        """How a link is used in this frame: the medium's number for it, its use, and its mean SNR as it is."""
         found = self._uses.get((sender, receiver))
-        if found is not None:
-            return found[1]
-        now, medium = self._env.now, self.medium
-        flow = medium.flow(sender, receiver)
-        minstrel = self._service.minstrel
-        if minstrel is not None:
-            minstrel.sent(sender, receiver, now, medium.learned(flow).tolist())
-        given = None if self._overrides is None else self._overrides.link(sender, receiver)
-        use = self._service.use(sender, receiver, now, *self._snr_of(sender, receiver), receiver in self._gone, given)
-        medium.tune(flow, use.link)
-        self._uses[sender, receiver] = flow, use
-        return use
+        if found is None:
+            now_s, medium = self._env.now, self.medium
+            flow = medium.flow(sender, receiver)
+            minstrel = self._service.minstrel
+            if minstrel is not None:
+                minstrel.sent(sender, receiver, now_s, medium.learned(flow).tolist())
+            given = None if self._overrides is None else self._overrides.link(sender, receiver)
+            known_db, snr_db = self._snr_of(sender, receiver)
+            use = self._service.use(sender, receiver, now_s, known_db, receiver in self._gone, given)
+            medium.tune(flow, use.link)
+            found = self._uses[sender, receiver] = flow, use, snr_db
+        return found
 
     def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
         """From the next frame on the fleet flies another way (see `Channel.reroute`)."""
@@ -227,7 +227,7 @@ class Air:
 
     # --- context ---------------------------------------------------------------------------------
 
-    def broadcast(self, sender: int, payload_bytes: int, on_heard: OnHeard) -> None:
+    def broadcast(self, sender: int, payload_bytes: int, on_heard: OnHeard, in_s: float | None = None) -> None:
         """Put one group-addressed frame on the air: no ack, no retry, basic rate.
 
         Args:
@@ -235,13 +235,17 @@ class Air:
             payload_bytes: 1 … 2200.
             on_heard: called once, at the frame's end, with the ids of the drones that received it, ascending
                 (none if it collided).
+            in_s: time until it reaches the radio, ≥ 0; None is the drone's own phase (see `publish_spread`).
 
         Raises:
             ValueError: if an argument is out of its bounds.
         """
         if sender in self._gone:
             return
-        self.medium.announce(self._broadcasts.frame(sender, payload_bytes, on_heard), self._broadcasts.phase_s[sender])
+        if in_s is not None and not in_s >= 0.0:
+            raise ValueError(f"in_s is {in_s!r}, must be at least 0")
+        frame = self._broadcasts.frame(sender, payload_bytes, on_heard)
+        self.medium.announce(frame, self._broadcasts.phase_s[sender] if in_s is None else in_s)
 
     # --- data ------------------------------------------------------------------------------------
 
@@ -289,32 +293,29 @@ class Air:
         number = self._numbers
         self._numbers = number + 1
         hop = receiver if self._routes is None else self._routes.next_hop(sender, receiver, self._routes.max_hops)
-        s = Sample(
+        drained_bits, gone = self._drained(sender, now), sender in self._gone
+        flow, _, snr_db = (-1, None, self._snr_of(sender, hop)[1]) if gone else self._use(sender, hop)
+        s = self._in_flight[number] = Sample(
             number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
-            fragments(payload_bytes, piece_bytes or self._settings.fragment_bytes),
-            self._snr_of(sender, hop)[1], self._drained(sender), piece_bytes or 0,
+            fragments(payload_bytes, piece_bytes or self._settings.fragment_bytes), snr_db, drained_bits, piece_bytes or 0,
         )  # fmt: skip
-        s.receiver = hop
-        self._in_flight[number] = s
+        s.receiver, s.flow = hop, flow
         self.counters.data_sent_bytes += payload_bytes
-        if sender in self._gone:
+        if gone:
             s.live = False
             self._env.timeout(0.0, s).callbacks.append(self._refuse)
-            return number
-        self._queue(s)
+        else:
+            self._queue(s)
         return number
 
     def _queue(self, s: Sample) -> None:
         """Hand a sample to its sender's queue; there the newest of its kind stands for an older one."""
-        self._use(s.sender, s.receiver)
-        s.flow = self._uses[s.sender, s.receiver][0]
         self._service.prepare(s)
-        key = (s.sender, s.origin, s.target, s.kind)
-        old = self._latest.get(key)
+        old = self._latest.get(s.key)
         if old is not None and old.number > s.number:  # it came over a longer way
-            self._close(s, _EXPIRED, "replaced")
+            self._close(s, _EXPIRED, "replaced", self._env.now)
             return
-        self._latest[key] = s
+        self._latest[s.key] = s
         if old is None:
             self.medium.submit(s)
         elif old.live:
@@ -322,10 +323,10 @@ class Air:
             self._book(old)
             self.medium.replace(old, s)
             self._measure(old, served, self._env.now)
-            self._close(old, _EXPIRED, "replaced")
+            self._close(old, _EXPIRED, "replaced", self._env.now)
         else:  # it waits for its repair, outside the medium
             self.medium.submit(s)
-            self._close(old, _EXPIRED, "replaced")
+            self._close(old, _EXPIRED, "replaced", self._env.now)
 
     def silence(self, drone: int) -> None:
         """A drone is lost or has landed: its queue is dropped, and nothing reaches it from now on.
@@ -340,7 +341,7 @@ class Air:
             if s.number in self._in_flight:  # no earlier one's callback has settled it
                 if s.live:
                     self.medium.withdraw(s)
-                self._close(s, _LOST, "sender_gone")
+                self._close(s, _LOST, "sender_gone", self._env.now)
         self._others_changed()
 
     def wake(self, drone: int) -> None:
@@ -351,19 +352,19 @@ class Air:
     def _others_changed(self) -> None:
         if self.channel.frame >= 0:
             self.medium.sync()
-            for sender in range(self._n):
-                self._drained(sender)  # what has been sent so far went to who was there
+            self._book_all()  # what has been sent so far went to who was there
             self._retune()
             self.medium.replan()
 
     def _refuse(self, event: simpy.Event) -> None:
         s = cast(Sample, event.value)
         if s.number in self._in_flight:
-            self._close(s, _LOST, "sender_gone")
+            self._close(s, _LOST, "sender_gone", self._env.now)
 
     def _begin(self, s: Sample, now_s: float) -> None:
         """A sample comes to the head of its queue."""
-        self._service.begin(s, self._use(s.sender, s.receiver), now_s, fresh=True)
+        _, use, snr_db = self._use(s.sender, s.receiver)
+        self._service.begin(s, use, snr_db, now_s, fresh=True)
 
     def _snr_of(self, sender: int, receiver: int) -> tuple[float, float]:
         """Mean SNR of a link as its sender knows it, from the frame before, and as it is."""
@@ -382,10 +383,10 @@ class Air:
             queued = how is _DEADLINE_QUEUED and s.repairs == s.repairs_before
             if queued and s.hops == 1:  # it may have come to the head at this very instant
                 s.t_first_s = nan
-            self._close(s, _EXPIRED, "deadline_queued" if queued else "deadline_in_service")
+            self._close(s, _EXPIRED, "deadline_queued" if queued else "deadline_in_service", now_s)
             return
         if how is _UNREACHABLE:
-            self._close(s, _LOST, s.unreachable or "no_link")
+            self._close(s, _LOST, s.unreachable or "no_link", now_s)
             return
         if s.reliable:
             s.wire_bytes += repair_wire_bytes(s.left)
@@ -398,9 +399,9 @@ class Air:
         elif s.receiver != s.target and (lost == 0 or any(map(len, s.arrived))):
             self._forward(s, now_s)
         elif lost == 0 and s.is_whole():
-            self._close(s, _DELIVERED, "")
+            self._close(s, _DELIVERED, "", now_s)
         else:
-            self._close(s, _LOST, "fragment_lost")
+            self._close(s, _LOST, "fragment_lost", now_s)
 
     def _forward(self, s: Sample, now_s: float) -> None:
         """A relay has it: on to the next hop, as the links are now."""
@@ -408,32 +409,32 @@ class Air:
         self._forget(s)
         here = s.receiver
         hop = self._routes.next_hop(here, s.target, self._routes.max_hops - s.hops)
-        s.forward(here, hop, now_s, self._drained(here))
+        s.forward(here, hop, now_s, self._drained(here, now_s))
+        s.flow, _, _ = self._use(here, hop)
         self._queue(s)
 
     def _forget(self, s: Sample) -> None:
-        key = (s.sender, s.origin, s.target, s.kind)
-        if self._latest.get(key) is s:
-            del self._latest[key]
+        if self._latest.get(s.key) is s:
+            del self._latest[s.key]
 
     def _repair(self, event: simpy.Event) -> None:
         s = cast(Sample, event.value)
         if s.number not in self._in_flight:
             return  # replaced or silenced meanwhile
         if self._env.now >= s.deadline_s - 1e-12:
-            self._close(s, _EXPIRED, "deadline_in_service")
+            self._close(s, _EXPIRED, "deadline_in_service", self._env.now)
             return
         s.repairs += 1
         self._use(s.sender, s.receiver)
         self._service.prepare(s)
         self.medium.submit(s)
 
-    def _close(self, s: Sample, status: Status, reason: str) -> None:
+    def _close(self, s: Sample, status: Status, reason: str, now_s: float) -> None:
         del self._in_flight[s.number]
         self._forget(s)
         if s.pieces is not None and s.arrived_frames:  # cut short: its first pieces are there
             s.end_pass()
-        row = s.row_of(status, reason, self._env.now)
+        row = s.row_of(status, reason, now_s)
         c = self.counters
         c.data_wire_bytes += row.wire_bytes
         c.data_delivered_bytes += row.arrived_bytes
@@ -469,7 +470,8 @@ class Air:
         known = self._goodput.read(sender, self._env.now)
         head = self.medium.in_service(sender)
         if head is not None:
-            drained, now = self._drained(sender), self._env.now
+            self._book(head)
+            drained, now = self._drained_bits[sender], self._env.now
             for s in self.medium.queued(sender):
                 if s is head and now - s.mark_s >= _WINDOW_S:
                     since, bits = s.mark_s, s.mark_bits
@@ -489,11 +491,19 @@ class Air:
             s.mark_bits += bits
             self._drained_bits[s.sender] += bits
 
-    def _drained(self, sender: int) -> float:
-        """What the sender has got through so far, bits as goodput counts them."""
-        head = self.medium.in_service(sender)
-        if head is not None:
+    def _book_all(self) -> None:
+        for head in self.medium.heads():
             self._book(head)
+
+    def _drained(self, sender: int, now_s: float) -> float:
+        """What the sender has got through so far, bits as goodput counts them."""
+        queue = self.medium.queued(sender)
+        if queue:
+            self.medium.sync()
+            head = queue[0]
+            if head.begun_s < now_s:  # else it cannot have got through anything
+                self.medium.read(head)
+                self._book(head)
         return self._drained_bits[sender]
 
     def _measure(self, s: Sample, served: bool, now_s: float) -> None:
@@ -509,7 +519,7 @@ class Air:
         else:
             waited = now_s - s.t_queued_s
             if s.repairs == s.repairs_before and waited >= _WINDOW_S:
-                rate = (self._drained(s.sender) - s.drained_bits) / waited * 1e-6
+                rate = (self._drained(s.sender, now_s) - s.drained_bits) / waited * 1e-6
                 self._goodput.bounded(s.sender, s.receiver, rate)
 
     # --- accounts --------------------------------------------------------------------------------
@@ -531,7 +541,5 @@ class Air:
 
     def finish(self) -> list[Transmission]:
         """What is still in flight at the end, by number; call it once, when the clock has stopped."""
-        self.medium.sync()
-        for sender in range(self._n):
-            self._drained(sender)
+        self._book_all()
         return [s.row_of(Status.IN_FLIGHT, "", nan) for _, s in sorted(self._in_flight.items())]

@@ -19,6 +19,8 @@ shadowing, because falling is quicker than rising; a drop shows in the next fram
 
 from __future__ import annotations
 
+from math import inf
+
 from sortie.scenarios.link_state import MEASURED_FOR_S, SILENT_MBPS, WAITING_MBPS
 
 RISE = 0.3
@@ -33,10 +35,9 @@ class Goodput:
 
     def measured(self, sender: int, receiver: int, mbps: float, now_s: float) -> None:
         """A measurement: down at once, up by `RISE` of the gap; one without another lately is taken as it is."""
-        self._expire(sender, now_s)
-        row = self._mbps[sender]
-        before = row[receiver]
-        self._measured_at_s[sender][receiver] = now_s
+        row, measured_at_s = self._mbps[sender], self._measured_at_s[sender]
+        before = row[receiver] if now_s - measured_at_s.get(receiver, -inf) <= MEASURED_FOR_S else 0.0
+        measured_at_s[receiver] = now_s
         row[receiver] = before + RISE * (mbps - before) if 0.0 < before < mbps else max(mbps, SILENT_MBPS)
 
     def bounded(self, sender: int, receiver: int, mbps: float) -> None:
@@ -46,11 +47,8 @@ class Goodput:
 
     def read(self, sender: int, now_s: float) -> list[float]:
         """The estimates to all drones (0 where nothing was measured lately, and to itself)."""
-        self._expire(sender, now_s)
-        return self._mbps[sender].copy()
-
-    def _expire(self, sender: int, now_s: float) -> None:
         measured_at_s = self._measured_at_s[sender]
         for receiver in [i for i, t_s in measured_at_s.items() if now_s - t_s > MEASURED_FOR_S]:
             del measured_at_s[receiver]
             self._mbps[sender][receiver] = 0.0
+        return self._mbps[sender].copy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from math import isnan, nan
 from typing import NamedTuple
 
@@ -29,7 +30,7 @@ from sortie.radio.mac.jobs import NO_FRAMES, AirJob
 from sortie.radio.mac.medium import Link
 from sortie.radio.mac.rate_control import Minstrel
 from sortie.radio.overrides import LinkNow
-from sortie.radio.rates import STANDARDS, rate_table
+from sortie.radio.rates import STANDARDS, StandardName, rate_table
 from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission
 
@@ -43,7 +44,7 @@ class Sample(AirJob):
     """A sample, its current pass through the medium, and the goodput measurement that it carries."""
 
     __slots__ = (
-        "arrived", "begun_s", "drained_bits", "fragments", "full_mbps", "hops", "kind", "left", "lost", "mark_bits", "mark_frames",
+        "arrived", "begun_s", "drained_bits", "fragments", "full_mbps", "hops", "key", "kind", "left", "lost", "mark_bits", "mark_frames",
         "mark_s", "mcs", "on_done", "origin", "pass_wire", "payload_bytes", "piece_bytes", "pieces", "receiver", "reliable",
         "repairs", "repairs_before", "sent_before", "snr_db", "t_first_s", "t_queued_s", "t_sent_s", "target", "unreachable", "wire_bytes",
     )  # fmt: skip
@@ -60,6 +61,7 @@ class Sample(AirJob):
         self.origin, self.target = sender, receiver
         self.hops = 1
         self.kind = kind
+        self.key = sender, sender, receiver, kind  # sender of this hop, origin, target, kind: a newer one replaces it
         self.payload_bytes = payload_bytes
         self.reliable = reliable
         self.on_done = on_done
@@ -94,26 +96,25 @@ class Sample(AirJob):
         """Share of this pass that is not at its receiver."""
         return 1.0 - self.arrived_frames / self.frames if self.frames else 1.0
 
-    def _pass_bytes(self) -> float:
-        """What this pass has put on the air; tries on a link that is dead count as airtime alone."""
-        return (self.sent_before if self.unreachable else self.sent_frames) * self.pass_wire
-
     def end_pass(self) -> int:
         """Take in what this pass has brought; returns how many of its fragments are missing at the receiver."""
-        self.wire_bytes += self._pass_bytes()
-        self.lost += len(self.dropped)
+        # tries on a link that is dead count as airtime alone
+        self.wire_bytes += (self.sent_before if self.unreachable else self.sent_frames) * self.pass_wire
         missing = self.left - self.arrived_frames
         if self.pieces is not None:
             self.arrived.append(self.pieces[self.here])
             self.pieces = np.delete(self.pieces, self.here)
         self.arrived_frames = self.sent_frames = self.sent_before = self.mark_frames = 0
         self.here = NO_FRAMES
-        self.dropped = set()
+        if self.dropped:
+            self.lost += len(self.dropped)
+            self.dropped = set()
         return missing
 
     def forward(self, sender: int, receiver: int, now_s: float, drained_bits: float) -> None:
         """Begin the next hop with what the last one brought."""
         self.sender, self.receiver = sender, receiver
+        self.key = sender, self.origin, self.target, self.kind
         self.hops += 1
         self.repairs_before = self.repairs
         self.t_queued_s, self.drained_bits = now_s, drained_bits
@@ -140,20 +141,35 @@ class Sample(AirJob):
             if len(here):
                 status, arrived = Status.PARTIAL, self.bytes_of(here)
                 missing = tuple(np.setdiff1d(np.arange(self.fragments), here).tolist())
-        return Transmission(
-            self.number, self.origin, self.target, self.kind, self.payload_bytes, round(self.wire_bytes + self._pass_bytes()),
+        sent_frames = self.sent_before if self.unreachable else self.sent_frames
+        wire_bytes = round(self.wire_bytes + sent_frames * self.pass_wire)
+        row = (
+            self.number, self.origin, self.target, self.kind, self.payload_bytes, wire_bytes,
             self.t_sent_s, self.deadline_s, self.t_first_s, t_done_s, status, reason, self.fragments, self.lost + len(self.dropped),
             self.repairs, self.mcs, self.snr_db, self.granted_s, self.hops, arrived, missing,
         )  # fmt: skip
+        return tuple.__new__(Transmission, row)  # half the time of the constructor
 
 
 class Use(NamedTuple):
-    """How a link is used in this frame: what the medium must know, why there is none, and its mean SNR as it is."""
+    """How a link is used in this frame: what the medium must know, why nobody is reached, and the rate of full A-MPDUs."""
 
     link: Link
     unreachable: str
-    snr_db: float
     full_mbps: float
+
+
+@lru_cache(maxsize=64)
+def full_goodputs_mbps(
+    bandwidth_mhz: int, standard: StandardName, fragment_bytes: int, max_ampdu_frames: int
+) -> tuple[float, ...]:
+    """By MCS: payload Mb/s of full A-MPDUs without loss, alone on the channel."""
+    each, found = frame_bytes(fragment_bytes, fragmented=True), []
+    for rate_mbps in STANDARDS[standard].rates_mbps[bandwidth_mhz]:
+        m = ampdu_frames(each, rate_mbps, max_ampdu_frames, STANDARDS[standard])
+        exchanges = frames_exchanges(m, each, each, rate_mbps, max_ampdu_frames, standard=STANDARDS[standard])
+        found.append(m * fragment_bytes * 8e-6 / exchanges.channel_s(contention(1)))
+    return tuple(found)
 
 
 class Service:
@@ -165,17 +181,21 @@ class Service:
         self._standard = STANDARDS[settings.standard]
         self._table = rate_table(settings.bandwidth_mhz, settings.rician_k_db, self._frame_bytes, settings.standard)
         self._rates = self._standard.rates_mbps[settings.bandwidth_mhz]
-        self._full_mbps = tuple(self._full_goodput(rate) for rate in self._rates)
+        self._full_mbps = full_goodputs_mbps(
+            settings.bandwidth_mhz, settings.standard, settings.fragment_bytes, settings.max_ampdu_frames
+        )
         self.least_snr_db = settings.preamble_detection_dbm - noise_dbm
         self.minstrel = Minstrel(self._rates) if settings.rate_control == "minstrel" else None
+        no_link = Use(Link(-1, dead=True), "no_link", 0.0)
+        by_mcs = [Use(Link(mcs), "", mbps) for mcs, mbps in enumerate(self._full_mbps)]
+        self._plain = (*by_mcs, no_link)  # MCS −1 is the last one
         self._mbps_at: FloatArray | None = None
         # payloads come in few sizes
         self._equivalents: dict[tuple[int, int, int], float] = {}
         self._passes: dict[tuple[int, int, int, int, bool], tuple[int, int, float]] = {}
 
     def use(
-        self, sender: int, receiver: int, now_s: float, known_snr_db: float, snr_db: float, receiver_gone: bool,
-        given: LinkNow | None = None,
+        self, sender: int, receiver: int, now_s: float, known_snr_db: float, receiver_gone: bool, given: LinkNow | None = None,
     ) -> Use:  # fmt: skip
         """How a link is used from now on.
 
@@ -183,13 +203,14 @@ class Service:
             sender, receiver: whose link.
             now_s: the time.
             known_snr_db: mean SNR that its sender knows and picks the MCS by.
-            snr_db: mean SNR as it is.
             receiver_gone: whether nobody is there to answer.
             given: what stands beside the models or in their place; None is nothing.
         """
         mcs = self._ideal_mcs(known_snr_db)
         if self.minstrel is not None and mcs >= 0:
             mcs = self.minstrel.mcs(sender, receiver, now_s)
+        if given is None and not receiver_gone:
+            return self._plain[mcs]
         rate_mbps, frames, burst_loss, loss = 0.0, 0, 0.0, nan
         if given is not None:
             mcs = self._given_mcs(mcs, given)
@@ -199,7 +220,7 @@ class Service:
         reason = "receiver_gone" if receiver_gone else "no_link" if mcs < 0 else ""
         link = Link(mcs, bool(reason), rate_mbps, frames, loss, burst_loss)
         full_mbps = 0.0 if reason else given.goodput_mbps if rate_mbps and given is not None else self._full_mbps[mcs]
-        return Use(link, reason, snr_db, full_mbps)
+        return Use(link, reason, full_mbps)
 
     def _ideal_mcs(self, snr_db: float) -> int:
         return self._table.mcs[self._table.index(snr_db)] if snr_db >= self.least_snr_db else -1
@@ -227,7 +248,7 @@ class Service:
         body_s = max(frames * frame_s - around_s - self._standard.preamble_s, frames * 1e-6)
         return frames * 8e-6 * (self._frame_bytes + MPDU_DELIMITER) / body_s, frames
 
-    def begin(self, s: Sample, use: Use, now_s: float, *, fresh: bool) -> None:
+    def begin(self, s: Sample, use: Use, snr_db: float, now_s: float, *, fresh: bool) -> None:
         """A sample comes to the head of its queue (`fresh`), or its link has changed while it is there."""
         if fresh and isnan(s.t_first_s):
             s.t_first_s = now_s
@@ -238,7 +259,7 @@ class Service:
             s.mark_s, s.mark_bits = now_s, 0.0
         if use.unreachable and not s.unreachable:
             s.sent_before = 0 if fresh else s.sent_frames
-        s.snr_db, s.unreachable, s.mcs, s.full_mbps = use.snr_db, use.unreachable, mcs, use.full_mbps
+        s.snr_db, s.unreachable, s.mcs, s.full_mbps = snr_db, use.unreachable, mcs, use.full_mbps
 
     def prepare(self, s: Sample) -> None:
         """Set the frames of a sample's next pass."""
@@ -306,12 +327,3 @@ class Service:
     def _mbps(self, mcs: int, per: float) -> float:
         limit = self._settings.retry_limit
         return self._full_mbps[mcs] / tries(per, limit) * (1.0 - residual_loss(per, limit))
-
-    def _full_goodput(self, rate_mbps: float) -> float:
-        """Payload Mb/s of full A-MPDUs without loss, alone on the channel."""
-        c = self._settings
-        m = ampdu_frames(self._frame_bytes, rate_mbps, c.max_ampdu_frames, self._standard)
-        exchanges = frames_exchanges(
-            m, self._frame_bytes, self._frame_bytes, rate_mbps, c.max_ampdu_frames, standard=self._standard
-        )
-        return m * c.fragment_bytes * 8e-6 / exchanges.channel_s(contention(1))

@@ -34,14 +34,16 @@ class StreamShadowing:
     def __init__(self, settings: AirSettings, seed: int, replication: int, n: int, frame_s: float) -> None:
         self._sigma_db, self._n = settings.shadowing_sigma_db, n
         self._keep = keep(frame_s, settings.shadowing_time_s)
-        self._streams = [stream(seed, replication, h, "shadowing") for h in range(n)]
+        self._streams = [stream(seed, replication, h, "shadowing") for h in range(1, n)] if self._sigma_db else []
         self._last_db: FloatArray | None = None
 
     def block(self, frames: int) -> FloatArray:
         """Of the next frames, dB; [frames, n, n], symmetric. All blocks but the last must be of one length."""
+        if not self._sigma_db:
+            return np.zeros((frames, self._n, self._n))
         normals = np.zeros((frames, self._n, self._n))
-        for h in range(1, self._n):
-            normals[:, h, :h] = drawn = self._streams[h].standard_normal((frames, h))
+        for h, rng in enumerate(self._streams, 1):
+            normals[:, h, :h] = drawn = rng.standard_normal((frames, h))
             normals[:, :h, h] = drawn
         shadow_db = gauss_markov(normals, self._sigma_db, self._keep, self._last_db)
         self._last_db = shadow_db[-1]
@@ -96,3 +98,11 @@ def fade_table_db(k_db: float) -> NDArray[np.float32]:
     rising = np.concatenate([[True], np.diff(cdf) > 0.0])
     middles = (np.arange(_LEVELS) + 0.5) / _LEVELS
     return np.asarray(np.interp(middles, cdf[rising], grid_db[rising]), np.float32)
+
+
+@lru_cache(maxsize=32)
+def fade_table(k_db: float) -> NDArray[np.float32]:
+    """The same as a factor of the mean power."""
+    table: NDArray[np.float32] = (10.0 ** (np.asarray(fade_table_db(k_db), float) / 10.0)).astype(np.float32)
+    table.flags.writeable = False  # all fleets share it
+    return table

@@ -68,15 +68,28 @@ def _is_finite(values: FloatArray) -> bool:
     return True
 
 
+def linear(snr_db: AnyFloats) -> FloatArray:
+    """A ratio in dB as a factor; NaN is 0."""
+    return np.nan_to_num(10.0 ** (np.asarray(snr_db, float) / 10.0))
+
+
 class FrameLinks:
-    """The mean SNR of the links in one frame; squares and rows are made at their first use."""
+    """The mean SNR of the links in one frame; all other forms of it are made at their first use."""
 
-    __slots__ = ("_rows", "_square", "links", "snr_db")
+    __slots__ = ("_gain", "_rows", "_square", "links", "snr_db")
 
-    def __init__(self, links: LinkList, snr_db: AnyFloats, rows_db: list[list[float]] | None = None) -> None:
+    def __init__(self, links: LinkList, snr_db: AnyFloats, gain: FloatArray | None = None) -> None:
         self.links, self.snr_db = links, snr_db
         self._square: FloatArray | None = None
-        self._rows = rows_db
+        self._rows: list[list[float]] | None = None
+        self._gain = gain
+
+    @property
+    def gain(self) -> FloatArray:
+        """[L]: the same as a factor, 0 for NaN."""
+        if self._gain is None:
+            self._gain = linear(self.snr_db)
+        return self._gain
 
     @property
     def square_db(self) -> FloatArray:
@@ -87,9 +100,10 @@ class FrameLinks:
 
     @property
     def rows_db(self) -> list[list[float]]:
-        """The same as lists."""
+        """The same as lists; what stands on the diagonal means nothing."""
         if self._rows is None:
-            self._rows = self.square_db.tolist()
+            square_db = self.snr_db.reshape(self.links.n, -1) if self.links.is_square else self.square_db
+            self._rows = square_db.tolist()
         return self._rows
 
 
@@ -164,7 +178,7 @@ class Channel:
         # the block, [frames, L] each
         self._snr_db: AnyFloats
         self._shadow_db: AnyFloats
-        self._snr_rows: list[list[list[float]]] = []  # of a small fleet: the block as lists, which one looks up faster
+        self._gain: FloatArray | None = None  # of a small fleet
 
     def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
         """Move on by one frame.
@@ -184,12 +198,12 @@ class Channel:
         if row == 0:
             self._refill()
         links, snr = self.links, self._snr_db[row]
-        rows_db = self._snr_rows[row] if self._crowd is None else None
+        gain = None if self._gain is None else self._gain[row]
         if self._own is not None:
             square_db = links.square(snr, OUT_OF_RANGE_DB)
             at_m, t_s = self._positions_m[self.frame], self.frame * self._frame_s
             snr = changed_snr(self._own, t_s, at_m, square_db)[links.sender, links.receiver]
-            rows_db = None
+            gain = None
         if extra_loss_db is not None or jammers:
             snr = snr.copy()
             if extra_loss_db is not None:
@@ -199,9 +213,10 @@ class Channel:
                 snr -= extra[links.sender, links.receiver]
             if jammers:
                 snr -= self.noise_rise_db(jammers)[links.receiver]
-            rows_db = None
-        self.before = self.now if self.frame else FrameLinks(links, snr, rows_db)
-        self.now = FrameLinks(links, snr, rows_db)
+            gain = None
+        now = FrameLinks(links, snr, gain)
+        self.before = self.now if self.frame else now
+        self.now = now
 
     def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
         """From the next frame on the fleet flies another way; what was drawn of shadowing stays.
@@ -271,12 +286,14 @@ class Channel:
             at = [self._field.between(q, (first + t) * self._frame_s) for t, q in enumerate(p)]
             self._shadow_db = np.stack(at).reshape(len(p), -1)
         self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
-        self._snr_rows = self._snr_db.reshape(len(p), self.n, self.n).tolist()
+        self._gain = linear(self._snr_db)
 
     def _loss_db(self, p: FloatArray, up: FloatArray | None) -> FloatArray:
         """[frames, N²] of [frames, N, 3] positions: path and antennas."""
         links, c = self.links, self.settings
-        delta = p[:, :, None, :] - p[:, None, :, :]
+        delta = np.empty((len(p), self.n, self.n, 3))
+        for axis in range(3):  # numpy is slow along an axis of three
+            np.subtract(p[:, :, None, axis], p[:, None, :, axis], out=delta[..., axis])
         distance = np.sqrt(np.einsum("tijk,tijk->tij", delta, delta)).reshape(len(p), -1)
         heights = p[:, :, 2]
         loss_db = path_loss_db(c, distance, heights[:, links.sender], heights[:, links.receiver])

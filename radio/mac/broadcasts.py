@@ -46,9 +46,11 @@ class Broadcasts:
     ) -> None:  # fmt: skip
         self._rate_mbps, self._n, self._counters, self._gone, self._as_lists = rate_mbps, n, counters, gone, as_lists
         self._airtime_s: dict[int, float] = {}  # by payload, bytes
-        self.phase_s = [
-            float(stream(seed, replication, i, "publish phase").random()) * publish_spread * frame_s for i in range(n)
-        ]
+        self._others = [(*range(i), *range(i + 1, n)) for i in range(n)] if as_lists else []
+        self.phase_s = [0.0] * n
+        if publish_spread:
+            at = [float(stream(seed, replication, i, "publish phase").random()) for i in range(n)]
+            self.phase_s = [x * publish_spread * frame_s for x in at]
 
     def frame(self, sender: int, payload_bytes: int, on_heard: OnHeard) -> Broadcast:
         """One more frame of a drone; arguments and errors as for `Air.broadcast`."""
@@ -64,34 +66,31 @@ class Broadcasts:
         counters.context_sent_bytes += payload_bytes
         return Broadcast(sender, airtime_s, payload_bytes + _GROUP_OVERHEAD_BYTES, on_heard)
 
-    def end(self, frame: Broadcast, receivers: NDArray[np.int64], fates: NDArray[np.uint8]) -> None:
+    def end(self, frame: Broadcast, receivers: NDArray[np.int64], fates: bytes) -> None:
         """The medium is through with a frame; receivers that it does not name are out of its reach."""
         counters, sender, gone = self._counters, frame.sender, self._gone
         counters.context_wire_bytes += frame.wire_bytes
         living = self._n - 1 - (len(gone - {sender}) if gone else 0)
         if self._as_lists and not gone:
-            fate_list, receiver_list = fates.tolist(), receivers.tolist()
-            heard: Sequence[int] = [
-                j for j, fate in zip(receiver_list, fate_list, strict=True) if fate == _HEARD and j != sender
-            ]
-            if len(heard) < living:
-                self._miss(np.delete(fates, sender) if len(fates) == self._n else fates, living - len(heard))
+            heard: Sequence[int] = self._others[sender]
+            if fates.count(_HEARD) < living:
+                heard = [j for j, fate in zip(receivers.tolist(), fates, strict=True) if fate == _HEARD]
+                self._miss(fates, living - len(heard))
         else:
             counted = receivers != sender
             if gone:
                 counted &= ~np.isin(receivers, list(gone))
-            alive, fates = receivers[counted], fates[counted]
-            found = alive[fates == _HEARD]
-            if len(found) < living:
-                self._miss(fates, living - len(found))
-            heard = found.tolist()
+            alive, of_alive = receivers[counted], np.frombuffer(fates, np.uint8)[counted]
+            heard = alive[of_alive == _HEARD].tolist()
+            if len(heard) < living:
+                self._miss(of_alive.tobytes(), living - len(heard))
         counters.receptions += len(heard)
         frame.on_heard(heard)
 
-    def _miss(self, fates: NDArray[np.uint8], missed: int) -> None:
+    def _miss(self, fates: bytes, missed: int) -> None:
         counters = self._counters
         counters.missed += missed
-        by_cause = np.bincount(fates, minlength=_HEARD + 1)[1:_HEARD].tolist()
+        by_cause = [fates.count(cause) for cause in range(1, _HEARD)]
         for name, count in zip(CAUSES, by_cause, strict=True):
             counters.lost_to[name] += count
         counters.lost_to["weak_signal"] += missed - sum(by_cause)

@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 from numba import carray, types
-from numba.core.cgutils import voidptr_t
+from numba.core.cgutils import raw_memcpy, voidptr_t
 from numba.extending import intrinsic
 
 from sortie.scenarios.compiled import compiled, part
@@ -57,8 +57,8 @@ STATION_COLUMNS = 52
 
 # columns of a job
 (
-    KIND, STATION, FLOW, FOLLOWING, COUNT, LOW, HIGH, FULL_BYTES, LAST_BYTES, ARRIVED, DROPPED, IS_LIVE,
-    JOB_ACCESS, AIR_NS, READY_AT, HEAD_AT, IS_TOLD, VAIN_TRIES,
+    KIND, STATION, FLOW, FOLLOWING, COUNT, FULL_BYTES, LAST_BYTES, DROPPED, IS_LIVE, JOB_ACCESS, READY_AT, IS_TOLD, VAIN_TRIES,
+    LOW, HIGH, ARRIVED, AIR_NS, HEAD_AT,
 ) = range(18)  # fmt: skip
 JOB_COLUMNS = 18
 
@@ -1032,6 +1032,18 @@ def substitute(old, job, kind, station, flow, access_class, count, full_bytes, l
     return True
 
 
+def _copy_bytes(_, to, origin, count):
+    def generate(_, builder, __, values):
+        addresses = [builder.inttoptr(value, voidptr_t) for value in values[:2]]
+        raw_memcpy(builder, *addresses, values[2], 1)
+
+    return types.void(to, origin, count), generate
+
+
+copy_bytes = intrinsic(_copy_bytes)
+"""Copy so many bytes from one address to another: in a third of a loop's time."""
+
+
 @part
 def copy(
     S,
@@ -1062,16 +1074,12 @@ def copy(
     C,
 ):
     """Make the second state equal to the first; what is not in use is left out."""
-    for s in range(S.shape[0]):
-        P2[s] = P[s]
-        for k in range(STATION_COLUMNS):
-            S2[s, k] = S[s, k]
-    for k in range(G.shape[0]):
-        G2[k] = G[k]
+    copy_bytes(S2.ctypes.data, S.ctypes.data, 8 * S.size)
+    copy_bytes(P2.ctypes.data, P.ctypes.data, 8 * P.size)
+    copy_bytes(G2.ctypes.data, G.ctypes.data, 8 * G.size)
     for x in range(J.shape[0]):
         if J[x, IS_LIVE] == 1:
-            for k in range(JOB_COLUMNS):
-                J2[x, k] = J[x, k]
+            copy_bytes(J2[x].ctypes.data, J[x].ctypes.data, 8 * JOB_COLUMNS)
         else:
             J2[x, IS_LIVE] = 0
     if C[C_LEARNS] == 1:
@@ -1083,8 +1091,8 @@ def copy(
             for k in range(begin[s], begin[s + 1]):
                 W2[k], WHY2[k] = W[k], WHY[k]
         if S[s, TX_JOB] >= 0 or S[s, HEAD] >= 0 or S[s, HEAD_LOW] >= 0:
-            for k in range(M.shape[1]):
-                M2[s, k], T2[s, k] = M[s, k], T[s, k]
+            copy_bytes(M2[s].ctypes.data, M[s].ctypes.data, M.shape[1])
+            copy_bytes(T2[s].ctypes.data, T[s].ctypes.data, 4 * T.shape[1])
         if S[s, LOCK] >= 0:
             for k in range(S[s, SEGMENTS]):
                 SEG_AT2[s, k], SEG2[s, k] = SEG_AT[s, k], SEG[s, k]

@@ -11,7 +11,7 @@ counted by station, so what is run again draws the same, and the result does not
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from functools import cache
 from heapq import heappop, heappush
 from math import inf, nan
@@ -20,9 +20,9 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 import simpy
 from numpy.typing import NDArray
-from simpy.events import EventPriority
+from simpy.events import NORMAL, EventPriority
 
-from sortie.radio.channel.draws import fade_table_db
+from sortie.radio.channel.draws import fade_table
 from sortie.radio.mac.airtime import CONTROL_MBPS, ampdu_frames, frame_bytes
 from sortie.radio.mac.jobs import AirJob, End, GroupFrame
 from sortie.radio.rates import CURVES, LEGACY_CURVES, STANDARDS, group_curve
@@ -70,19 +70,26 @@ class Link(NamedTuple):
 
 
 class _State:
-    """Everything about the stations that a run changes, in arrays; `now_ns` is how far they have been run."""
+    """Everything about the stations that a run changes, in arrays; `now_ns` is how far they have been run.
 
-    __slots__ = ("arrays", "jobs", "now_ns")
+    `rows` and `drops` are the numbers of two of the arrays, one after another: a lone number is read faster this way.
+    """
+
+    __slots__ = ("arrays", "drops", "jobs", "now_ns", "rows", "table")
 
     def __init__(self, arrays: tuple[NDArray[Any], ...], jobs: int, now_ns: int) -> None:
         self.arrays, self.jobs, self.now_ns = arrays, jobs, now_ns
+        self.rows, self.drops = (memoryview(arrays[k].reshape(-1).data) for k in (_J, _DROPS))
+        self.table: IntArray | None = None
+        """Sizes and addresses for `edca.ahead`; None when one of the arrays has become another."""
 
-    def clone(self) -> _State:
-        return _State(tuple(a.copy() for a in self.arrays), self.jobs, self.now_ns)
+    def blank(self) -> _State:
+        """Another one of the same sizes, for a run to fill."""
+        return _State(tuple(np.zeros(a.shape, a.dtype) for a in self.arrays), self.jobs, self.now_ns)
 
 
 _S, _P, _W, _WHY, _G, _J, _M, _T, _SEG_AT, _SEG, _LS, _DROPS = range(12)
-_JOBS, _FLOWS = 64, 32
+_JOBS, _FLOWS = 16, 32
 _DROPS_KEPT = 8192
 """Given up fragments that a run keeps before they must be read, at the least."""
 
@@ -114,7 +121,7 @@ class Medium(Generic[J, F]):
         noise_dbm: float,
         on_begin: Callable[[J, float], None],
         on_end: Callable[[J, End, float], None],
-        on_group_end: Callable[[F, IntArray, NDArray[np.uint8]], None],
+        on_group_end: Callable[[F, IntArray, bytes], None],
     ) -> None:
         self._env = env
         self._on_begin, self._on_end, self._on_group_end = on_begin, on_end, on_group_end
@@ -126,7 +133,10 @@ class Medium(Generic[J, F]):
         self._begin_s = env.now
         self._timer: simpy.Event | None = None
         self._is_replanning = False
-        self._told: list[tuple[int, int, J | F | None]] = []
+        self._last = self._event()
+        self._on_last: list[Callable[[simpy.Event], None]] = [self._replan]
+        self._on_time: list[Callable[[simpy.Event], None]] = [self._on_timer]
+        self._told: list[list[int]] = []
         self._is_telling = False
         self._free = list(range(_JOBS))[::-1]
         self._finished: list[int] = []
@@ -140,7 +150,7 @@ class Medium(Generic[J, F]):
         self._group_access, self._payload_access = order
         keys = [stream(seed, replication, i, "channel access").bit_generator.random_raw() for i in range(n)]
         self._keys = np.array(keys, np.uint64)
-        self._fade = (10.0 ** (np.asarray(fade_table_db(settings.rician_k_db), float) / 10.0)).astype(np.float32)
+        self._fade = fade_table(settings.rician_k_db)
         curves = [*CURVES, group_curve(settings.group_rate_mbps), LEGACY_CURVES[CONTROL_MBPS]]
         centre_db, slope, weight = np.array(curves).T
         sure = 10.0 ** ((centre_db + 36.001 / slope) / 10.0)  # the stations' form of the curve is 0 from 36 on
@@ -168,18 +178,18 @@ class Medium(Generic[J, F]):
             _JOBS, self._ns(env.now) - 1,
         )  # fmt: skip
         self._settled.arrays[_G][e.G_SINCE] = self._ns(env.now)
-        self._planned = self._settled.clone()
+        self._planned = self._settled.blank()
         self._flow_ints = np.zeros((_FLOWS, e.FLOW_COLUMNS), np.int64)
         self._flow_floats = np.zeros((_FLOWS, 3))
         self._orders = np.zeros((_FLOWS, mcs), np.int64)
         self._out = np.zeros((2 * n + 8, 2), np.int64)
+        self._first: list[int] = []  # as `_begin`, in a list
         self._touch = np.zeros(2 * n + 2, np.int64)
         self._begin: IntArray = np.zeros(n + 1, np.int64)
         self._receiver: IntArray = np.zeros(0, np.int64)
         self._gain: FloatArray = np.zeros(0)
         self._extra = np.zeros(1)
         self._shared: tuple[Any, ...] = ()
-        self._tables: dict[int, IntArray] = {}
         self._share()
 
     @staticmethod
@@ -223,6 +233,7 @@ class Medium(Generic[J, F]):
             self._gain[:] = gain
         else:
             self._begin, self._receiver, self._gain = begin, receiver, gain.copy()
+            self._first = begin.tolist()
             self._share()
             if len(settled.arrays[_W]) != len(receiver):
                 sized = {_W: len(receiver), _WHY: len(receiver)}
@@ -239,23 +250,19 @@ class Medium(Generic[J, F]):
             self._flow_ints, self._flow_floats, self._out, self._touch, self._begin, self._receiver, self._gain, self._extra, self._fade, self._keys,
             self._rates, self._limits, self._orders, self._ints, self._floats, self._curves,
         )  # fmt: skip
+        self._settled.table = self._planned.table = None
 
-        self._tables = {}
-
-    def _table(self, first: _State) -> IntArray:
-        """Sizes and addresses of the arrays, as `edca.ahead` wants them; made anew when one of them is another."""
-        found = self._tables.get(id(first))
-        if found is None:
-            second = self._planned if first is self._settled else self._settled
-            a = first.arrays
-            sizes = (
-                self._n, len(self._receiver), len(a[_J]), self._window, len(a[_LS]), len(self._rates), len(a[_DROPS]),
-                len(self._extra),
-            )  # fmt: skip
-            arrays = (*a, *second.arrays, *self._shared)
-            assert all(each.flags.c_contiguous for each in arrays)  # noqa: S101 (addresses know no strides)
-            found = self._tables[id(first)] = np.array([*sizes, *(each.ctypes.data for each in arrays)], np.int64)
-        return found
+    def _make_table(self) -> IntArray:
+        """Sizes and addresses of the settled state's arrays, the planned one's, and those that they share."""
+        a = self._settled.arrays
+        sizes = (
+            self._n, len(self._receiver), len(a[_J]), self._window, len(a[_LS]), len(self._rates), len(a[_DROPS]),
+            len(self._extra),
+        )  # fmt: skip
+        arrays = (*a, *self._planned.arrays, *self._shared)
+        assert all(each.flags.c_contiguous for each in arrays)  # noqa: S101 (addresses know no strides)
+        self._settled.table = table = np.array([*sizes, *(each.ctypes.data for each in arrays)], np.int64)
+        return table
 
     def flow(self, sender: int, receiver: int) -> int:
         """The number of an ordered link that carries unicast frames."""
@@ -272,7 +279,8 @@ class Medium(Generic[J, F]):
                 self._share()
             e = self._e
             self._flow_ints[found, e.FLOW_TO] = receiver
-            self._orders[found] = np.roll(np.arange(len(self._rates)), 5 * sender + receiver)
+            if self._ints[e.C_LEARNS]:
+                self._orders[found] = np.roll(np.arange(len(self._rates)), 5 * sender + receiver)
         return found
 
     def tune(self, flow: int, link: Link) -> None:
@@ -295,12 +303,14 @@ class Medium(Generic[J, F]):
 
     def submit(self, job: J) -> None:
         """Queue a job behind its sender's others; its `flow`, `frames`, `full_bytes` and `last_bytes` are set."""
-        entry = self._enter(job)
-        queue = self._queues[job.sender]
+        now_s, queue = self._env.now, self._queues[job.sender]
+        entry = self._enter(job, now_s)
         queue.append(job)
         if len(queue) == 1:
-            self._on_begin(job, self._env.now)
-        self._submit(entry)
+            self._on_begin(job, now_s)
+        settled = self._settled.arrays
+        self._e.submit(*entry, settled[_S], settled[_J])
+        self.replan()
 
     def replace(self, old: J, new: J) -> None:
         """Drop `old` (queued or in service) for `new`.
@@ -309,14 +319,14 @@ class Medium(Generic[J, F]):
         the sender's other samples are not starved by a link that is slower than its samples come.
         """
         self.sync()
-        queue = self._queues[old.sender]
+        now_s, queue = self._env.now, self._queues[old.sender]
         if queue[0] is not old:
-            self._read(old)
-            entry = self._enter(new)
+            self.read(old)
+            entry = self._enter(new, now_s)
             a = self._settled.arrays
             if self._e.substitute(old.row, *entry, a[_S], a[_J]):
                 queue[queue.index(old)] = new
-                self._leave(old)
+                self._leave(old, now_s)
                 self.replan()
                 return
             self._free.append(new.row)
@@ -324,38 +334,34 @@ class Medium(Generic[J, F]):
         self._take(old, requests=True)
         self.submit(new)
 
-    def _enter(self, job: J) -> tuple[int, ...]:
+    def _enter(self, job: J, now_s: float) -> tuple[int, ...]:
         """Open a row for a job; returns it as the stations want it."""
+        job.row = row = self._free.pop() if self._free else self._new_row()
+        self._at_row[row] = job
         job.live = True
         job.arrived_frames = job.sent_frames = 0
-        job.dropped = set()
+        if job.dropped:
+            job.dropped = set()
         job.pass_granted_s = 0.0
         job.t_start_s = nan
         self._pushes += 1
         if job.deadline_s < inf:
-            heappush(self._deadlines, (self._ns(job.deadline_s), job.number, self._pushes, job))
-        row = self._open(job)
+            heappush(self._deadlines, (round(job.deadline_s * 1e9), job.number, self._pushes, job))
         return (
             row, self._e.DATA, job.sender, job.flow, self._payload_access, job.frames, job.full_bytes, job.last_bytes, 0,
-            self._ns(self._env.now),
+            round(now_s * 1e9),
         )  # fmt: skip
 
-    def _open(self, job: J | F) -> int:
+    def _new_row(self) -> int:
+        """A row for a job when none is free: one of those that are finished, or a row more."""
+        live, told = self._settled.arrays[_J][:, self._e.IS_LIVE], {row for _, row in self._told}
+        self._free = [row for row in self._finished if not live[row] and row not in told]  # it may be its turn yet
+        self._finished = [row for row in self._finished if live[row] or row in told]
         if not self._free:
-            self._make_room()
-        job.row = row = self._free.pop()
-        self._at_row[row] = job
-        return row
-
-    def _make_room(self) -> None:
-        live = self._settled.arrays[_J][:, self._e.IS_LIVE]
-        self._free = [row for row in self._finished if not live[row]]
-        self._finished = [row for row in self._finished if live[row]]
-        if not self._free:
-            self._tables = {}
             n = self._settled.jobs
             self._settled, self._planned = (_sized(state, {_J: 2 * n}) for state in (self._settled, self._planned))
             self._free = list(range(n, 2 * n))[::-1]
+        return self._free.pop()
 
     def withdraw(self, job: J) -> None:
         """Take a job out without a word; the next in its queue begins."""
@@ -364,46 +370,45 @@ class Medium(Generic[J, F]):
         self.replan()
 
     def _take(self, job: J, *, requests: bool) -> None:
-        self._read(job)
-        a = self._settled.arrays
-        self._e.cancel(job.row, self._ns(self._env.now), a[_S], a[_J], requests)
-        self._leave(job)
+        self.read(job)
+        a, now_s = self._settled.arrays, self._env.now
+        self._e.cancel(job.row, round(now_s * 1e9), a[_S], a[_J], requests)
+        self._leave(job, now_s)
 
-    def _leave(self, job: J) -> None:
+    def _leave(self, job: J, now_s: float) -> None:
         """A job is no longer the sender's concern here; the stations may still owe it an answer."""
         job.live = False
         self._finished.append(job.row)
         del self._at_row[job.row]
         job.row = -1
         queue = self._queues[job.sender]
-        if job not in queue:
-            return
-        if queue[0] is job:
+        if queue and queue[0] is job:
             queue.popleft()
             if queue:
-                self._on_begin(queue[0], self._env.now)
-        else:
+                self._on_begin(queue[0], now_s)
+        elif job in queue:
             queue.remove(job)
 
-    def _read(self, job: J) -> None:
-        """Bring a job's figures up to the settled state."""
-        self._drain()
-        e, row = self._e, self._settled.arrays[_J][job.row].tolist()
-        job.arrived_frames, job.sent_frames = row[e.ARRIVED], row[e.HIGH]
-        granted_s = row[e.AIR_NS] * _NS
+    def read(self, job: J) -> None:
+        """Bring a job's figures up to the settled state (see `sync`)."""
+        settled, e = self._settled, self._e
+        if settled.drops[0]:
+            self._drain()
+        first = job.row * e.JOB_COLUMNS
+        low, high, arrived, air_ns, head_at = settled.rows[first + e.LOW : first + e.JOB_COLUMNS].tolist()
+        job.arrived_frames, job.sent_frames = arrived, high
+        granted_s = air_ns * _NS
         job.granted_s += granted_s - job.pass_granted_s
         job.pass_granted_s = granted_s
-        job.t_start_s = row[e.HEAD_AT] * _NS if row[e.HEAD_AT] >= 0 else nan
+        job.t_start_s = head_at * _NS if head_at >= 0 else nan
         if job.keeps_frames:
-            waiting = np.arange(row[e.LOW], row[e.HIGH])
-            here = waiting[(self._settled.arrays[_M][job.sender, waiting % self._window] & 64) > 0]
-            job.here = np.concatenate([np.setdiff1d(np.arange(row[e.LOW]), list(job.dropped)), here])
+            waiting = np.arange(low, high)
+            here = waiting[(settled.arrays[_M][job.sender, waiting % self._window] & 64) > 0]
+            job.here = np.concatenate([np.setdiff1d(np.arange(low), list(job.dropped)), here])
 
     def _drain(self) -> None:
         """Give the jobs what the settled state has dropped. The plan may tell the same again: a set takes it once."""
         drops = self._settled.arrays[_DROPS]
-        if not drops[0, 0]:
-            return
         for row, index in drops[1 : drops[0, 0] + 1].tolist():
             job = self._at_row.get(row)
             if job is not None:
@@ -416,29 +421,41 @@ class Medium(Generic[J, F]):
         if not queue:
             return None
         self.sync()
-        self._read(queue[0])
+        self.read(queue[0])
         return queue[0]
 
-    def queued(self, sender: int) -> Iterable[J]:
+    def queued(self, sender: int) -> Sequence[J]:
         """A sender's jobs, the one in service first."""
         return self._queues[sender]
 
+    def queues(self) -> list[Sequence[J]]:
+        """The jobs of every sender that has any, the one in service first."""
+        return [queue for queue in self._queues if queue]
+
     def heads(self) -> list[J]:
-        """The job at the head of every queue."""
-        return [queue[0] for queue in self._queues if queue]
+        """The job in service of every sender that has one, its figures brought up to now."""
+        heads = [queue[0] for queue in self._queues if queue]
+        if heads:
+            self.sync()
+        for job in heads:
+            self.read(job)
+        return heads
 
     # --- group frames ----------------------------------------------------------------------------
 
     def announce(self, frame: F, in_s: float = 0.0) -> None:
         """A group frame comes to its station's queue, `in_s` from now."""
-        row, length = self._open(frame), frame.wire_bytes
-        at_ns, air_ns = self._ns(self._env.now + in_s), round(frame.airtime_s * 1e9)
+        frame.row = row = self._free.pop() if self._free else self._new_row()
+        self._at_row[row] = frame
+        length, settled = frame.wire_bytes, self._settled.arrays
+        at_ns, air_ns = round((self._env.now + in_s) * 1e9), round(frame.airtime_s * 1e9)
         entry = (row, self._e.GROUP, frame.sender, 0, self._group_access, 1, length, length, air_ns, at_ns)
+        self._e.submit(*entry, settled[_S], settled[_J])
         if self._timer is not None and at_ns > self._planned.now_ns and not self._is_telling:
-            for state in (self._settled, self._planned):  # the plan stands: it ends before
-                self._e.submit(*entry, state.arrays[_S], state.arrays[_J])
+            planned = self._planned.arrays  # the plan stands: it ends before
+            self._e.submit(*entry, planned[_S], planned[_J])
         else:
-            self._submit(entry)
+            self.replan()
 
     def drop_context(self, sender: int) -> None:
         """Forget a drone's group frames and its block-ack requests, waiting or to come; a frame on the air ends."""
@@ -459,69 +476,74 @@ class Medium(Generic[J, F]):
 
     def sync(self) -> None:
         """Bring the settled state up to now; what happens at this very instant is still to come."""
-        until = self._ns(self._env.now) - 1
-        while self._settled.now_ns < until:
-            self._settled.now_ns, told = self._e.ahead(self._table(self._settled), until, until - 1)
+        until, settled = round(self._env.now * 1e9) - 1, self._settled
+        while settled.now_ns < until:
+            table = self._make_table() if settled.table is None else settled.table
+            settled.now_ns, told = self._e.ahead(table, until, until - 1)
             if told < 0:
                 self._drain()
-
-    def _submit(self, entry: tuple[int, ...]) -> None:
-        """A job comes to the stations."""
-        state = self._settled.arrays
-        self._e.submit(*entry, state[_S], state[_J])
-        self.replan()
 
     def replan(self) -> None:
         """Something has come from outside: plan anew when all that comes at this instant has come."""
         self._timer = None
         if not (self._is_replanning or self._is_telling):
             self._is_replanning = True
-            last = self._env.event()
-            last.callbacks.append(self._plan)
-            last._ok, last._value = True, None
-            self._env.schedule(last, _LAST)
+            self._last.callbacks = self._on_last
+            self._env.schedule(self._last, _LAST)
 
-    def _plan(self, _: simpy.Event | None = None) -> None:
-        """Run a copy ahead to whatever must be told next, and set the timer there."""
-        settled, planned = self._settled, self._planned
-        now = self._env.now
+    def _event(self) -> simpy.Event:
+        """An event to schedule again and again, with callbacks set anew: half the work of a timeout each time."""
+        event = simpy.Event(self._env)
+        event._ok, event._value = True, None
+        return event
+
+    def _replan(self, _: simpy.Event) -> None:
         self._is_replanning = False
+        self._plan(self._event())
+
+    def _plan(self, timer: simpy.Event) -> None:
+        """Run a copy ahead to whatever must be told next, and set the timer there."""
         self._timer = None
-        self._told = []
         if not self._at_row:
             return
-        deadlines = self._deadlines
+        settled, deadlines, now_s = self._settled, self._deadlines, self._env.now
         while deadlines and not deadlines[0][3].live:
             heappop(deadlines)
-        since = max(self._ns(now) - 1, settled.now_ns)
+        since = round(now_s * 1e9) - 1
+        if since < settled.now_ns:
+            since = settled.now_ns
         until = since + _AHEAD_NS
-        if deadlines:
-            until = min(until, max(deadlines[0][0], since))
-        reached, told = self._e.ahead(self._table(settled), since, until)
+        if deadlines and deadlines[0][0] < until:
+            until = max(deadlines[0][0], since)
+        ahead = self._e.ahead
+        table = self._make_table() if settled.table is None else settled.table
+        reached, told = ahead(table, since, until)
         while reached < since:
             self._drain()
-            reached, told = self._e.ahead(self._table(settled), since, until)
-        settled.now_ns, planned.now_ns = since, reached
-        if told > 0:
-            self._told = [(kind, row, self._at_row.get(row)) for kind, row in self._out[:told].tolist()]
-        self._timer = timer = self._env.timeout(max(0.0, planned.now_ns * _NS - now))
-        timer.callbacks.append(self._on_timer)
+            reached, told = ahead(table, since, until)
+        settled.now_ns, self._planned.now_ns = since, reached
+        self._told = self._out[:told].tolist() if told > 0 else []
+        timer.callbacks = self._on_time
+        self._timer = timer
+        self._env.schedule(timer, NORMAL, max(0.0, reached * _NS - now_s))
 
     def _on_timer(self, event: simpy.Event) -> None:
         if event is not self._timer:
             return  # something came earlier
         self._settled, self._planned = self._planned, self._settled
-        self._drain()
-        now, settled, e = self._env.now, self._settled, self._e
+        now, settled = self._env.now, self._settled
+        if settled.drops[0]:
+            self._drain()
         self._is_telling = True
-        for kind, row, job in self._told:
-            if job is None or job.row != row:
-                continue
-            if kind == e.T_GROUP:
+        for kind, row in self._told:
+            job = self._at_row.get(row)
+            if job is None:
+                continue  # it was taken out, and what the stations owed it is done
+            if kind == _T_GROUP:
                 self._end_group(job, row)  # type: ignore[arg-type]
                 continue
-            self._read(job)  # type: ignore[arg-type]
-            self._leave(job)  # type: ignore[arg-type]
+            self.read(job)  # type: ignore[arg-type]
+            self._leave(job, now)  # type: ignore[arg-type]
             self._on_end(job, _ENDS[kind], now)  # type: ignore[arg-type]
         deadlines = self._deadlines
         while deadlines and (not deadlines[0][3].live or deadlines[0][0] <= settled.now_ns):
@@ -532,11 +554,11 @@ class Medium(Generic[J, F]):
                 is_served = is_head and job.t_start_s < now - _NS
                 self._on_end(job, End.DEADLINE_IN_SERVICE if is_served else End.DEADLINE_QUEUED, now)
         self._is_telling = False
-        self._plan()
+        self._plan(event)
 
     def _end_group(self, frame: F, row: int) -> None:
-        links = slice(self._begin[frame.sender], self._begin[frame.sender + 1])
-        receivers, fates = self._receiver[links], self._settled.arrays[_WHY][links]
+        first, last = self._first[frame.sender : frame.sender + 2]
+        receivers, fates = self._receiver[first:last], self._settled.arrays[_WHY][first:last].tobytes()
         self._finished.append(row)
         del self._at_row[row]
         frame.row = -1
@@ -574,6 +596,8 @@ class Medium(Generic[J, F]):
         return min(1.0, plain_sum(self._busy_s()) / elapsed) if elapsed > 0 else 0.0
 
 
+_T_GROUP = 0
+"""As `edca.T_GROUP`."""
 _ENDS = {1: End.ARRIVED, 2: End.OVER, 3: End.UNREACHABLE}
 
 

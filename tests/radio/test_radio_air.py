@@ -425,6 +425,36 @@ def test_the_first_frame_may_begin_after_the_air_is_there() -> None:
     assert [ids for _, _, ids in f.heard] == [(1, 2, 3, 4)]
 
 
+def test_a_descriptor_that_is_handed_over_early_is_as_one_that_is_handed_over_in_time() -> None:
+    """Also between payloads: what waits for its time neither holds them up nor is held up."""
+    rng = np.random.default_rng(3)
+    due = list(zip(np.sort(rng.uniform(0.0, 0.9, 200)).tolist(), rng.integers(0, 5, 200).tolist(), strict=True))
+
+    def flown(early: bool) -> tuple[list[object], list[object]]:
+        f, heard = Flight(seed=3, spread=0.0), []
+
+        def give(at: float, sender: int) -> None:
+            in_s = max(0.0, at - f.env.now)
+            f.air.broadcast(sender, 208, lambda ids: heard.append((at, round(f.env.now, 9), list(ids))), in_s)
+
+        def tick(t: float) -> None:
+            for at, sender in due:
+                if t <= at < t + 0.1 and early:
+                    give(at, sender)
+                elif t <= at < t + 0.1:
+                    wait = f.env.timeout(at - f.env.now, (at, sender))
+                    wait.callbacks.append(lambda event: give(*event.value))
+            f.everyone(40_000, peers=1)(t)
+
+        f.fly(1.0, tick)
+        return heard, [(row.status, round(row.t_done_s, 9), row.airtime_s) for row in f.rows]
+
+    heard, rows = flown(early=True)
+    assert (heard, rows) == flown(early=False)
+    assert (len(heard), len(rows)) == (200, 50)
+    assert all(heard_s - at > 0.4e-3 for at, heard_s, _ in heard)
+
+
 def test_arguments_out_of_bounds_are_refused() -> None:
     f = Flight(STILL, 2)
     f.air.advance()
@@ -438,6 +468,8 @@ def test_arguments_out_of_bounds_are_refused() -> None:
         f.air.broadcast(2, 10, print)
     with pytest.raises(ValueError, match=r"payload_bytes is 3000, must be in \[1, 2200\]"):
         f.air.broadcast(0, 3000, print)
+    with pytest.raises(ValueError, match=r"in_s is -0.1, must be at least 0"):
+        f.air.broadcast(0, 10, print, -0.1)
     with pytest.raises(ValueError, match=r"publish_spread is 2, must be in \[0, 1\]"):
         Flight(STILL, 2, spread=2)
 

@@ -62,7 +62,7 @@ def test_every_living_drone_hears_a_descriptor_or_misses_it_for_a_reason(
     receivers = np.arange(6)
     if far:
         receivers, fates = np.delete(receivers, 4), [*fates[:4], fates[5]]
-    casts.end(casts.frame(0, 180, heard.append), receivers, np.array(fates, np.uint8))
+    casts.end(casts.frame(0, 180, heard.append), receivers, bytes(fates))
     assert heard == [[1, 5]]
     missed = 3 - (3 in gone)
     assert (counters.receptions, counters.missed, counters.collided) == (2, missed, 1)
@@ -74,8 +74,8 @@ def test_every_living_drone_hears_a_descriptor_or_misses_it_for_a_reason(
 def test_a_descriptor_that_meets_several_others_is_one_that_collided() -> None:
     counters = Counters()
     casts = Broadcasts(6.0, 4, counters, set(), seed=1, replication=0, frame_s=0.1, publish_spread=0.8, as_lists=True)
-    casts.end(casts.frame(2, 100, lambda ids: None), np.arange(4), np.array([1, 2, 0, 3], np.uint8))
-    casts.end(casts.frame(2, 100, lambda ids: None), np.arange(4), np.array([4, 5, 0, 4], np.uint8))
+    casts.end(casts.frame(2, 100, lambda ids: None), np.arange(4), bytes([1, 2, 0, 3]))
+    casts.end(casts.frame(2, 100, lambda ids: None), np.arange(4), bytes([4, 5, 0, 4]))
     assert (counters.collided, counters.missed, counters.broadcasts) == (1, 6, 2)
 
 
@@ -361,7 +361,7 @@ def test_what_a_link_is_used_at_follows_what_stands_beside_the_models() -> None:
     nan = math.nan
 
     def use(snr_db: float, given: LinkNow | None, gone: bool = False) -> Any:
-        return service.use(0, 1, 0.0, snr_db, snr_db, gone, given)
+        return service.use(0, 1, 0.0, snr_db, gone, given)
 
     assert use(-50.0, None).unreachable == "no_link"
     assert use(-50.0, LinkNow(0.0, 0.3, nan)).link[:2] == (0, False)
@@ -374,8 +374,8 @@ def test_what_a_link_is_used_at_follows_what_stands_beside_the_models() -> None:
 
 def test_a_sender_without_a_link_tries_no_rate() -> None:
     service = Service(AirSettings(rate_control="minstrel"), -88.0)
-    assert service.use(0, 1, 0.0, -50.0, -50.0, False).unreachable == "no_link"
-    assert service.use(0, 1, 0.0, 50.0, 50.0, False).link.mcs == 0  # it knows of none yet
+    assert service.use(0, 1, 0.0, -50.0, False).unreachable == "no_link"
+    assert service.use(0, 1, 0.0, 50.0, False).link.mcs == 0  # it knows of none yet
 
 
 @pytest.mark.parametrize("name", ["voice", "background"])
@@ -384,15 +384,13 @@ def test_a_traced_goodput_is_that_of_its_own_class_of_traffic(name: str) -> None
     rates = {}
     for payload_class in ("best_effort", name):
         settings = AirSettings(payload_class=payload_class, max_ampdu_frames=4)  # type: ignore[arg-type]
-        rates[payload_class] = (
-            Service(settings, -88.0).use(0, 1, 0.0, 30.0, 30.0, False, LinkNow(0.0, math.nan, 20.0)).link
-        )
+        rates[payload_class] = Service(settings, -88.0).use(0, 1, 0.0, 30.0, False, LinkNow(0.0, math.nan, 20.0)).link
     assert (rates[name].rate_mbps < rates["best_effort"].rate_mbps) is (name == "voice")
     assert rates[name].frames == 4
     few = AirSettings(
         standard="n", bandwidth_mhz=20, max_ampdu_frames=256, edca=EdcaSettings(background=AccessSettings(7, 15, 1023))
     )
-    assert Service(few, -88.0).use(0, 1, 0.0, 30.0, 30.0, False, LinkNow(0.0, math.nan, 300.0)).link.frames <= 64
+    assert Service(few, -88.0).use(0, 1, 0.0, 30.0, False, LinkNow(0.0, math.nan, 300.0)).link.frames <= 64
 
 
 def test_a_sample_was_given_the_channel_in_all_its_passes(tmp_path: Path) -> None:
@@ -410,12 +408,12 @@ def test_a_sample_was_given_the_channel_in_all_its_passes(tmp_path: Path) -> Non
 def test_a_measurement_begins_anew_with_another_rate_alone() -> None:
     service = Service(CALM, -88.0)
     s = sample(3000, 3)
-    good, weak = (service.use(0, 1, 0.0, db, db, False) for db in (40.0, 12.0))
-    service.begin(s, good, 1.0, fresh=True)
+    good, weak = (service.use(0, 1, 0.0, db, False) for db in (40.0, 12.0))
+    service.begin(s, good, 40.0, 1.0, fresh=True)
     s.mark_bits = 500.0
-    service.begin(s, good._replace(snr_db=39.0), 2.0, fresh=False)
+    service.begin(s, good, 39.0, 2.0, fresh=False)
     assert (s.mark_s, s.mark_bits, s.snr_db, s.t_first_s) == (1.0, 500.0, 39.0, 1.0)
-    service.begin(s, weak, 3.0, fresh=False)
+    service.begin(s, weak, 12.0, 3.0, fresh=False)
     assert (s.mark_s, s.mark_bits, s.t_first_s, s.begun_s) == (3.0, 0.0, 1.0, 1.0)
     s.forward(1, 2, 4.0, 77.0)
     assert (s.t_queued_s, s.drained_bits, s.hops, s.t_sent_s) == (4.0, 77.0, 2, 0.0)

@@ -82,7 +82,7 @@ def fades_db(settings: AirSettings, n: int, frames: int, seed: int = 1, per_fram
     gain = 1e6
     found: list[list[np.ndarray]] = [[] for _ in range(n)]
 
-    def end(frame: GroupFrame, receivers: np.ndarray, fates: np.ndarray) -> None:
+    def end(frame: GroupFrame, receivers: np.ndarray, fates: bytes) -> None:
         power = medium._settled.arrays[2].reshape(n, n)[frame.sender]  # as the kernel has it of the last frame
         found[frame.sender].append(10.0 * np.log10(np.where(np.arange(n) == frame.sender, np.nan, power / gain)))
 

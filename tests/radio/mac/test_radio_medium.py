@@ -53,9 +53,9 @@ class Bench:
         if job.sender in self.again:
             self.submit(job.sender, job.frames)
 
-    def _group_end(self, frame: GroupFrame, receivers: np.ndarray, fates: np.ndarray) -> None:
+    def _group_end(self, frame: GroupFrame, receivers: np.ndarray, fates: bytes) -> None:
         assert receivers.tolist() == list(range(self.n))
-        self.heard.append((self.env.now, frame.sender, tuple(int(f) for j, f in enumerate(fates) if j != frame.sender)))
+        self.heard.append((self.env.now, frame.sender, tuple(f for j, f in enumerate(fates) if j != frame.sender)))
 
     def job(self, sender: int, frames: int = 4, deadline_s: float = inf, to: int | None = None) -> AirJob:
         job = AirJob(self.jobs, sender, self.env.now + deadline_s)
@@ -91,6 +91,14 @@ def exchange_s(frames: int, mcs: int = 7) -> float:
     """The frame alone, without its answer."""
     rate = (36.0, 72.1, 108.1, 144.1, 216.2, 288.2, 324.3, 360.3)[mcs]
     return ppdu_s(frames * (FRAME + 6), rate)
+
+
+def test_rows_of_jobs_that_are_over_are_used_again() -> None:
+    """Also by jobs that come while the end of another is told."""
+    b = Bench(-50.0)
+    b.saturate(2, 4, until=1.0)
+    assert b.jobs > 500
+    assert len(b.medium._settled.rows) <= 64 * edca.JOB_COLUMNS
 
 
 # --- closed forms --------------------------------------------------------------------------------------

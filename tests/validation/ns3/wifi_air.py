@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,23 @@ class _Saturated:
         )  # fmt: skip
 
 
+def _feed(env: simpy.Environment, rows: Sequence[tuple[Any, ...]], give: Callable[..., None]) -> None:
+    """Hand each row over at its time, which is its first value; rows are in order of time."""
+    following = iter(rows)
+
+    def on(event: simpy.Event | None) -> None:
+        if event is not None:
+            give(*event.value)
+        now_s = env.now
+        for row in following:
+            if row[0] > now_s:
+                env.timeout(row[0] - now_s, row).callbacks.append(on)
+                return
+            give(*row)
+
+    on(None)
+
+
 def run_air(
     plan: Plan, warm_s: float, stop_s: float, *, mcs: int | None = None, seed: int = 1, **settings: Any
 ) -> dict[str, Any]:
@@ -76,33 +93,34 @@ def run_air(
     if mcs is not None:
         pin(air, mcs)
     rows: list[Transmission] = []
-    heard: list[tuple[float, int, float, list[int]]] = []
+    heard: list[tuple[float, int, float, Sequence[int]]] = []
     flows: list[_Saturated] = []
     marks: dict[str, Any] = {}
 
-    def descriptors() -> Iterator[simpy.Event]:
-        for t, s, size in plan.descriptors:
-            if t > env.now:
-                yield env.timeout(t - env.now)
-            air.broadcast(s, size, lambda ids, t=t, s=s: heard.append((t, s, env.now - t, list(ids))))
+    descriptors = plan.descriptors[::-1]
 
-    def payloads() -> Iterator[simpy.Event]:
-        for t, s, r, size in plan.payloads:
-            if t > env.now:
-                yield env.timeout(t - env.now)
-            air.send(s, r, size, kind="features", reliable=False, deadline_s=FRAME_S, on_done=rows.append)
+    def publish(until_s: float) -> None:
+        """Hand over a frame's descriptors, as a fleet does: each waits in its drone until its time."""
+        while descriptors and descriptors[-1][0] < until_s:
+            t, s, size = descriptors.pop()
+            in_s = max(0.0, t - env.now)
+            air.broadcast(s, size, lambda ids, t=t, s=s: heard.append((t, s, env.now - t, ids)), in_s)
+
+    def payload(_: float, s: int, r: int, size: int) -> None:
+        air.send(s, r, size, kind="features", reliable=False, deadline_s=FRAME_S, on_done=rows.append)
 
     def clock() -> Iterator[simpy.Event]:
         for k in range(frames - 1):
             air.advance()
             if k == 0:
                 flows.extend(_Saturated(air, f, s, r) for f, (s, r) in enumerate(plan.saturated))
+                _feed(env, plan.payloads, payload)
             if abs(k * FRAME_S - warm_s) < 1e-9:
                 marks.update(bytes=[f.bytes for f in flows], tx=list(air.airtime_s))
+            publish((k + 1) * FRAME_S)
             yield env.timeout((k + 1) * FRAME_S - env.now)
 
-    for process in (clock(), descriptors(), payloads()):
-        env.process(process)
+    env.process(clock())
     env.run(until=stop_s)
     span_s = stop_s - warm_s
     saturated = [8e-6 * (f.bytes - before) / span_s for f, before in zip(flows, marks["bytes"], strict=True)]
