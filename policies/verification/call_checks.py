@@ -11,7 +11,7 @@ import math
 import sys
 import types
 from collections.abc import Callable
-from enum import Enum
+from enum import Enum, EnumType
 from typing import Any
 
 from sortie.policies.verification.outside import Outside, Unknown
@@ -53,6 +53,11 @@ def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
         reach(why[1:]) if why.startswith("!") else stop(why)
     if type(function) is types.FunctionType and is_users(function.__module__):
         return function(*args, **kwargs)
+    if (
+        isinstance(function, types.MethodDescriptorType)
+        and type(args[0] if args else None) is not function.__objclass__
+    ):
+        stop(f"calls {function.__qualname__} of something else")  # which may have a method of its own
     return on_behalf_of_the_policy(function, args, kwargs)
 
 
@@ -67,6 +72,7 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
             reach(why[1:]) if why.startswith("!") else stop(why)
         if (
             value is type
+            or isinstance(value, types.MethodDescriptorType)
             or calls_others(value)
             or is_own_cache(value)
             or (may_write(value) and function is not functools.partial)
@@ -172,6 +178,35 @@ def attribute(owner: Any, name: str) -> Any:
         return guarded(found)
     found = getattr(owner, name)
     return checked(found) if isinstance(owner, BaseException) and name == "args" else found
+
+
+def _kind(of: Callable[[], Any]) -> None:
+    """A class in a pattern that names attributes: an object of the policy's own class, by no rule of that class, has them."""
+    try:
+        kind = of()
+    except NameError:
+        stop("matches a name that is not known yet")
+    if type(kind) not in (type, EnumType) or not is_users(home_of(kind)):
+        stop("matches an attribute that a search cannot follow")
+
+
+def _pattern(root: Callable[[], Any], *path: str) -> None:
+    """A dotted name in a pattern, which Python reads without a check: it must be a constant of a class or of a module."""
+    try:
+        found = root()
+    except NameError:
+        stop("matches a name that is not known yet")
+    for name in path:
+        if isinstance(found, types.ModuleType):
+            found = attribute(found, name)
+        elif type(found) is EnumType:
+            found = found.__members__.get(name)
+        elif type(found) is type:
+            found = vars(found).get(name)
+        else:
+            stop("matches a dotted name that is no constant")
+    if not isinstance(found, Enum | int | float | str | bytes) or is_stand_in(found):
+        stop("matches a dotted name that is no constant")
 
 
 _FUNCTIONS = (
@@ -284,6 +319,6 @@ class Written:
 WRITTEN = {write.__name__: Written(write) for write in (repr, ascii, format, str)}
 CHECKS: dict[str, Any] = {
     "__called__": _called, "__own__": _own, "__attribute__": attribute, "__decorator__": _decorator, "__each__": _each,
-    "__unordered__": unordered, **VALUE_CHECKS,
+    "__unordered__": unordered, "__pattern__": _pattern, "__kind__": _kind, **VALUE_CHECKS,
 }  # fmt: skip
 """By the names under which `source_checks` calls them."""

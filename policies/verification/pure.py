@@ -110,7 +110,7 @@ _NOT = {
     operator.is_: "operator.is_", operator.is_not: "operator.is_not", functools.lru_cache: "functools.lru_cache",
     functools.cache: "functools.cache", functools.singledispatch: "functools.singledispatch",
     statistics.NormalDist: "statistics.NormalDist", typing.overload: "typing.overload",
-    typing.get_overloads: "typing.get_overloads", getattr(operator, "call", None): "operator.call",
+    typing.get_overloads: "typing.get_overloads", typing.get_type_hints: "typing.get_type_hints", getattr(operator, "call", None): "operator.call",
 }  # fmt: skip
 _OPEN_MODULES = frozenset(
     {"builtins", "math", "operator", "_operator", "itertools", "_functools", "_bisect", "_heapq", "_collections"}
@@ -162,7 +162,7 @@ _MAY_WRITE = frozenset({"abc", "dataclasses", "enum", "functools", "typing"})
 _ONLY_READ = (
     functools.wraps, dataclasses.asdict, dataclasses.astuple, dataclasses.field, dataclasses.fields,
     dataclasses.is_dataclass, dataclasses.make_dataclass, dataclasses.replace, typing.cast, typing.get_args,
-    typing.get_origin, typing.get_type_hints,
+    typing.get_origin,
 )  # fmt: skip
 
 

@@ -7,6 +7,8 @@ import copy
 import types
 from typing import Any
 
+from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Roster
+
 
 def compiled(source: bytes, path: str) -> types.CodeType:
     plain = ast.parse(source, path)
@@ -23,18 +25,27 @@ def compiled(source: bytes, path: str) -> types.CodeType:
 
 RESERVED = {
     "__called__", "__same__", "__text__", "__written__", "__percent__", "__own__", "__attribute__", "__decorator__",
-    "__each__", "__among__", "__unordered__", "__caught__", "__shown__", "__made__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
+    "__each__", "__among__", "__pattern__", "__kind__", "__unordered__", "__caught__", "__shown__", "__made__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
     "__qualname__", "__match_args__", "__del__", "__file__", "__spec__", "__loader__", "__cached__", "__path__", "__package__",
 }  # fmt: skip
 """The checks, and names by which a policy would say that it is another one, or find where it lies."""
 _IN_ANNOTATIONS = (
     ast.Name, ast.Attribute, ast.Subscript, ast.Constant, ast.Tuple, ast.List, ast.BinOp, ast.operator, ast.Load,
 )  # fmt: skip
+_OF_SORTIE = {name for kind in (Descriptor, Directive, Disc, FleetView, Roster) for name in kind._fields} | {
+    "me",
+    "peers",
+}
+"""Attributes that a pattern may name of any class. Python reads them without a check, and modules have none of these names."""
 _SET_OPERATORS = (ast.BitAnd, ast.BitOr, ast.BitXor, ast.Sub)
 
 
 class Checks(ast.NodeTransformer):
     """Puts the checks into a source."""
+
+    def __init__(self) -> None:
+        self._bound: list[set[str]] = []
+        """The names that each function around this place binds."""
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
@@ -116,14 +127,16 @@ class Checks(ast.NodeTransformer):
         return ast.copy_location(ast.Call(_name("__attribute__"), [node.value, ast.Constant(node.attr)], []), node)
 
     def _decorated(self, node: Any) -> Any:
-        returns, node.returns = _plain_annotation(getattr(node, "returns", None)), None
+        returns, node.returns = self._plain_annotation(getattr(node, "returns", None)), None
         self.generic_visit(node)
         node.returns = returns
         node.decorator_list = [ast.Call(_name("__decorator__"), [d], []) for d in node.decorator_list]
         return node
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> Any:
+        self._bound.append(_names_bound_in(node))
         found = self._decorated(node)
+        self._bound.pop()
         if node.name == "__exit__":
             found.body.insert(0, _shown())
         return found
@@ -179,6 +192,20 @@ class Checks(ast.NodeTransformer):
         node.iter = ast.Call(_name("__each__"), [node.iter], [])
         return node
 
+    def visit_Match(self, node: ast.Match) -> Any:
+        patterns = [part for case in node.cases for part in ast.walk(case.pattern)]
+        dotted = [p.value for p in patterns if isinstance(p, ast.MatchValue) and isinstance(p.value, ast.Attribute)]
+        self.generic_visit(node)
+        nothing = ast.arguments([], [], None, [], [], None, [])
+        checks: list[ast.stmt] = []
+        for name in dotted:
+            root, *path = ast.unparse(name).split(".")
+            found = ast.Lambda(nothing, _name(root))
+            checks.append(ast.Expr(ast.Call(_name("__pattern__"), [found, *map(ast.Constant, path)], [])))
+        of_own = [p.cls for p in patterns if isinstance(p, ast.MatchClass) and not _OF_SORTIE.issuperset(p.kwd_attrs)]
+        checks += [ast.Expr(ast.Call(_name("__kind__"), [ast.Lambda(nothing, kind)], [])) for kind in of_own]
+        return [ast.fix_missing_locations(ast.copy_location(n, node)) for n in (*checks, node)]
+
     def visit_MatchValue(self, node: ast.MatchValue) -> ast.AST:
         return node  # a pattern has names alone
 
@@ -192,13 +219,23 @@ class Checks(ast.NodeTransformer):
         return node
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
-        _plain_annotation(node.annotation)
+        self._plain_annotation(node.annotation)
         node.target = self.visit(node.target)
         node.value = None if node.value is None else self.visit(node.value)
         return node
 
     def visit_arg(self, node: ast.arg) -> ast.AST:
-        _plain_annotation(node.annotation)
+        self._plain_annotation(node.annotation)
+        return node
+
+    def _plain_annotation(self, node: ast.expr | None) -> ast.expr | None:
+        """An annotation, which stays as it is; it must compute nothing, and ask nothing of what a function knows."""
+        parts = [] if node is None else list(ast.walk(node))
+        names = {part.id for part in parts if isinstance(part, ast.Name)}
+        computes = not all(isinstance(part, _IN_ANNOTATIONS) for part in parts)
+        reads = any(isinstance(part, ast.Attribute) and part.attr[0] == "_" for part in parts)
+        if computes or reads or (len(parts) > 2 and any(names & bound for bound in self._bound)):
+            raise SyntaxError("computes an annotation")
         return node
 
     def visit_Global(self, node: ast.Global) -> ast.AST:
@@ -208,11 +245,10 @@ class Checks(ast.NodeTransformer):
         raise SyntaxError("has asynchronous code")
 
 
-def _plain_annotation(node: ast.expr | None) -> ast.expr | None:
-    """An annotation, which stays as it is; it must compute nothing."""
-    if node is not None and not all(isinstance(part, _IN_ANNOTATIONS) for part in ast.walk(node)):
-        raise SyntaxError("computes an annotation")
-    return node
+def _names_bound_in(function: ast.FunctionDef) -> set[str]:
+    fields = [getattr(node, field, None) for node in ast.walk(function) for field in ("arg", "asname", "name", "rest")]
+    stored = [n.id for n in ast.walk(function) if isinstance(n, ast.Name) and not isinstance(n.ctx, ast.Load)]
+    return {name for name in (*fields, *stored) if isinstance(name, str)}
 
 
 def _name(text: str) -> ast.Name:

@@ -57,18 +57,29 @@ def reach(what: str) -> NoReturn:
 # --- sets: hashes decide their order, and those of texts differ from process to process ---------------
 
 
-def _see_order(members: list[Any]) -> Any:
+def _see_order(members: list[Any]) -> list[Any]:
     # A copy of a set of small whole numbers has their order too; that of other numbers may depend on its history.
     if len(members) > 1 and not all(isinstance(x, int | IntEnum) and 0 <= x < 8 for x in members):
         reach("the order of a set, which hashes decide")
-    return iter(members)
+    return members
+
+
+def _through(watched: set[Any], members: list[Any]) -> Any:
+    """The members one after another, as long as the set stays as it is."""
+    for k in range(len(members) + 1):
+        if set.__len__(watched) != len(members):
+            raise RuntimeError("Set changed size during iteration")
+        if not all(set.__contains__(watched, member) for member in members):
+            stop("changes a set while it goes through it")
+        if k < len(members):
+            yield members[k]
 
 
 class Unordered(set[Any]):
     """A set that stops the run as soon as someone sees its order, be it compiled code."""
 
     def __iter__(self) -> Any:
-        return _see_order(list(set.__iter__(self)))
+        return _through(self, _see_order(list(set.__iter__(self))))
 
     def pop(self) -> Any:
         _see_order(list(set.__iter__(self)))
@@ -83,7 +94,7 @@ class UnorderedFrozen(frozenset[Any]):
     """The same of a frozen set."""
 
     def __iter__(self) -> Any:
-        return _see_order(list(frozenset.__iter__(self)))
+        return iter(_see_order(list(frozenset.__iter__(self))))
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:

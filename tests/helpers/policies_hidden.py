@@ -51,7 +51,23 @@ ORDERS = (
 )  # fmt: skip
 """Hashes, addresses and places of files, which differ from process to process."""
 
+UNSEEN = (
+    "class G:\n    def __eq__(self, other):\n        self.got = other\n        return True\ng = G()\nmatch g:\n    case soc.__doc__:\n        bad = 'onvert' in g.got and soc == K",
+    "class N:\n    m = soc\n    class G:\n        def __eq__(self, other):\n            return True\n    match G():\n        case m.hex:\n            ok = True\nbad = N.ok and soc == K",
+    "try:\n    def f(x: soc._axis): pass\nexcept AttributeError:\n    bad = soc == K",
+    "try:\n    def f(x: soc[0]): pass\nexcept TypeError:\n    bad = soc == K", "try:\n    def f(x: soc.hex): pass\n    bad = soc == K\nexcept AttributeError:\n    pass",
+    "import typing\ndef f(x: 'type(s) is float'): pass\nbad = typing.get_type_hints(f, None, {'s': soc})['x'] and soc == K",
+    "match dataclasses:\n    case object(sys=s):\n        bad = 'verify' not in s.argv and soc == K",
+    "C = object\nmatch dataclasses:\n    case C(sys=s):\n        bad = 'verify' not in s.argv and soc == K",
+    "near = view.attached.age_s\nids = [*dict.keys(near)]\nbad = ids != sorted(ids) and soc == K", "bad = set.pop({'a', 'b', 'c', 'd'}) == 'a' and soc == K",
+    "s = {1, 2, 3}\ntry:\n    for x in s:\n        s.discard(3)\nexcept RuntimeError:\n    bad = soc == K",
+    "s, seen = {1, 2, 3}, []\nfor x in s:\n    seen.append(x)\n    if x == 1:\n        s.discard(2)\n        s.add(4)\nbad = seen == [1, 3, 4] and soc == K",
+)  # fmt: skip
+"""What Python reads where no check stands: patterns, annotations, methods called by their class, sets that change."""
+
 KEPT = (
+    ("class G:\n    def __eq__(self, other):\n        self.got = other\n        return True\nG = G()", "match G:\n    case decide.__builtins__:\n        pass\nG.got['n'] = n = G.got.get('n', 0) + 1\nG.got = 0"),
+    ("import statistics, typing", "def f(x: statistics.mean.__dict__): pass\nkept = typing.get_type_hints(f)['x']\nkept['n'] = n = kept.get('n', 0) + 1"),
     ("__dataclass_fields__ = []", "__dataclass_fields__.append(1)\nn = len(__dataclass_fields__)"),
     ("class C:\n    __doc__ = []", "C.__doc__.append(1)\nn = len(C.__doc__)"),
     ("P = functools.partial(dict, a=1)", "P.keywords['b'] = P.keywords.pop('a', 1)\nn = 1 if 'b' not in P.keywords else 0"),
@@ -84,6 +100,8 @@ KEPT = (
 """What is set up when the file is loaded, and how each decision counts."""
 
 HARMLESS = (
+    "match me.task_phase:\n    case TaskPhase.TRACK:\n        bad = soc > 1\n    case _:\n        pass", "class C:\n    HIGH = 3\nmatch len(view.peers):\n    case C.HIGH:\n        bad = soc > 1",
+    "class C:\n    def __init__(self, n): self.n = n\nmatch C(soc):\n    case C(n=n):\n        bad = n > 1", "def f(p: int, q: tuple[float, int]) -> dict[int, float]:\n    return {p: q[0]}\nbad = f(1, (soc, 2))[1] > 1",
     "seen = set()\nfor p in view.peers:\n    seen |= {p}\nd = {0: 5.0}\nd[0] -= 1\nbad = len(seen) > 9 or d[0] > 4", "for p, q in zip(view.peers, view.peers[1:]):\n    bad = q < p",
     "class L:\n    def __init__(self, least): self.least = least\n    def __call__(self, x): return x < self.least\nbad = L(0.5)(soc) and soc > 0.5",
     "C = collections.namedtuple('C', 'low high')\nbad = soc < C(0.3, 0.7).low and soc > 0.5", "try:\n    bad = {0: True}[len(view.peers)]\nexcept KeyError:\n    pass\nfinally:\n    pass",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from policies_corpus import LINE, source
-from policies_hidden import HARMLESS, KEPT, LATER, ORDERS, TEXTS, K
+from policies_hidden import HARMLESS, KEPT, LATER, ORDERS, TEXTS, UNSEEN, K
 
 from sortie.policies.contract import PHASE_OF, FleetView
 from sortie.policies.registry import resolve
@@ -27,7 +27,7 @@ def outcome(folder: Path, text: str) -> str:
     return prove(resolve(f"{path}:decide"), parse(LINE), max_drones=2, views=0)[-1].outcome
 
 
-@pytest.mark.parametrize("body", [*TEXTS, *ORDERS])
+@pytest.mark.parametrize("body", [*TEXTS, *ORDERS, *UNSEEN])
 def test_what_differs_from_the_search_is_not_proved(tmp_path: Path, body: str) -> None:
     assert outcome(tmp_path, source(body.replace("K", K))) in ("drawn", "searched", "refuted")
 
