@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from time import perf_counter  # before a user's file may replace it in its module
 from typing import Protocol
@@ -39,6 +38,7 @@ from sortie.scenarios.streams import stream
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
+from sortie.sim.engine.garbage import LEFTOVERS, older_objects_kept
 from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
@@ -120,6 +120,7 @@ def run_sortie(
         LimitError: the flight takes longer than `limits.run_s`.
     """
     begin_s = perf_counter()
+    LEFTOVERS.free()
     seed = scenario.seed if seed is None else seed
     name, policies = _policy(scenario, policy)
     limits, end_s = scenario.limits, begin_s + scenario.limits.run_s
@@ -135,7 +136,7 @@ def run_sortie(
         own = loaded(scenario)
         parts = build(scenario, policies, seed, replication, detector_of)
         files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited during the flight
-        with _older_objects_kept():
+        with older_objects_kept():
             fly(parts, each_second, observer)
         record = _collect(parts, policies, name, seed, replication)
         metrics = own_metrics(own, record)
@@ -322,16 +323,6 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
     if scorer is not None:
         scorer.flush()
     each_second(parts.env.now)
-
-
-@contextmanager
-def _older_objects_kept() -> Iterator[None]:
-    """Spare Python's search for cyclic garbage what was there before the flight: mostly modules, which stay for good."""
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
 
 
 def _collect(parts: Parts, policies: PolicyPlan, policy: str, seed: int, replication: int) -> SortieRecord:
