@@ -264,6 +264,8 @@ RECOGNISED = {
         f"change of an attached view by {act}": f"near = view.attached\ntry:\n    {act}\n    bad = len(near.age_s) < len(view.age_s) and {RARE}\nexcept (AttributeError, TypeError):\n    pass"
         for act in ("near.age_s[view.ego] = 0.0", "near.descriptors.update({})", "near.age_s.setdefault(view.ego, 0.0)")
     },
+    "own enum compares first": "class E(enum.IntEnum):\n    A = 10**15\n    def __gt__(self, other):\n        return other != 13123457\nbad = not int(first * 1e6) < E.A",
+    "own enum as another number": "class E(enum.IntEnum):\n    A = 5\n    def __int__(self):\n        return 7\nbad = first == E.A and first != 7",
     "kind of an attached mapping": f"near = view.attached.age_s\nbad = type(near) is dict and len(near) < len(view.age_s) and {RARE}",
     **{
         f"order of {made}": f"s = list({made}.descriptors)\nbad = len(s) < len(view.age_s) and s != sorted(s) and {RARE}"
@@ -639,6 +641,7 @@ CORRECT = {
     "combinations": "bad = any(a == b for a, b in itertools.combinations(view.peers, 2)) or soc < 0",
     "dataclass": "Rate = namedtuple('Rate', 'hz why')\nr = Rate(2 if soc < 0.5 else 4, 'x')\nbad = r.hz > 4",
     "exception": "try:\n    x = [1, 2][5]\nexcept IndexError:\n    bad = soc < 0",
+    "own enum": "class Level(enum.IntEnum):\n    LOW = 0\n    HIGH = 1\nbad = soc > Level.HIGH or int(first) < Level.LOW",
     "while": "n, x = 0, soc\nwhile n < 5:\n    n += 1\nbad = n != 5 or x > 1",
     "statistics of ids": "bad = statistics.mean([1, 2, 3]) != 2 or soc < 0",
     "math of constants": "bad = math.sqrt(4) != 2 or soc < 0",
