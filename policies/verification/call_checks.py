@@ -29,7 +29,7 @@ from sortie.policies.verification.pure import (
     takes_ranges,
 )
 from sortie.policies.verification.stand_ins import FOR_USER
-from sortie.policies.verification.symbols import Ranged
+from sortie.policies.verification.symbols import Ranged, Text
 from sortie.policies.verification.value_checks import (
     MAKES_TEXT,
     VALUE_CHECKS,
@@ -220,7 +220,7 @@ def _type_of(*args: Any, **kwargs: Any) -> Any:
     if len(args) == 1 and (_is_compiled(args[0]) or isinstance(args[0], types.FunctionType)):
         stop(KIND_OF_FUNCTION)
     if len(args) == 1 and (is_stand_in(args[0]) or isinstance(args[0], Unordered | UnorderedFrozen)):
-        return args[0].__class__
+        return str if type(args[0]) is Text else args[0].__class__
     return NotImplemented
 
 

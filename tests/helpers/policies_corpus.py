@@ -264,6 +264,8 @@ RECOGNISED = {
         f"change of an attached view by {act}": f"near = view.attached\ntry:\n    {act}\n    bad = len(near.age_s) < len(view.age_s) and {RARE}\nexcept (AttributeError, TypeError):\n    pass"
         for act in ("near.age_s[view.ego] = 0.0", "near.descriptors.update({})", "near.age_s.setdefault(view.ego, 0.0)")
     },
+    "type of text": f"bad = type(f'{{soc}}') is str and {RARE}",
+    "class of text": f"bad = f'{{soc}}'.__class__ is str and {RARE}",
     "own enum compares first": "class E(enum.IntEnum):\n    A = 10**15\n    def __gt__(self, other):\n        return other != 13123457\nbad = not int(first * 1e6) < E.A",
     "own enum as another number": "class E(enum.IntEnum):\n    A = 5\n    def __int__(self):\n        return 7\nbad = first == E.A and first != 7",
     "kind of an attached mapping": f"near = view.attached.age_s\nbad = type(near) is dict and len(near) < len(view.age_s) and {RARE}",
