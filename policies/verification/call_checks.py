@@ -136,7 +136,7 @@ def _cannot_ask(kinds: Any) -> str | None:
 def _own(owner: Any, name: str) -> Any:
     """What an attribute may be assigned to: an object of the policy's own classes."""
     if isinstance(owner, type) or not is_users(home_of(type(owner))):
-        if is_stand_in(owner) or isinstance(owner, tuple):
+        if issubclass(type(owner), tuple) and (name[0] != "_" or not is_stand_in(owner)):
             return owner  # raises what the real object raises
         stop(f"assigns to {name} of a {type(owner).__name__}")
     return owner
