@@ -28,7 +28,12 @@ class Outside:
         reach(self._path)
 
 
-_OPERATORS = "call iter len bool getitem eq ne lt le gt ge add radd sub rsub mul rmul truediv float int str hash"
+_OPERATORS = (
+    "call iter next reversed len bool getitem setitem delitem contains eq ne lt le gt ge add radd sub rsub mul rmul matmul "
+    "rmatmul truediv rtruediv floordiv rfloordiv mod rmod divmod rdivmod pow rpow lshift rlshift rshift rrshift and rand or "
+    "ror xor rxor neg pos abs invert float int index complex round trunc floor ceil bytes str repr format hash enter exit "
+    "instancecheck subclasscheck await aiter anext fspath"
+)
 for _operator in _OPERATORS.split():
     setattr(Outside, f"__{_operator}__", Outside._used)
 
