@@ -31,11 +31,14 @@ from sortie.policies.verification.pure import (
 from sortie.policies.verification.stand_ins import FOR_USER
 from sortie.policies.verification.symbols import Ranged, Text
 from sortie.policies.verification.value_checks import (
+    DOUBTFUL,
     MAKES_TEXT,
     VALUE_CHECKS,
+    cannot_ask,
     checked,
     is_stand_in,
     may_hold_stand_in,
+    passed,
     stands_for_text,
 )
 from sortie.policies.verification.watch import WATCH, Unordered, UnorderedFrozen, ordered_for, reach, stop, unordered
@@ -53,7 +56,11 @@ def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
         reach(why[1:]) if why.startswith("!") else stop(why)
     if type(function) is types.FunctionType and is_users(function.__module__):
         return function(*args, **kwargs)
-    return on_behalf_of_the_policy(function, args, kwargs)
+    try:
+        return on_behalf_of_the_policy(function, args, kwargs)
+    except DOUBTFUL:  # a lambda may be called by compiled code that catches it
+        passed()
+        raise
 
 
 def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
@@ -67,6 +74,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
             reach(why[1:]) if why.startswith("!") else stop(why)
         if (
             value is type
+            or value is isinstance
+            or value is issubclass
             or calls_others(value)
             or is_own_cache(value)
             or (may_write(value) and function is not functools.partial)
@@ -89,6 +98,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     if has_text and function is int and len(args) + len(kwargs) > 1:
         stop("reads a number in the text of a range")
     if function in (isinstance, issubclass) and len(args) == 2 and (why := _cannot_ask(args[1])):
+        stop(why)
+    if function is isinstance and len(args) == 2 and is_stand_in(args[0]) and (why := cannot_ask(args[1])):
         stop(why)
     special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
     if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:

@@ -6,9 +6,11 @@ raise `Reached`. `call_checks` has the checks on calls and attributes.
 
 from __future__ import annotations
 
+import dis
 import re
 import sys
 import types
+from abc import ABCMeta
 from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable
 from enum import Enum
@@ -18,7 +20,7 @@ from typing import Any
 from sortie.policies.verification.outside import Outside
 from sortie.policies.verification.pure import foreign_method, home_of
 from sortie.policies.verification.symbols import MARK, Ranged, Text
-from sortie.policies.verification.watch import reach, stop, unordered
+from sortie.policies.verification.watch import WATCH, reach, stop, unordered
 from sortie.scenarios.plugins.user_code import is_users
 
 STAND_INS = (
@@ -60,10 +62,20 @@ def checked(found: Any) -> Any:
 _CONTAINERS = (list, tuple, dict, deque, defaultdict, OrderedDict, Counter)
 
 
+_ASKS_KINDS = {"__subclasshook__", "__subclasscheck__", "__length_hint__"}
+"""Methods that are given the class of a stand-in, or from which compiled code takes no stand-in and hides the error."""
+
+
 def _made(kind: Any) -> Any:
     """A class as it is, if all that Python calls by its special names is the policy's own code."""
     if isinstance(kind, type) and is_users(home_of(kind)) and (name := foreign_method(kind)) is not None:
         stop(f"has compiled code as {name} of {kind.__name__}")
+    if is_users(home_of(kind)):
+        for name in _ASKS_KINDS & vars(kind).keys():
+            if getattr(vars(kind)[name], "__module__", None) != "typing":
+                stop(f"has {name} in {kind.__name__}")
+        if getattr(kind, "_is_runtime_protocol", False):
+            stop(f"has the protocol {kind.__name__}, which instances are checked against")
     return kind
 
 
@@ -90,7 +102,84 @@ def _shown() -> None:
                 stop("looks at an error whose text is another one in flight")
 
 
+DOUBTFUL = (TypeError, AttributeError, SystemError)
+"""Kinds of errors that compiled code raises of a stand-in although it would take the real object."""
+_ALIKE = re.compile(
+    r"'(?P<kind>\w+)' object (is not (iterable|subscriptable|callable)|does not support item (assignment|deletion))"
+    r"|cannot unpack non-iterable NoneType object|object of type 'NoneType' has no len\(\)"
+    r"|argument of type 'NoneType' is not iterable|bad operand type for .+: 'NoneType'"
+    r"|unsupported operand type\(s\) for .+: ('NoneType' and '\w+'|'\w+' and 'NoneType')"
+    r"|'[<>]=?' not supported between instances of ('NoneType' and '\w+'|'\w+' and 'NoneType')"
+)
+"""Texts of errors that real objects raise as well, unless `kind` is a stand-in's."""
+_RAISES = dis.opmap["RAISE_VARARGS"]
+_SETS = (dis.opmap["STORE_ATTR"], dis.opmap["DELETE_ATTR"])
+_PLAIN_OWNERS = (type(None), int, float, str, bytes, tuple, list, dict, types.MappingProxyType, types.ModuleType)
+
+
+def passed() -> None:
+    """An error is caught, or leaves a function, whose caller may catch it."""
+    parts: list[Any] = [sys.exc_info()[1]]
+    while parts:
+        error = parts.pop()
+        if isinstance(error, BaseExceptionGroup):
+            parts += error.exceptions
+        elif isinstance(error, DOUBTFUL) and not _is_alike(error):
+            WATCH.doubtful.append(error)
+
+
+def _is_alike(error: BaseException) -> bool:
+    """Whether real objects raise this error as well."""
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    if last is not None and is_users(str(last.tb_frame.f_globals.get("__name__"))):
+        step = last.tb_frame.f_code.co_code[last.tb_lasti]
+        if step == _RAISES or (step in _SETS and isinstance(error, AttributeError)):  # the second: see `_own`
+            return True
+    if isinstance(error, AttributeError):
+        owner = error.obj
+        known = type(owner) in _PLAIN_OWNERS or is_users(home_of(owner if isinstance(owner, type) else type(owner)))
+        return error.name is not None and known
+    text = _ALIKE.fullmatch(str(error.args[0])) if type(error) is TypeError and error.args else None
+    return text is not None and not _STAND_IN_NAMES.search(text["kind"] or "")
+
+
+def _raised(kinds: Any) -> Any:
+    """What is raised, or what an `except` names: as it is, if it is not outside."""
+    for kind in kinds if type(kinds) is tuple else (kinds,):
+        if isinstance(kind, Outside):
+            kind._used()
+        if type(kind) is tuple:
+            _raised(kind)
+    return kinds
+
+
+def cannot_ask(kind: Any) -> str | None:
+    """Why a search cannot ask whether a stand-in is an instance of this: its answer depends on more than `__class__`."""
+    if isinstance(kind, tuple):
+        return next((why for one in kind if (why := cannot_ask(one))), None)
+    if isinstance(kind, types.UnionType):
+        return cannot_ask(kind.__args__)
+    if isinstance(kind, type):
+        home, how = home_of(kind), type(kind)
+        asks_plainly = how.__instancecheck__ is type.__instancecheck__ or (how is ABCMeta and is_users(home))
+        if asks_plainly or home in ("numbers", "collections.abc"):
+            return None
+    return f"asks whether something is a {getattr(kind, '__name__', kind)}"
+
+
+def _kinds(*kinds: Any) -> None:
+    """The classes of a pattern."""
+    for kind in kinds:
+        if isinstance(kind, Outside):
+            kind._used()
+        if (why := cannot_ask(kind)) is not None:
+            stop(why)
+
+
 def _caught() -> None:
+    passed()
     error = sys.exc_info()[1]
     if isinstance(error, BaseExceptionGroup):
         error = error.subgroup((RecursionError, MemoryError))
@@ -215,6 +304,7 @@ def _among(left: Any, right: Any) -> bool:
 
 VALUE_CHECKS: dict[str, Any] = {
     "__same__": _same, "__text__": _text, "__written__": _written, "__percent__": _percent, "__among__": _among,
-    "__caught__": _caught, "__shown__": _shown, "__made__": _made,
+    "__caught__": _caught, "__shown__": _shown, "__made__": _made, "__raised__": _raised, "__kinds__": _kinds,
+    "__passed__": passed, "__doubtful__": DOUBTFUL,
 }  # fmt: skip
 """By the names under which `source_checks` calls them."""
