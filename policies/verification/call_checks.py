@@ -161,6 +161,8 @@ _OF_OWN_CLASSES = {"__init__", "__post_init__"}
 
 def attribute(owner: Any, name: str) -> Any:
     if isinstance(owner, Outside):
+        if name[:2] == "__":
+            owner._used()
         return Outside(f"{owner._path}.{name}")
     if name[0] == "_" and not _may_read(owner, name):
         stop(f"reads {name}")

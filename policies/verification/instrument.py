@@ -60,7 +60,7 @@ class Instrumented:
                 raise WATCH.stopped
             caught = next((e for e in WATCH.doubtful if e is not escaped), None)
             if caught is not None:
-                raise Refused(f"catches a {type(caught).__name__} that real objects may not raise")
+                raise Refused(f"catches an error ({type(caught).__name__}) that real objects may not raise")
             changed = self._kept.changed() or WATCH.changed()
             if changed:
                 raise Remembers(changed)

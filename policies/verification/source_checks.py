@@ -30,7 +30,7 @@ def compiled(source: bytes, path: str) -> types.CodeType:
 
 RESERVED = {
     "__called__", "__same__", "__text__", "__written__", "__percent__", "__own__", "__attribute__", "__decorator__",
-    "__each__", "__among__", "__unordered__", "__caught__", "__shown__", "__made__", "__kinds__", "__raised__", "__passed__", "__doubtful__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
+    "__each__", "__among__", "__unordered__", "__caught__", "__shown__", "__made__", "__kinds__", "__subject__", "__raised__", "__passed__", "__doubtful__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
     "__qualname__", "__match_args__", "__del__", "__file__", "__spec__", "__loader__", "__cached__", "__path__", "__package__",
 }  # fmt: skip
 """The checks, and names by which a policy would say that it is another one, or find where it lies."""
@@ -214,6 +214,8 @@ class Checks(ast.NodeTransformer):
         if kinds & _bound(node):
             raise SyntaxError("binds the name of a class in the match that uses it")
         self.generic_visit(node)
+        if any(isinstance(part, ast.MatchMapping) for part in ast.walk(node)):
+            node.subject = ast.Call(_name("__subject__"), [node.subject], [])
         asked = ast.Expr(ast.Call(_name("__kinds__"), [_name(kind) for kind in sorted(kinds)], []))
         return [ast.copy_location(asked, node), node] if kinds else node
 

@@ -74,9 +74,21 @@ def _made(kind: Any) -> Any:
         for name in _ASKS_KINDS & vars(kind).keys():
             if getattr(vars(kind)[name], "__module__", None) != "typing":
                 stop(f"has {name} in {kind.__name__}")
+        for name, value in vars(kind).items():
+            if name[:2] == "__" and _is_lambda(getattr(value, "__func__", value)):
+                stop(f"has a lambda as {name} of {kind.__name__}")
         if getattr(kind, "_is_runtime_protocol", False):
             stop(f"has the protocol {kind.__name__}, which instances are checked against")
     return kind
+
+
+def _is_lambda(value: Any) -> bool:
+    """Whether this is the policy's own `lambda`, which does not note the errors that leave it (`passed`)."""
+    return (
+        type(value) is types.FunctionType
+        and value.__code__.co_name == "<lambda>"
+        and is_users(str(value.__globals__.get("__name__")))
+    )
 
 
 _STAND_IN_NAMES = re.compile(
@@ -169,6 +181,19 @@ def cannot_ask(kind: Any) -> str | None:
     return f"asks whether something is a {getattr(kind, '__name__', kind)}"
 
 
+def _subject(value: Any) -> Any:
+    """What a pattern of a mapping is matched with."""
+    parts, met = [value], set[int]()
+    while parts:
+        part = parts.pop()
+        if isinstance(part, Outside):
+            part._used()
+        if type(part) in (list, tuple, dict) and id(part) not in met:
+            met.add(id(part))
+            parts += part.values() if type(part) is dict else part
+    return value
+
+
 def _kinds(*kinds: Any) -> None:
     """The classes of a pattern."""
     for kind in kinds:
@@ -229,6 +254,9 @@ def _takes_apart(template: str) -> bool:
 
 
 def _same(a: Any, b: Any) -> bool:
+    for one in (a, b):
+        if isinstance(one, Outside):
+            one._used()
     for one in (a, b):
         if one is None or one is NotImplemented or one is Ellipsis or isinstance(one, bool | Enum | type):
             return a is b
@@ -304,7 +332,7 @@ def _among(left: Any, right: Any) -> bool:
 
 VALUE_CHECKS: dict[str, Any] = {
     "__same__": _same, "__text__": _text, "__written__": _written, "__percent__": _percent, "__among__": _among,
-    "__caught__": _caught, "__shown__": _shown, "__made__": _made, "__raised__": _raised, "__kinds__": _kinds,
+    "__caught__": _caught, "__shown__": _shown, "__made__": _made, "__raised__": _raised, "__kinds__": _kinds, "__subject__": _subject,
     "__passed__": passed, "__doubtful__": DOUBTFUL,
 }  # fmt: skip
 """By the names under which `source_checks` calls them."""

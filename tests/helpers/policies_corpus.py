@@ -248,6 +248,7 @@ CAUGHT_BY = {
     "finally": f"def ask():\n    ok = False\n    try:\n        float.is_integer(first)\n        ok = True\n    finally:\n        return ok\nbad = ask() and {RARE}",
     "list": f"ok = []\nclass K:\n    def __len__(self):\n        float.is_integer(first)\n        ok.append(1)\n        return 0\n    def __iter__(self):\n        return iter(())\nlist(K())\nbad = len(ok) > 0 and {RARE}",
     "list from a lambda": f"ok = []\nclass K:\n    __len__ = lambda self: (float.is_integer(first), ok.append(1), 0)[2]\n    def __iter__(self):\n        return iter(())\nlist(K())\nbad = len(ok) > 0 and {RARE}",
+    "list from an operator in a lambda": f"ok = []\nclass K:\n    def __hash__(self):\n        return int(first)\nclass L:\n    __len__ = lambda self: ({{K(): 1}}, ok.append(1), 0)[2]\n    def __iter__(self):\n        return iter(())\nlist(L())\nbad = len(ok) > 0 and {RARE}",
     "group": f"try:\n    float.is_integer(first)\n    bad = {RARE}\nexcept* TypeError:\n    pass",
     "another error": f"try:\n    try:\n        float.is_integer(first)\n        bad = {RARE}\n    except TypeError:\n        raise KeyError(1)\nexcept KeyError:\n    pass",
 }
@@ -306,6 +307,17 @@ RECOGNISED = {
     "own __subclasscheck__": f"import abc\nclass M(abc.ABCMeta):\n    def __subclasscheck__(cls, kind):\n        return kind is not float\nclass Q(metaclass=M): pass\nbad = not isinstance(soc, Q) and {RARE}",
     "type of text": f"bad = type(f'{{soc}}') is str and {RARE}",
     "class of text": f"bad = f'{{soc}}'.__class__ is str and {RARE}",
+    "identity of what is outside": f"bad = os.sep is os.sep and {RARE}",
+    "class of what is outside": f"bad = os.sep.__class__ is str and {RARE}",
+    **{
+        f"what is outside in a pattern: {pattern}": f"match {value}:\n    case {pattern}:\n        bad = {RARE}\n    case _:\n        pass"
+        for value, pattern in (
+            ("os.sep", "str()"),
+            ("[os.sep]", "[str()]"),
+            ("sys.version_info", "[a, *_]"),
+            ("os.environ", "{}"),
+        )
+    },
     "sets an attribute of flags": f"try:\n    me.novelty_flags.seen = True\nexcept AttributeError:\n    bad = {RARE}",
     "sets a private part": f"x = me.battery_soc\ntry:\n    x._axis = 1\nexcept AttributeError:\n    bad = {RARE}",
     "sets the class": f"try:\n    soc.__class__ = int\nexcept AttributeError:\n    pass\nexcept TypeError:\n    bad = {RARE}",
