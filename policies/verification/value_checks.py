@@ -152,7 +152,9 @@ def _is_alike(error: BaseException) -> bool:
     if isinstance(error, AttributeError):
         owner = error.obj
         known = type(owner) in _PLAIN_OWNERS or is_users(home_of(owner if isinstance(owner, type) else type(owner)))
-        return error.name is not None and known
+        # A view and a descriptor are of classes of their own, with the fields of the real ones.
+        lacks = issubclass(type(owner), tuple) and not hasattr(owner.__class__, str(error.name))
+        return error.name is not None and (known or lacks)
     text = _ALIKE.fullmatch(str(error.args[0])) if type(error) is TypeError and error.args else None
     return text is not None and not _STAND_IN_NAMES.search(text["kind"] or "")
 

@@ -710,6 +710,7 @@ CORRECT = {
     "no region": "try:\n    bad = me.region.radius_m < 0\nexcept AttributeError:\n    bad = me.region is not None",
     "compares with nothing": "try:\n    bad = {}.get('limit') < soc\nexcept TypeError:\n    bad = soc < 0",
     "item of nothing": "try:\n    bad = {}.get('limits')['low'] < soc\nexcept TypeError:\n    bad = soc < 0",
+    "no such field": "try:\n    bad = me.charge > 1\nexcept AttributeError:\n    bad = soc > 1",
     "own attribute": "class C: pass\ntry:\n    bad = C().limit < soc\nexcept AttributeError:\n    bad = soc < 0",
     "own error": "def limit(x):\n    if x < 0.5:\n        raise TypeError('low')\n    return 2.0\ntry:\n    bad = limit(soc) > 2\nexcept TypeError:\n    bad = soc >= 0.5",
     "own error again": "class Low(AttributeError): pass\ntry:\n    try:\n        if soc < 0.5: raise Low\n    except Low as error:\n        raise ValueError(1) from error\nexcept (ValueError, KeyError):\n    bad = soc >= 0.5",
