@@ -29,13 +29,16 @@ from sortie.policies.verification.pure import (
     takes_ranges,
 )
 from sortie.policies.verification.stand_ins import FOR_USER
-from sortie.policies.verification.symbols import Ranged
+from sortie.policies.verification.symbols import Ranged, Text
 from sortie.policies.verification.value_checks import (
+    DOUBTFUL,
     MAKES_TEXT,
     VALUE_CHECKS,
+    cannot_ask,
     checked,
     is_stand_in,
     may_hold_stand_in,
+    passed,
     stands_for_text,
 )
 from sortie.policies.verification.watch import WATCH, Unordered, UnorderedFrozen, ordered_for, reach, stop, unordered
@@ -58,7 +61,11 @@ def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
         and type(args[0] if args else None) is not function.__objclass__
     ):
         stop(f"calls {function.__qualname__} of something else")  # which may have a method of its own
-    return on_behalf_of_the_policy(function, args, kwargs)
+    try:
+        return on_behalf_of_the_policy(function, args, kwargs)
+    except DOUBTFUL:  # a lambda may be called by compiled code that catches it
+        passed()
+        raise
 
 
 def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
@@ -72,6 +79,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
             reach(why[1:]) if why.startswith("!") else stop(why)
         if (
             value is type
+            or value is isinstance
+            or value is issubclass
             or isinstance(value, types.MethodDescriptorType)
             or calls_others(value)
             or is_own_cache(value)
@@ -95,6 +104,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     if has_text and function is int and len(args) + len(kwargs) > 1:
         stop("reads a number in the text of a range")
     if function in (isinstance, issubclass) and len(args) == 2 and (why := _cannot_ask(args[1])):
+        stop(why)
+    if function is isinstance and len(args) == 2 and is_stand_in(args[0]) and (why := cannot_ask(args[1])):
         stop(why)
     special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
     if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
@@ -142,7 +153,7 @@ def _cannot_ask(kinds: Any) -> str | None:
 def _own(owner: Any, name: str) -> Any:
     """What an attribute may be assigned to: an object of the policy's own classes."""
     if isinstance(owner, type) or not is_users(home_of(type(owner))):
-        if is_stand_in(owner) or isinstance(owner, tuple):
+        if issubclass(type(owner), tuple) and (name[0] != "_" or not is_stand_in(owner)):
             return owner  # raises what the real object raises
         stop(f"assigns to {name} of a {type(owner).__name__}")
     return owner
@@ -156,6 +167,8 @@ _OF_OWN_CLASSES = {"__init__", "__post_init__"}
 
 def attribute(owner: Any, name: str) -> Any:
     if isinstance(owner, Outside):
+        if name[:2] == "__":
+            owner._used()
         return Outside(f"{owner._path}.{name}")
     if name[0] == "_" and not _may_read(owner, name):
         stop(f"reads {name}")
@@ -180,13 +193,9 @@ def attribute(owner: Any, name: str) -> Any:
     return checked(found) if isinstance(owner, BaseException) and name == "args" else found
 
 
-def _kind(of: Callable[[], Any]) -> None:
-    """A class in a pattern that names attributes: an object of the policy's own class, by no rule of that class, has them."""
-    try:
-        kind = of()
-    except NameError:
-        stop("matches a name that is not known yet")
-    if type(kind) not in (type, EnumType) or not is_users(home_of(kind)):
+def _kind(*kinds: Any) -> None:
+    """Classes in patterns that name attributes: an object of the policy's own class, by no rule of that class, has them."""
+    if not all(type(kind) in (type, EnumType) and is_users(home_of(kind)) for kind in kinds):
         stop("matches an attribute that a search cannot follow")
 
 
@@ -255,7 +264,7 @@ def _type_of(*args: Any, **kwargs: Any) -> Any:
     if len(args) == 1 and (_is_compiled(args[0]) or isinstance(args[0], types.FunctionType)):
         stop(KIND_OF_FUNCTION)
     if len(args) == 1 and (is_stand_in(args[0]) or isinstance(args[0], Unordered | UnorderedFrozen)):
-        return args[0].__class__
+        return str if type(args[0]) is Text else args[0].__class__
     return NotImplemented
 
 

@@ -48,12 +48,19 @@ class Instrumented:
         """
         if self._kept is None:
             self._kept = kept_by(self.function, self.module)
-        WATCH.stopped = None
+        WATCH.stopped, WATCH.doubtful = None, []
+        escaped: BaseException | None = None
         try:
             return self.function(view, **params)
+        except BaseException as error:
+            escaped = error
+            raise
         finally:
             if WATCH.stopped is not None:
                 raise WATCH.stopped
+            caught = next((e for e in WATCH.doubtful if e is not escaped), None)
+            if caught is not None:
+                raise Refused(f"catches an error ({type(caught).__name__}) that real objects may not raise")
             changed = self._kept.changed() or WATCH.changed()
             if changed:
                 raise Remembers(changed)

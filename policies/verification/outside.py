@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NoReturn
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
 
 from sortie.policies.verification.pure import is_seeded
 from sortie.policies.verification.watch import reach, stop
+from sortie.scenarios.plugins.user_code import is_users
 
 
 class Outside:
@@ -19,6 +22,12 @@ class Outside:
             raise AttributeError(name)
         return Outside(f"{self._path}.{name}")
 
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        if is_users(str(sys._getframe(1).f_globals.get("__name__"))):  # a pattern with a class
+            self._used()
+        return type(self)
+
     def __mro_entries__(self, _: object) -> NoReturn:
         self._used()
 
@@ -28,9 +37,16 @@ class Outside:
         reach(self._path)
 
 
-_OPERATORS = "call iter len bool getitem eq ne lt le gt ge add radd sub rsub mul rmul truediv float int str hash"
+_OPERATORS = (
+    "call iter next reversed len bool getitem setitem delitem contains eq ne lt le gt ge add radd sub rsub mul rmul matmul "
+    "rmatmul truediv rtruediv floordiv rfloordiv mod rmod divmod rdivmod pow rpow lshift rlshift rshift rrshift and rand or "
+    "ror xor rxor neg pos abs invert float int index complex round trunc floor ceil bytes str repr format hash enter exit "
+    "instancecheck subclasscheck await aiter anext fspath"
+)
 for _operator in _OPERATORS.split():
     setattr(Outside, f"__{_operator}__", Outside._used)
+
+Sequence.register(Outside)  # a pattern of a sequence meets its length
 
 
 class Unknown(Outside):

@@ -110,7 +110,8 @@ _NOT = {
     operator.is_: "operator.is_", operator.is_not: "operator.is_not", functools.lru_cache: "functools.lru_cache",
     functools.cache: "functools.cache", functools.singledispatch: "functools.singledispatch",
     statistics.NormalDist: "statistics.NormalDist", typing.overload: "typing.overload",
-    typing.get_overloads: "typing.get_overloads", typing.get_type_hints: "typing.get_type_hints", getattr(operator, "call", None): "operator.call",
+    typing.get_overloads: "typing.get_overloads", typing.get_type_hints: "typing.get_type_hints",
+    typing.runtime_checkable: "typing.runtime_checkable", getattr(operator, "call", None): "operator.call",
 }  # fmt: skip
 _OPEN_MODULES = frozenset(
     {"builtins", "math", "operator", "_operator", "itertools", "_functools", "_bisect", "_heapq", "_collections"}

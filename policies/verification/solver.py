@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from enum import IntEnum
 from typing import Any
 
 from sortie.policies.verification.symbols import MARK, Path, Ranged, Refused, Text
@@ -166,8 +165,6 @@ class Solved(Ranged):
         path: Any = self._path
         if isinstance(other, Solved):
             return other._term
-        if isinstance(other, IntEnum):
-            return path.constant(int(other))
         c = self._constant(other)
         if c is None:
             return None

@@ -12,12 +12,19 @@ from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Ros
 
 def compiled(source: bytes, path: str) -> types.CodeType:
     plain = ast.parse(source, path)
+    kinds, nonlocals = set[str](), set[str]()
     for node in ast.walk(plain):
         names = {getattr(node, field, None) for field in ("id", "name", "arg", "asname", "rest")}
         reads_name = isinstance(node, ast.Name) and node.id == "__name__" and isinstance(node.ctx, ast.Load)
         taken = RESERVED & names
         if taken and not reads_name and not isinstance(node, ast.keyword):
             raise SyntaxError(f"uses the name {taken.pop()}")
+        if isinstance(node, ast.Nonlocal):
+            nonlocals.update(node.names)
+        if isinstance(node, ast.MatchClass) and isinstance(node.cls, ast.Name):
+            kinds.add(node.cls.id)
+    if kinds & nonlocals:  # a call within the `match` could change it after its check
+        raise SyntaxError("changes a class that a match uses")
     tree = Checks().visit(plain)
     code: types.CodeType = compile(ast.fix_missing_locations(tree), path, "exec", dont_inherit=True)
     return code
@@ -25,7 +32,7 @@ def compiled(source: bytes, path: str) -> types.CodeType:
 
 RESERVED = {
     "__called__", "__same__", "__text__", "__written__", "__percent__", "__own__", "__attribute__", "__decorator__",
-    "__each__", "__among__", "__pattern__", "__kind__", "__unordered__", "__caught__", "__shown__", "__made__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
+    "__each__", "__among__", "__pattern__", "__kind__", "__unordered__", "__caught__", "__shown__", "__made__", "__kinds__", "__subject__", "__raised__", "__passed__", "__doubtful__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
     "__qualname__", "__match_args__", "__del__", "__file__", "__spec__", "__loader__", "__cached__", "__path__", "__package__",
 }  # fmt: skip
 """The checks, and names by which a policy would say that it is another one, or find where it lies."""
@@ -137,6 +144,10 @@ class Checks(ast.NodeTransformer):
         self._bound.append(_names_bound_in(node))
         found = self._decorated(node)
         self._bound.pop()
+        # Compiled code and Python's library, which may call this function, catch errors as well.
+        passes = ast.ExceptHandler(_name("__doubtful__"), None, [_passed(), ast.Raise()])
+        documented = ast.get_docstring(found) is not None and len(found.body) > 1
+        found.body[documented:] = [ast.Try(found.body[documented:], [passes], [], [])]
         if node.name == "__exit__":
             found.body.insert(0, _shown())
         return found
@@ -151,6 +162,13 @@ class Checks(ast.NodeTransformer):
     def visit_ExceptHandler(self, node: ast.ExceptHandler) -> ast.AST:
         self.generic_visit(node)
         node.body[:0] = [_caught()] if node.name is None else [_caught(), _shown()]
+        node.type = node.type and ast.Call(_name("__raised__"), [node.type], [])
+        return node
+
+    def visit_Raise(self, node: ast.Raise) -> ast.AST:
+        self.generic_visit(node)
+        node.exc = node.exc and ast.Call(_name("__raised__"), [node.exc], [])
+        node.cause = node.cause and ast.Call(_name("__raised__"), [node.cause], [])
         return node
 
     def visit_Try(self, node: ast.Try) -> ast.AST:
@@ -194,17 +212,24 @@ class Checks(ast.NodeTransformer):
 
     def visit_Match(self, node: ast.Match) -> Any:
         patterns = [part for case in node.cases for part in ast.walk(case.pattern)]
+        classes = [p for p in patterns if isinstance(p, ast.MatchClass) and isinstance(p.cls, ast.Name)]
+        kinds = {ast.unparse(p.cls) for p in classes}
+        if kinds & _bound(node):
+            raise SyntaxError("binds the name of a class in the match that uses it")
+        of_own = {ast.unparse(p.cls) for p in classes if not _OF_SORTIE.issuperset(p.kwd_attrs)}
         dotted = [p.value for p in patterns if isinstance(p, ast.MatchValue) and isinstance(p.value, ast.Attribute)]
         self.generic_visit(node)
-        nothing = ast.arguments([], [], None, [], [], None, [])
-        checks: list[ast.stmt] = []
-        for name in dotted:
-            root, *path = ast.unparse(name).split(".")
-            found = ast.Lambda(nothing, _name(root))
-            checks.append(ast.Expr(ast.Call(_name("__pattern__"), [found, *map(ast.Constant, path)], [])))
-        of_own = [p.cls for p in patterns if isinstance(p, ast.MatchClass) and not _OF_SORTIE.issuperset(p.kwd_attrs)]
-        checks += [ast.Expr(ast.Call(_name("__kind__"), [ast.Lambda(nothing, kind)], [])) for kind in of_own]
-        return [ast.fix_missing_locations(ast.copy_location(n, node)) for n in (*checks, node)]
+        if any(isinstance(part, ast.MatchMapping) for part in patterns):
+            node.subject = ast.Call(_name("__subject__"), [node.subject], [])
+        checks: list[ast.expr] = []
+        for check, names in (("__kinds__", kinds), ("__kind__", of_own)):
+            if names:
+                checks.append(ast.Call(_name(check), [_name(name) for name in sorted(names)], []))
+        for value in dotted:
+            root, *path = ast.unparse(value).split(".")
+            found = ast.Lambda(ast.arguments([], [], None, [], [], None, []), _name(root))
+            checks.append(ast.Call(_name("__pattern__"), [found, *map(ast.Constant, path)], []))
+        return [ast.fix_missing_locations(ast.copy_location(n, node)) for n in (*map(ast.Expr, checks), node)]
 
     def visit_MatchValue(self, node: ast.MatchValue) -> ast.AST:
         return node  # a pattern has names alone
@@ -251,6 +276,18 @@ def _names_bound_in(function: ast.FunctionDef) -> set[str]:
     return {name for name in (*fields, *stored) if isinstance(name, str)}
 
 
+def _bound(node: ast.Match) -> set[str]:
+    """The names that get another value within a `match`."""
+    bound = set[str]()
+    for part in ast.walk(node):
+        if isinstance(part, ast.NamedExpr):
+            bound.add(part.target.id)
+    for case in node.cases:
+        for part in ast.walk(case.pattern):
+            bound |= {name for field in ("name", "rest") if (name := getattr(part, field, None)) is not None}
+    return bound
+
+
 def _name(text: str) -> ast.Name:
     return ast.Name(text, ast.Load())
 
@@ -261,6 +298,10 @@ def _assign(name: str, value: ast.expr) -> ast.Assign:
 
 def _unordered(value: ast.expr) -> ast.Call:
     return ast.Call(_name("__unordered__"), [value], [])
+
+
+def _passed() -> ast.Expr:
+    return ast.Expr(ast.Call(_name("__passed__"), [], []))
 
 
 def _caught() -> ast.Expr:

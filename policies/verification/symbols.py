@@ -206,7 +206,7 @@ class Ranged:
             if low == high:
                 return other._at(low)
             raise Combined(self._path, self._axis, other._axis)
-        if isinstance(other, IntEnum):
+        if isinstance(other, IntEnum) and computes_as_int(kind):
             return int(other)
         if issubclass(kind, int | float) or isinstance(other, numbers.Number):  # rounded, or compared, in another way
             self._path.refuse(f"compares or combines {self._axis} with a {kind.__name__}")
@@ -354,6 +354,17 @@ class Ranged:
     def __class__(self) -> Any:
         """The plain number's class, so that `isinstance` and `match` give the same result as in flight. `type` does not."""
         return type(self._at(self._path.ranges[self._axis][0]))
+
+
+def computes_as_int(kind: type) -> bool:
+    """Whether a class of whole numbers has the operators of `int`. A plain number lets others answer first."""
+    return all(getattr(kind, name, None) is found for name, found in _OF_INT.items())
+
+
+_NOT_OPERATORS = {
+    "__new__", "__repr__", "__str__", "__format__", "__hash__", "__getattribute__", "__getnewargs__", "__sizeof__", "__doc__",
+}  # fmt: skip
+_OF_INT = {name: getattr(int, name) for name in vars(int) if name[:2] == "__" and name not in _NOT_OPERATORS}
 
 
 def for_policy(frame: Any) -> bool:

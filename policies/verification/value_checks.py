@@ -6,9 +6,11 @@ raise `Reached`. `call_checks` has the checks on calls and attributes.
 
 from __future__ import annotations
 
+import dis
 import re
 import sys
 import types
+from abc import ABCMeta
 from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable
 from enum import Enum
@@ -18,7 +20,7 @@ from typing import Any
 from sortie.policies.verification.outside import Outside
 from sortie.policies.verification.pure import foreign_method, home_of
 from sortie.policies.verification.symbols import MARK, Ranged, Text
-from sortie.policies.verification.watch import reach, stop, unordered
+from sortie.policies.verification.watch import WATCH, reach, stop, unordered
 from sortie.scenarios.plugins.user_code import is_users
 
 STAND_INS = (
@@ -60,11 +62,33 @@ def checked(found: Any) -> Any:
 _CONTAINERS = (list, tuple, dict, deque, defaultdict, OrderedDict, Counter)
 
 
+_ASKS_KINDS = {"__subclasshook__", "__subclasscheck__", "__length_hint__"}
+"""Methods that are given the class of a stand-in, or from which compiled code takes no stand-in and hides the error."""
+
+
 def _made(kind: Any) -> Any:
     """A class as it is, if all that Python calls by its special names is the policy's own code."""
     if isinstance(kind, type) and is_users(home_of(kind)) and (name := foreign_method(kind)) is not None:
         stop(f"has compiled code as {name} of {kind.__name__}")
+    if is_users(home_of(kind)):
+        for name in _ASKS_KINDS & vars(kind).keys():
+            if getattr(vars(kind)[name], "__module__", None) != "typing":
+                stop(f"has {name} in {kind.__name__}")
+        for name, value in vars(kind).items():
+            if name[:2] == "__" and _is_lambda(getattr(value, "__func__", value)):
+                stop(f"has a lambda as {name} of {kind.__name__}")
+        if getattr(kind, "_is_runtime_protocol", False):
+            stop(f"has the protocol {kind.__name__}, which instances are checked against")
     return kind
+
+
+def _is_lambda(value: Any) -> bool:
+    """Whether this is the policy's own `lambda`, which does not note the errors that leave it (`passed`)."""
+    return (
+        type(value) is types.FunctionType
+        and value.__code__.co_name == "<lambda>"
+        and is_users(str(value.__globals__.get("__name__")))
+    )
 
 
 _STAND_IN_NAMES = re.compile(
@@ -90,7 +114,99 @@ def _shown() -> None:
                 stop("looks at an error whose text is another one in flight")
 
 
+DOUBTFUL = (TypeError, AttributeError, SystemError)
+"""Kinds of errors that compiled code raises of a stand-in although it would take the real object."""
+_ALIKE = re.compile(
+    r"'(?P<kind>\w+)' object (is not (iterable|subscriptable|callable)|does not support item (assignment|deletion))"
+    r"|cannot unpack non-iterable NoneType object|object of type 'NoneType' has no len\(\)"
+    r"|argument of type 'NoneType' is not iterable|bad operand type for .+: 'NoneType'"
+    r"|unsupported operand type\(s\) for .+: ('NoneType' and '\w+'|'\w+' and 'NoneType')"
+    r"|'[<>]=?' not supported between instances of ('NoneType' and '\w+'|'\w+' and 'NoneType')"
+)
+"""Texts of errors that real objects raise as well, unless `kind` is a stand-in's."""
+_RAISES = dis.opmap["RAISE_VARARGS"]
+_SETS = (dis.opmap["STORE_ATTR"], dis.opmap["DELETE_ATTR"])
+_PLAIN_OWNERS = (type(None), int, float, str, bytes, tuple, list, dict, types.MappingProxyType, types.ModuleType)
+
+
+def passed() -> None:
+    """An error is caught, or leaves a function, whose caller may catch it."""
+    parts: list[Any] = [sys.exc_info()[1]]
+    while parts:
+        error = parts.pop()
+        if isinstance(error, BaseExceptionGroup):
+            parts += error.exceptions
+        elif isinstance(error, DOUBTFUL) and not _is_alike(error):
+            WATCH.doubtful.append(error)
+
+
+def _is_alike(error: BaseException) -> bool:
+    """Whether real objects raise this error as well."""
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    if last is not None and is_users(str(last.tb_frame.f_globals.get("__name__"))):
+        step = last.tb_frame.f_code.co_code[last.tb_lasti]
+        if step == _RAISES or (step in _SETS and isinstance(error, AttributeError)):  # the second: see `_own`
+            return True
+    if isinstance(error, AttributeError):
+        owner = error.obj
+        known = type(owner) in _PLAIN_OWNERS or is_users(home_of(owner if isinstance(owner, type) else type(owner)))
+        # A view and a descriptor are of classes of their own, with the fields of the real ones.
+        lacks = issubclass(type(owner), tuple) and not hasattr(owner.__class__, str(error.name))
+        return error.name is not None and (known or lacks)
+    text = _ALIKE.fullmatch(str(error.args[0])) if type(error) is TypeError and error.args else None
+    return text is not None and not _STAND_IN_NAMES.search(text["kind"] or "")
+
+
+def _raised(kinds: Any) -> Any:
+    """What is raised, or what an `except` names: as it is, if it is not outside."""
+    for kind in kinds if type(kinds) is tuple else (kinds,):
+        if isinstance(kind, Outside):
+            kind._used()
+        if type(kind) is tuple:
+            _raised(kind)
+    return kinds
+
+
+def cannot_ask(kind: Any) -> str | None:
+    """Why a search cannot ask whether a stand-in is an instance of this: its answer depends on more than `__class__`."""
+    if isinstance(kind, tuple):
+        return next((why for one in kind if (why := cannot_ask(one))), None)
+    if isinstance(kind, types.UnionType):
+        return cannot_ask(kind.__args__)
+    if isinstance(kind, type):
+        home, how = home_of(kind), type(kind)
+        asks_plainly = how.__instancecheck__ is type.__instancecheck__ or (how is ABCMeta and is_users(home))
+        if asks_plainly or home in ("numbers", "collections.abc"):
+            return None
+    return f"asks whether something is a {getattr(kind, '__name__', kind)}"
+
+
+def _subject(value: Any) -> Any:
+    """What a pattern of a mapping is matched with."""
+    parts, met = [value], set[int]()
+    while parts:
+        part = parts.pop()
+        if isinstance(part, Outside):
+            part._used()
+        if type(part) in (list, tuple, dict) and id(part) not in met:
+            met.add(id(part))
+            parts += part.values() if type(part) is dict else part
+    return value
+
+
+def _kinds(*kinds: Any) -> None:
+    """The classes of a pattern."""
+    for kind in kinds:
+        if isinstance(kind, Outside):
+            kind._used()
+        if (why := cannot_ask(kind)) is not None:
+            stop(why)
+
+
 def _caught() -> None:
+    passed()
     error = sys.exc_info()[1]
     if isinstance(error, BaseExceptionGroup):
         error = error.subgroup((RecursionError, MemoryError))
@@ -140,6 +256,9 @@ def _takes_apart(template: str) -> bool:
 
 
 def _same(a: Any, b: Any) -> bool:
+    for one in (a, b):
+        if isinstance(one, Outside):
+            one._used()
     for one in (a, b):
         if one is None or one is NotImplemented or one is Ellipsis or isinstance(one, bool | Enum | type):
             return a is b
@@ -215,6 +334,7 @@ def _among(left: Any, right: Any) -> bool:
 
 VALUE_CHECKS: dict[str, Any] = {
     "__same__": _same, "__text__": _text, "__written__": _written, "__percent__": _percent, "__among__": _among,
-    "__caught__": _caught, "__shown__": _shown, "__made__": _made,
+    "__caught__": _caught, "__shown__": _shown, "__made__": _made, "__raised__": _raised, "__kinds__": _kinds, "__subject__": _subject,
+    "__passed__": passed, "__doubtful__": DOUBTFUL,
 }  # fmt: skip
 """By the names under which `source_checks` calls them."""

@@ -21,6 +21,8 @@ class Watch:
     def begin(self) -> None:
         """Forget the policy before."""
         self.stopped: Reached | Refused | None = None
+        self.doubtful: list[BaseException] = []
+        """Errors that real objects may not raise. They may end the decision; the policy may not go on after one."""
         self._others: dict[str, tuple[Any, Any]] = {}
 
     def stop(self, why: Reached | Refused) -> NoReturn:

@@ -221,6 +221,38 @@ STAND_INS = {
 
 RARE = "0.802 < soc * 1.945 < 0.8020001"
 """Charges so few that only a search finds them."""
+CAUGHT = {
+    "unbound method of a float": "float.is_integer(first)",
+    "own __float__": "class K:\n    def __float__(self):\n        return soc\nfloat(K())",
+    "own __hash__": "class K:\n    def __hash__(self):\n        return int(first)\n{K(): 1}",
+    "length of a deque": "collections.deque([], int(first))",
+    "own __length_hint__": "class K:\n    def __length_hint__(self):\n        return int(first)\n    def __iter__(self):\n        return iter(())\nlist(K())",
+    "method of a tuple": "tuple.count(me.priority_target_ids, 7)",
+    "error that is outside": "try:\n    raise OSError\nexcept os.error:\n    pass",
+    "error beside one that is outside": "import struct\ntry:\n    {}['a']\nexcept (struct.error, KeyError):\n    pass",
+    "cause that is outside": "try:\n    raise ValueError from os.error\nexcept ValueError:\n    pass",
+    "raised from outside": "try:\n    raise os.error\nexcept OSError:\n    pass",
+    **{
+        f"operator with what is outside: {act}": act
+        for act in (
+            "sys.maxsize // 2", "sys.maxsize % 7", "2 ** sys.flags.debug", "-sys.maxsize", "~sys.maxsize",
+            "sys.maxsize & 1", "sys.maxsize | 1", "sys.maxsize ^ 1", "sys.maxsize << 1", "sys.maxsize >> 1",
+            "[1, 2][sys.flags.debug]", "[1, 2][: sys.maxsize]", "os.environ['SORTIE_NOTHING'] = ''",
+        )
+    },
+}  # fmt: skip
+"""What raises `TypeError` of a stand-in, and no error of the real object."""
+_SOFT = "    def __enter__(self):\n        return self\n    def __exit__(self, *_):\n        return True\n"
+CAUGHT_BY = {
+    "with": f"class Soft:\n{_SOFT}ok = []\nclass K:\n    def __hash__(self):\n        return int(first)\nwith Soft():\n    {{K(): 1}}\n    ok.append(1)\nbad = len(ok) > 0 and {RARE}",
+    "finally": f"def ask():\n    ok = False\n    try:\n        float.is_integer(first)\n        ok = True\n    finally:\n        return ok\nbad = ask() and {RARE}",
+    "list": f"ok = []\nclass K:\n    def __len__(self):\n        float.is_integer(first)\n        ok.append(1)\n        return 0\n    def __iter__(self):\n        return iter(())\nlist(K())\nbad = len(ok) > 0 and {RARE}",
+    "list from a lambda": f"ok = []\nclass K:\n    __len__ = lambda self: (float.is_integer(first), ok.append(1), 0)[2]\n    def __iter__(self):\n        return iter(())\nlist(K())\nbad = len(ok) > 0 and {RARE}",
+    "list from an operator in a lambda": f"ok = []\nclass K:\n    def __hash__(self):\n        return int(first)\nclass L:\n    __len__ = lambda self: ({{K(): 1}}, ok.append(1), 0)[2]\n    def __iter__(self):\n        return iter(())\nlist(L())\nbad = len(ok) > 0 and {RARE}",
+    "group": f"try:\n    float.is_integer(first)\n    bad = {RARE}\nexcept* TypeError:\n    pass",
+    "another error": f"try:\n    try:\n        float.is_integer(first)\n        bad = {RARE}\n    except TypeError:\n        raise KeyError(1)\nexcept KeyError:\n    pass",
+}
+"""What else than an `except` of the same error hides it."""
 RECOGNISED = {
     "own int masks first": "class I(int):\n    def __rand__(self, other):\n        return 99\nbad = me.novelty_flags & I(0) == 99 and 0.4 < soc < 0.4000001",
     "own int compares first": "class I(int):\n    def __gt__(self, other):\n        return False\nbad = not me.novelty_flags < I(999) and 0.4 < soc < 0.4000001",
@@ -264,6 +296,42 @@ RECOGNISED = {
         f"change of an attached view by {act}": f"near = view.attached\ntry:\n    {act}\n    bad = len(near.age_s) < len(view.age_s) and {RARE}\nexcept (AttributeError, TypeError):\n    pass"
         for act in ("near.age_s[view.ego] = 0.0", "near.descriptors.update({})", "near.age_s.setdefault(view.ego, 0.0)")
     },
+    "protocol of Python's": f"import typing\nbad = not isinstance(soc, typing.SupportsIndex) and {RARE}",
+    "protocol of Python's in a pattern": f"from typing import SupportsIndex\nmatch soc:\n    case SupportsIndex():\n        pass\n    case _:\n        bad = {RARE}",
+    "protocol in a pattern, bound before": f"from typing import SupportsIndex\nK = str\nmatch soc:\n    case _ if (K := SupportsIndex) is None:\n        pass\n    case K():\n        pass\n    case _:\n        bad = {RARE}",
+    "protocol handed on": f"import typing\nbad = not list(map(isinstance, [soc], [typing.SupportsIndex]))[0] and {RARE}",
+    "alias of a type": f"import typing\nbad = not isinstance(-int(first), typing.Union[typing.SupportsIndex, str]) and {RARE}",
+    "own protocol": f"import typing\n@typing.runtime_checkable\nclass Q(typing.Protocol):\n    _axis: int\nbad = not isinstance(soc, Q) and {RARE}",
+    "own protocol by its mark": f"import typing\nclass Q(typing.Protocol):\n    _axis: int\n    _is_runtime_protocol = True\nbad = not isinstance(soc, Q) and {RARE}",
+    "own __subclasshook__": f"import abc\nclass Q(abc.ABC):\n    @classmethod\n    def __subclasshook__(cls, kind):\n        return kind is not float\nbad = not isinstance(soc, Q) and {RARE}",
+    "own __subclasscheck__": f"import abc\nclass M(abc.ABCMeta):\n    def __subclasscheck__(cls, kind):\n        return kind is not float\nclass Q(metaclass=M): pass\nbad = not isinstance(soc, Q) and {RARE}",
+    "type of text": f"bad = type(f'{{soc}}') is str and {RARE}",
+    "class of text": f"bad = f'{{soc}}'.__class__ is str and {RARE}",
+    "identity of what is outside": f"bad = os.sep is os.sep and {RARE}",
+    "class of what is outside": f"bad = os.sep.__class__ is str and {RARE}",
+    **{
+        f"what is outside in a pattern: {pattern}": f"match {value}:\n    case {pattern}:\n        bad = {RARE}\n    case _:\n        pass"
+        for value, pattern in (
+            ("os.sep", "str()"),
+            ("[os.sep]", "[str()]"),
+            ("sys.version_info", "[a, *_]"),
+            ("os.environ", "{}"),
+        )
+    },
+    "sets an attribute of flags": f"try:\n    me.novelty_flags.seen = True\nexcept AttributeError:\n    bad = {RARE}",
+    "sets a private part": f"x = me.battery_soc\ntry:\n    x._axis = 1\nexcept AttributeError:\n    bad = {RARE}",
+    "sets the class": f"try:\n    soc.__class__ = int\nexcept AttributeError:\n    pass\nexcept TypeError:\n    bad = {RARE}",
+    "sets the class of a descriptor": f"try:\n    me.__class__ = tuple\nexcept AttributeError:\n    pass\nexcept TypeError:\n    bad = {RARE}",
+    "adds to a private part": f"try:\n    me._number += None\nexcept AttributeError:\n    bad = {RARE}\nexcept TypeError:\n    pass",
+    "own enum compares first": "class E(enum.IntEnum):\n    A = 10**15\n    def __gt__(self, other):\n        return other != 13123457\nbad = not int(first * 1e6) < E.A",
+    "own enum as another number": "class E(enum.IntEnum):\n    A = 5\n    def __int__(self):\n        return 7\nbad = first == E.A and first != 7",
+    **{
+        f"caught: {n}": "def ask():\n"
+        + "".join(f"    {line}\n" for line in act.splitlines())
+        + f"try:\n    ask()\n    bad = {RARE}\nexcept TypeError:\n    pass"
+        for n, act in CAUGHT.items()
+    },
+    **{f"caught by {n}": body for n, body in CAUGHT_BY.items()},
     "kind of an attached mapping": f"near = view.attached.age_s\nbad = type(near) is dict and len(near) < len(view.age_s) and {RARE}",
     **{
         f"order of {made}": f"s = list({made}.descriptors)\nbad = len(s) < len(view.age_s) and s != sorted(s) and {RARE}"
@@ -639,6 +707,19 @@ CORRECT = {
     "combinations": "bad = any(a == b for a, b in itertools.combinations(view.peers, 2)) or soc < 0",
     "dataclass": "Rate = namedtuple('Rate', 'hz why')\nr = Rate(2 if soc < 0.5 else 4, 'x')\nbad = r.hz > 4",
     "exception": "try:\n    x = [1, 2][5]\nexcept IndexError:\n    bad = soc < 0",
+    "no region": "try:\n    bad = me.region.radius_m < 0\nexcept AttributeError:\n    bad = me.region is not None",
+    "compares with nothing": "try:\n    bad = {}.get('limit') < soc\nexcept TypeError:\n    bad = soc < 0",
+    "item of nothing": "try:\n    bad = {}.get('limits')['low'] < soc\nexcept TypeError:\n    bad = soc < 0",
+    "no such field": "try:\n    bad = me.charge > 1\nexcept AttributeError:\n    bad = soc > 1",
+    "own attribute": "class C: pass\ntry:\n    bad = C().limit < soc\nexcept AttributeError:\n    bad = soc < 0",
+    "own error": "def limit(x):\n    if x < 0.5:\n        raise TypeError('low')\n    return 2.0\ntry:\n    bad = limit(soc) > 2\nexcept TypeError:\n    bad = soc >= 0.5",
+    "own error again": "class Low(AttributeError): pass\ntry:\n    try:\n        if soc < 0.5: raise Low\n    except Low as error:\n        raise ValueError(1) from error\nexcept (ValueError, KeyError):\n    bad = soc >= 0.5",
+    "own context": "class Quiet:\n    def __enter__(self):\n        return self\n    def __exit__(self, *_):\n        return True\nwith Quiet():\n    bad = {}['a'] < soc",
+    "smallest of none": "try:\n    bad = min([p for p in view.peers if me.goodput_to(p) > 5]) > 200\nexcept ValueError:\n    pass",
+    "own enum": "class Level(enum.IntEnum):\n    LOW = 0\n    HIGH = 1\nbad = soc > Level.HIGH or int(first) < Level.LOW",
+    "own abstract class": "import abc\nclass A(abc.ABC):\n    @abc.abstractmethod\n    def rate(self): ...\nclass B(A):\n    def rate(self):\n        'Always low.'\n        return 2\nmatch B():\n    case A() as found:\n        bad = found.rate() > 2 or soc > 1",
+    "protocol for types": "import typing\nclass Rates(typing.Protocol):\n    def rate(self, soc: float) -> float: ...\nclass R:\n    def rate(self, soc: float) -> float:\n        return 2.0\ndef choose(rates: Rates) -> float:\n    return rates.rate(soc)\nbad = choose(R()) > 2 or soc > 1",
+    "number in a pattern": "match soc:\n    case float() | int():\n        bad = soc > 1\n    case _:\n        bad = True",
     "while": "n, x = 0, soc\nwhile n < 5:\n    n += 1\nbad = n != 5 or x > 1",
     "statistics of ids": "bad = statistics.mean([1, 2, 3]) != 2 or soc < 0",
     "math of constants": "bad = math.sqrt(4) != 2 or soc < 0",
