@@ -587,6 +587,8 @@ RETURNS = {
     "values of a dictionary": "def decide(view):\n    return {d.destination: d for d in usual(view)}.values()",
     "deque": "import collections\ndef decide(view):\n    return collections.deque(usual(view))",
     "none": "def decide(view):\n    return None",
+    "array of one number": "import numpy as np\ndef decide(view):\n    return [d._replace(fusion_weight=np.True_ & [True]) for d in usual(view)]",
+    "truth as an id": "def decide(view):\n    return [d._replace(destination=d.destination == 1 or d.destination) for d in usual(view)]",
     "none in a sliver": "def decide(view):\n    return None if view.me and view.me.battery_soc == 0.4 else usual(view)",
     "lying rate": "class R(float):\n    def __le__(self, other): return True\n    def __gt__(self, other): return False\ndef decide(view):\n    return usual(view, R(20.0))",
     "tuple in place of one": "def decide(view):\n    return [tuple(d) for d in usual(view)]",
