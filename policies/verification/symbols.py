@@ -17,7 +17,7 @@ import numbers
 import struct
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from enum import IntEnum
+from enum import Enum, IntEnum
 from typing import Any, NoReturn, TypeVar
 
 from sortie.scenarios.plugins.user_code import is_users
@@ -206,14 +206,16 @@ class Ranged:
             if low == high:
                 return other._at(low)
             raise Combined(self._path, self._axis, other._axis)
-        if isinstance(other, IntEnum):
+        if isinstance(other, IntEnum) and all(getattr(kind, name) is getattr(int, name) for name in _OF_WHOLE_NUMBERS):
             return int(other)
         if issubclass(kind, int | float) or isinstance(other, numbers.Number):  # rounded, or compared, in another way
             self._path.refuse(f"compares or combines {self._axis} with a {kind.__name__}")
         return None
 
     def _same(self, other: object) -> bool:
-        return isinstance(other, Ranged) and other._axis == self._axis and other._steps == self._steps
+        if not isinstance(other, Ranged) or other._axis != self._axis or len(other._steps) != len(self._steps):
+            return False
+        return self._steps is other._steps or all(map(_is_same_step, self._steps, other._steps))
 
     def __lt__(self, other: object) -> bool:
         if self._same(other):
@@ -443,7 +445,21 @@ _STEPS: dict[str, Callable[[float, float], float]] = {
     "round": lambda x, _: round(x),
     "sqrt": lambda x, _: math.sqrt(x),
 }
+_OF_WHOLE_NUMBERS = {n for n in vars(Ranged) if callable(vars(int).get(n))} - {
+    *vars(IntEnum),
+    *vars(Enum),
+    "__getattribute__",
+}
+"""The operators, in which an `IntEnum` may differ from a whole number."""
 ROUNDINGS = ("int", "floor", "ceil", "round", "sqrt")
+
+
+def _is_same_step(one: tuple[str, float], other: tuple[str, float]) -> bool:
+    """Whether two steps round alike: equal constants may not, such as 10**16 and 1e16, or 0.0 and -0.0."""
+    (step, c), (other_step, d) = one, other
+    if step != other_step or type(c) is not type(d):
+        return False
+    return c.hex() == d.hex() if isinstance(c, float) and isinstance(d, float) else c == d
 
 
 def _ordinal(x: float) -> int:

@@ -229,6 +229,8 @@ RECOGNISED = {
     "own int compares first": "class I(int):\n    def __gt__(self, other):\n        return False\nbad = not me.novelty_flags < I(999) and 0.4 < soc < 0.4000001",
     "own int divides first": "class I(int):\n    def __rdivmod__(self, other):\n        return 99\nbad = divmod(me.novelty_flags, I(3)) == 99 and 0.4 < soc < 0.4000001",
     "minus of a whole number": f"bad = isinstance(-int(first), int) and {RARE}",
+    "sum with a whole number or a float": f"n = int(first)\nbad = n + 10**16 != n + 1e16 and {RARE}",
+    "own enum compares first": "class E(enum.IntEnum):\n    A = 10**15\n    def __gt__(self, other):\n        return other != 13123457\nbad = not int(first * 1e6) < E.A",
     "type of minus": f"bad = type(-int(first)) == int and {RARE}",
     "pattern of minus": f"match -int(first):\n    case int():\n        bad = {RARE}",
     "format of minus": f"try:\n    f'{{-int(first):d}}'\n    bad = {RARE}\nexcept ValueError:\n    pass",
