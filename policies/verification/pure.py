@@ -21,6 +21,7 @@ import typing
 from enum import Enum
 from typing import Any
 
+from sortie.policies.contract import looks_from
 from sortie.scenarios.plugins.user_code import PREFIX, is_users
 
 PURE_MODULES = frozenset({
@@ -166,11 +167,16 @@ _ONLY_READ = (
 )  # fmt: skip
 
 
+_MARKS = looks_from(lambda _: None).__code__
+
+
 def may_write(function: Any) -> bool:
-    """Whether this is a function of Python's that may set attributes of what it is given, as decorators do."""
+    """Whether this is a function that may set attributes of what it is given, as decorators do."""
     while isinstance(function, functools.partial):
         function = function.func
-    return type(function) is types.FunctionType and function.__module__ in _MAY_WRITE and function not in _ONLY_READ
+    if type(function) is not types.FunctionType:
+        return False
+    return function.__code__ is _MARKS or (function.__module__ in _MAY_WRITE and function not in _ONLY_READ)
 
 
 def is_others(value: Any) -> bool:

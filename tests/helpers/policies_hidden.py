@@ -80,6 +80,8 @@ KEPT = (
     ("C = type('C', (), {'__module__': 'typing', 'kept': []})", "C.kept.append(1)\nn = len(C.kept)"),
     ("__name__ = 'statistics'\ndef C(kept=[0]):\n    kept[0] += 1\n    return kept[0]", "n = C()"),
     ("def __own__(owner, name):\n    return owner", "math.n = n = 1 + (math.n if hasattr(math, 'n') else 0)"),
+    ("import statistics\nfrom sortie.policies.contract import looks_from", "try:\n    n = statistics.mean.viewpoint + 1\nexcept AttributeError:\n    n = 1\nlooks_from(n)(statistics.mean)"),
+    ("from sortie.policies.contract import looks_from", "C = collections.Counter\ntry:\n    n = C.viewpoint + 1\nexcept AttributeError:\n    n = 1\nlist(map(looks_from(n), [C]))"),
 )  # fmt: skip
 """What is set up when the file is loaded, and how each decision counts."""
 
