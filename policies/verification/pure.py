@@ -120,15 +120,18 @@ _OPEN_MODULES = frozenset(
 
 HEAP = 1 << 9
 """Of a class's `__flags__`: it was made while Python ran."""
+flags_of: Any = vars(type)["__flags__"].__get__
+_QUALNAME: Any = vars(type)["__qualname__"].__get__
+"""As Python stores them, whatever a metaclass says."""
 
 
 def home_of(kind: type) -> str:
     """The module of a class. One that is not found there is the policy's own, whatever its `__module__` says."""
     home = str(type.__dict__["__module__"].__get__(kind))
-    if not kind.__flags__ & HEAP or is_users(home):
+    if not flags_of(kind) & HEAP or is_users(home):
         return home
     found: Any = sys.modules.get(home)
-    for part in kind.__qualname__.split("."):
+    for part in _QUALNAME(kind).split("."):
         found = getattr(found, part, None)
     return home if found is kind else PREFIX
 

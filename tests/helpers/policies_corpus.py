@@ -314,6 +314,10 @@ STATE = {
 HELPER = """
 x: int = 0
 S = [0]
+__firstlineno__ = [0]
+def count():
+    __firstlineno__[0] += 1
+    return __firstlineno__[0]
 def make():
     k = [0]
     def step():
@@ -373,6 +377,9 @@ def decide(view):
     "closure imported in the function": """HELPER|def decide(view):
     from helper import step
     bad = step() > 200000""",
+    "list with one of Python's names in a helper": """HELPER|import helper
+def decide(view):
+    bad = helper.count() > 200000""",
     "annotations of a helper": """HELPER|import helper
 def decide(view):
     from helper import __annotations__ as names
