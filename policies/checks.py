@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from itertools import compress
 from typing import Any
 
+import numpy as np
+
 from sortie.policies.contract import (
     DIRECTIVE_BOUNDS,
     MAX_REPOSITION_M,
@@ -171,7 +173,7 @@ def find_wrong_type(d: object) -> str | None:
         return f"a policy returns Directive, got {type(d).__name__}"
     where = _where(d)
     for name in ("source", "destination"):
-        if not _is_honest(getattr(d, name)) or not _is_whole(getattr(d, name)):
+        if not _is_honest(getattr(d, name)) or not _is_id(getattr(d, name)):
             return f"{where}: {name} is {_told(getattr(d, name))}, must be a drone's id, a whole number"
     for name, (high, kind) in DIRECTIVE_BOUNDS.items():
         value = getattr(d, name)
@@ -220,12 +222,15 @@ def _told(value: object) -> str:
 
 
 def _compares(value: Any, low: float, high: float) -> bool:
-    """Whether a value can be compared with its bounds: a number of any type."""
+    """Whether a value can be compared with its bounds and is a number of any type, but no array of one number."""
     try:
         bool(low <= value <= high)
     except Exception:  # whatever a foreign type raises
         return False
-    return True
+    return isinstance(value, _NUMBERS) and not isinstance(value, np.timedelta64)
+
+
+_NUMBERS = (float, int, np.floating, np.integer, np.bool_)
 
 
 _HONEST = frozenset({"builtins", "numpy", "sortie"})
@@ -252,6 +257,11 @@ def _reason_fault(reason: object) -> str | None:
     if _HALF_PAIR.search(reason):
         return f"reason is {reason!r}, must be text that UTF-8 can write"
     return None
+
+
+def _is_id(value: Any) -> bool:
+    """Whether a value is a whole number and no truth value, which a record cannot keep among ids."""
+    return _is_whole(value) and not isinstance(value, bool)
 
 
 def _is_whole(value: Any) -> bool:

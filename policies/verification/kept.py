@@ -6,6 +6,7 @@ import collections
 import contextlib
 import dataclasses
 import functools
+import gc
 import inspect
 import operator
 import re
@@ -19,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sortie.policies.verification.pure import HEAP, home_of, is_own_cache
+from sortie.policies.verification.pure import HEAP, flags_of, home_of, is_own_cache
 from sortie.policies.verification.source_checks import RESERVED
 from sortie.policies.verification.symbols import Refused
 from sortie.scenarios.plugins.user_code import is_users, modules_with
@@ -29,17 +30,14 @@ _LEAVES = (
     int, str, bytes, bool, type(None), type(Ellipsis), type(NotImplemented), Fraction,
     types.MethodDescriptorType, types.WrapperDescriptorType, _TUPLE_FIELD, types.CodeType,
     type(vars(dataclasses).get("_HAS_DEFAULT_FACTORY")), type(dataclasses.MISSING),
-    types.GetSetDescriptorType, types.MemberDescriptorType, re.Pattern, np.generic, np.dtype, np.ufunc,
+    types.GetSetDescriptorType, types.MemberDescriptorType, re.Pattern, np.dtype, np.ufunc,
 )  # fmt: skip
 
 
-_PYTHONS_OWN = {
-    "__name__", "__package__", "__loader__", "__spec__", "__file__", "__cached__", "__builtins__", "__path__",
-    "__dataclass_params__", "__match_args__", "__dict__", "__weakref__",
-    "__annotate__", "__annotate_func__", "__conditional_annotations__", "__firstlineno__",
-    "__static_attributes__",
-}  # fmt: skip
-"""Names that Python itself gives to a module or a class."""
+_MRO: Any = vars(type)["__mro__"].__get__
+_NAMES: Any = vars(type)["__dict__"].__get__
+_PLACE_OF_DICT: Any = vars(type)["__dictoffset__"].__get__
+"""As Python stores them, whatever a metaclass says."""
 
 
 class Kept:
@@ -92,53 +90,57 @@ def fingerprint(value: Any) -> Any:
     return _fingerprint(value, {})
 
 
-def _fingerprint(value: Any, met: dict[int, int]) -> Any:
+def _fingerprint(value: Any, met: dict[int, tuple[int, Any]]) -> Any:
     kind = type(value)
     if kind is float:  # with the sign of NaN
         return "float", struct.pack("d", value)
     if kind is complex:
         return "complex", struct.pack("dd", value.real, value.imag)
-    if kind in _LEAVES or isinstance(value, np.generic | np.ufunc):
-        return kind.__name__, value if not isinstance(value, np.generic) else value.tobytes()
+    if issubclass(kind, np.generic) and not is_users(home_of(kind)) and not value.dtype.hasobject:
+        return kind.__name__, value.tobytes()
+    if kind in _LEAVES or issubclass(kind, np.ufunc):
+        return kind.__name__, value
     if kind in (Decimal, range):  # equal ones may differ: 1.0 and 1, -0 and 0, empty ranges
         return kind.__name__, repr(value)
     if id(value) in met:
-        return "again", met[id(value)]
-    met[id(value)] = len(met)
-    if isinstance(value, Enum):
-        own = [v for name, v in vars(value).items() if name != "__objclass__"] if is_users(home_of(kind)) else []
-        return _fingerprint(kind, met), value.name, tuple([_fingerprint(v, met) for v in own])
+        return "again", met[id(value)][0]
+    met[id(value)] = len(met), value  # kept, so that nothing made later gets its id
+    if issubclass(kind, Enum) and not is_users(home_of(kind)):
+        return kind.__name__, id(value)
     if kind is types.BuiltinFunctionType:  # a method of a list changes with the list
         owner = value.__self__
         of = owner.__name__ if isinstance(owner, types.ModuleType) else _fingerprint(owner, met)
         return kind.__name__, value.__name__, of
-    if kind in (list, tuple) or (isinstance(value, tuple) and not is_users(home_of(kind))):
+    if kind in (list, tuple) or (issubclass(kind, tuple) and not is_users(home_of(kind))):
         return kind.__name__, tuple([_fingerprint(v, met) for v in value])
-    if kind in (dict, types.MappingProxyType, collections.OrderedDict, collections.defaultdict, collections.Counter):
+    if kind is types.MappingProxyType:
+        return kind.__name__, _fingerprint(gc.get_referents(value)[0], met)
+    if kind in (dict, collections.OrderedDict, collections.defaultdict, collections.Counter):
         makes = _fingerprint(value.default_factory, met) if kind is collections.defaultdict else ()
         return kind.__name__, makes, tuple([(_fingerprint(k, met), _fingerprint(v, met)) for k, v in value.items()])
-    if isinstance(value, set | frozenset):
+    if issubclass(kind, set | frozenset) and not is_users(home_of(kind)):
         members = [_fingerprint(v, met) for v in _members(value)]
         ordered = all(isinstance(v, int) for v in _members(value))  # by what was there before, and it may be seen
         return kind.__name__, tuple(members) if ordered else frozenset(members)
     if kind in (collections.deque, bytearray):
         return kind.__name__, getattr(value, "maxlen", None), tuple([_fingerprint(v, met) for v in value])
-    if kind is np.ndarray:
+    if kind is np.ndarray and not value.dtype.hasobject:
         return "array", value.dtype.str, value.shape, value.tobytes()
     return kind.__name__, id(value), _parts(value, met)
 
 
 def _members(value: Any) -> Any:
     """The members of a set, which may be one that watches its order."""
-    return (set if isinstance(value, set) else frozenset).__iter__(value)
+    return (set if issubclass(type(value), set) else frozenset).__iter__(value)
 
 
-def _parts(value: Any, met: dict[int, int]) -> Any:
+def _parts(value: Any, met: dict[int, tuple[int, Any]]) -> Any:
     """The changeable parts of a function, a class, a module or an object."""
     found: list[Any]
-    if is_users(home_of(type(value))) and not isinstance(value, type):
+    kind = type(value)
+    if is_users(home_of(kind)) and not issubclass(kind, type):
         found = _parts_of_users(value)
-    elif isinstance(value, types.FunctionType):
+    elif issubclass(kind, types.FunctionType):
         is_others = not is_users(value.__globals__.get("__name__"))
         if is_others and not value.__dict__ and value.__closure__ is None:
             return ()
@@ -147,7 +149,7 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
             *cells,
             *(value.__defaults__ or ()),
             *(value.__kwdefaults__ or {}).values(),
-            *(v for v in value.__dict__.values() if not isinstance(v, inspect.Signature)),
+            *(v for v in value.__dict__.values() if type(v) is not inspect.Signature),
             *(
                 []
                 if is_others
@@ -155,34 +157,34 @@ def _parts(value: Any, met: dict[int, int]) -> Any:
             ),
             *([] if is_others else value.__annotations__.values()),
         ]
-    elif isinstance(value, types.ModuleType):
-        found = [v for n, v in vars(value).items() if n not in _PYTHONS_OWN] if is_users(value.__name__) else []
-    elif isinstance(value, type):
+    elif issubclass(kind, types.ModuleType):
+        found = [v for n, v in vars(value).items() if n not in RESERVED] if is_users(value.__name__) else []
+    elif issubclass(kind, type):
         if issubclass(value, Flag) and is_users(home_of(value)):
             _fill_cache(value)
-        own = {n: v for n, v in vars(value).items() if n not in _PYTHONS_OWN} if is_users(home_of(value)) else {}
-        found = [*(x for item in own.items() for x in item), *(c for c in value.__mro__[1:] if is_users(home_of(c)))]
-        found += [type(value)] if is_users(home_of(type(value))) else []
-    elif isinstance(value, functools.partial):
+        own = {n: v for n, v in _NAMES(value).items() if not _is_pythons(n, v)} if is_users(home_of(value)) else {}
+        found = [*(x for item in own.items() for x in item), *(c for c in _MRO(value)[1:] if is_users(home_of(c)))]
+        found += [kind] if is_users(home_of(kind)) else []
+    elif issubclass(kind, functools.partial):
         found = [value.func, value.args, value.keywords]
-    elif isinstance(value, types.MethodType):
+    elif issubclass(kind, types.MethodType):
         found = [value.__func__, value.__self__]
-    elif isinstance(value, staticmethod | classmethod):
+    elif issubclass(kind, staticmethod | classmethod):
         found = [value.__func__]
-    elif isinstance(value, property):
+    elif issubclass(kind, property):
         found = [value.fget, value.fset, value.fdel, value.__doc__]
-    elif isinstance(value, dataclasses.Field):
+    elif issubclass(kind, dataclasses.Field):
         found = [value.type, value.default, value.default_factory, value.metadata]
-    elif isinstance(value, operator.itemgetter):
+    elif issubclass(kind, operator.itemgetter):
         found = [value.__reduce__()]
-    elif isinstance(value, types.GenericAlias | types.UnionType) or home_of(type(value)) == "typing":
+    elif issubclass(kind, types.GenericAlias | types.UnionType) or home_of(kind) == "typing":
         found = [getattr(value, name, None) for name in _OF_ANNOTATIONS]
-    elif home_of(type(value)) in _UNCHANGING or is_own_cache(value):
+    elif home_of(kind) in _UNCHANGING or is_own_cache(value):
         found = []
     elif hasattr(value, "__wrapped__") or hasattr(value, "cache_info"):
         raise Refused("keeps results from one decision to the next (functools)")
     else:
-        raise Refused(f"keeps a {type(value).__name__} from one decision to the next")
+        raise Refused(f"keeps a {kind.__name__} from one decision to the next")
     return tuple([_fingerprint(v, met) for v in found])
 
 
@@ -210,25 +212,38 @@ _BASES = (
     collections.defaultdict, collections.deque, property, staticmethod, classmethod, types.ModuleType, Decimal,
 )  # fmt: skip
 """Compiled classes that keep no more than their content and what their attributes show."""
+_PLAIN: tuple[Any, ...] = (str, bytes, int, float, complex)
+"""Of these, those with one plain value as their content."""
 
 
 def _parts_of_users(value: Any) -> list[Any]:
-    """What an object of the policy's own class keeps: its attributes, its content, and its class, reached through it alone."""
+    """What an object of the policy's own class keeps: its attributes, its content, and its class, reached through it alone.
+
+    All is read as Python stores it, whatever the class's own methods and attributes say.
+    """
+    kind = type(value)
+    if issubclass(kind, Flag):
+        _fill_cache(kind)
     found = [x for item in _attributes(value).items() for x in item]
-    for base in type(value).__mro__:
-        is_compiled = not base.__flags__ & HEAP
+    for base in _MRO(kind):
+        is_compiled = not flags_of(base) & HEAP
         if is_compiled and base not in _BASES and not issubclass(base, BaseException):
             raise Refused(f"keeps a {base.__name__} from one decision to the next")
-        if base not in (object, str, bytes, int, float, complex):
-            shown = [n for n, v in vars(base).items() if isinstance(v, _SHOWN) and n not in _ALWAYS_SHOWN]
-            found += [getattr(value, name, None) for name in shown]
-    if isinstance(value, dict):
-        found += [x for item in dict.items(value) for x in item]
+        if base is not object and base not in _PLAIN:
+            hidden = _ALWAYS_SHOWN if is_compiled else _OF_EVERY_CLASS
+            shown = [of for n, of in _NAMES(base).items() if type(of) in _SHOWN and n not in hidden]
+            found += [_stored(of, value) for of in shown]
+    found += [plain.__getnewargs__(value) for plain in _PLAIN if issubclass(kind, plain)]
+    if issubclass(kind, Decimal):
+        found.append(Decimal.__str__(value))
+    if issubclass(kind, dict):
+        ordered: Any = collections.OrderedDict if issubclass(kind, collections.OrderedDict) else dict
+        found += [x for key in ordered.__iter__(value) for x in (key, dict.__getitem__(value, key))]
     for base in (list, tuple, bytearray, collections.deque):
-        if isinstance(value, base):  # as it is, whatever the class's own `__iter__` says
+        if issubclass(kind, base):
             read: Any = base.__iter__
             found += read(value)
-    return [*found, type(value)]
+    return [kind, *found]
 
 
 _OF_ANNOTATIONS = (
@@ -242,18 +257,40 @@ _UNCHANGING = {
     *(f"sortie.policies.verification.{m}" for m in ("call_checks", "outside")),
 }
 """Modules of classes that keep nothing that changes."""
-_SHOWN = types.MemberDescriptorType | types.GetSetDescriptorType
-_ALWAYS_SHOWN = {"__dict__", "__weakref__", "__class__", "__traceback__", "__context__", "__cause__"}
+_SHOWN = (types.MemberDescriptorType, types.GetSetDescriptorType)
+_OF_EVERY_CLASS = {"__dict__", "__weakref__"}
+_ALWAYS_SHOWN = _OF_EVERY_CLASS | {"__class__", "__traceback__", "__context__", "__cause__"}
 
 
 def _attributes(value: Any) -> dict[str, Any]:
-    slots = {s for c in type(value).__mro__ for s in _slots(c) if hasattr(value, s)}
-    return {**getattr(value, "__dict__", {}), **{s: getattr(value, s) for s in slots}}
+    """The dictionary of an object; empty where it has none."""
+    kind = type(value)
+    for base in _MRO(kind):
+        of = _NAMES(base).get("__dict__")
+        if type(of) in _SHOWN:
+            found: dict[str, Any] = of.__get__(value)
+            return found
+    if _PLACE_OF_DICT(kind):
+        raise Refused(f"keeps a {kind.__name__}, a class with a __dict__ of its own, from one decision to the next")
+    return {}
 
 
-def _slots(kind: type) -> tuple[str, ...]:
-    found = vars(kind).get("__slots__", ())
-    return (found,) if isinstance(found, str) else tuple(found)
+def _stored(of: Any, value: Any) -> tuple[Any, ...]:
+    """The content of a slot; nothing where it has none."""
+    try:
+        return (of.__get__(value),)
+    except AttributeError:
+        return ()
+
+
+def _is_pythons(name: str, value: Any) -> bool:
+    """Whether Python itself made this part of a class, and nothing in it can be changed."""
+    if name == "__dataclass_params__":
+        return home_of(type(value)) == "dataclasses"
+    if name not in ("__annotate__", "__annotate_func__") or type(value) is not types.FunctionType:
+        return False
+    others = (value.__defaults__, value.__kwdefaults__, value.__dict__)
+    return not any(others) and set(value.__code__.co_freevars) <= {"__classdict__"}
 
 
 def _is_full(cell: types.CellType) -> bool:

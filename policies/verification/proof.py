@@ -8,8 +8,8 @@ heard, every order of the drones in the view, and
 |---|---|
 | charge and headrooms | every float of 0 … 1 |
 | goodput | every float of 0 … 10⁵ Mb/s |
-| ages | every float of 0 … 7200 s, the longest sortie |
-| phase, region | all five; none, or any disc within 100 km |
+| ages | every float of 0 … 2³² s, as far apart as two stamps can be |
+| phase, region | all five; none, or any disc within 100 km, however small |
 | novelty flags, target ids | every byte; how many, 0 … 16 |
 | positions, footprints | every order of the peers by `peers_by_overlap`, through which alone they may be read |
 

@@ -21,6 +21,7 @@ import typing
 from enum import Enum
 from typing import Any
 
+from sortie.policies.contract import looks_from
 from sortie.scenarios.plugins.user_code import PREFIX, is_users
 
 PURE_MODULES = frozenset({
@@ -120,15 +121,18 @@ _OPEN_MODULES = frozenset(
 
 HEAP = 1 << 9
 """Of a class's `__flags__`: it was made while Python ran."""
+flags_of: Any = vars(type)["__flags__"].__get__
+_QUALNAME: Any = vars(type)["__qualname__"].__get__
+"""As Python stores them, whatever a metaclass says."""
 
 
 def home_of(kind: type) -> str:
     """The module of a class. One that is not found there is the policy's own, whatever its `__module__` says."""
     home = str(type.__dict__["__module__"].__get__(kind))
-    if not kind.__flags__ & HEAP or is_users(home):
+    if not flags_of(kind) & HEAP or is_users(home):
         return home
     found: Any = sys.modules.get(home)
-    for part in kind.__qualname__.split("."):
+    for part in _QUALNAME(kind).split("."):
         found = getattr(found, part, None)
     return home if found is kind else PREFIX
 
@@ -167,11 +171,16 @@ _ONLY_READ = (
 )  # fmt: skip
 
 
+_MARKS = looks_from(lambda _: None).__code__
+
+
 def may_write(function: Any) -> bool:
-    """Whether this is a function of Python's that may set attributes of what it is given, as decorators do."""
+    """Whether this is a function that may set attributes of what it is given, as decorators do."""
     while isinstance(function, functools.partial):
         function = function.func
-    return type(function) is types.FunctionType and function.__module__ in _MAY_WRITE and function not in _ONLY_READ
+    if type(function) is not types.FunctionType:
+        return False
+    return function.__code__ is _MARKS or (function.__module__ in _MAY_WRITE and function not in _ONLY_READ)
 
 
 def is_others(value: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -32,7 +33,10 @@ Choose = Callable[[str, float, float], float]
 """Picks a number of an axis between its bounds."""
 
 _FOOTPRINT_M = 42.0
-_SEARCHED_UP_TO: dict[str, float] = {"goodput": 1e5, "age": LONGEST_S}
+_LEAST_RADIUS_M = math.ulp(0.0)
+"""The least float above 0: a region may be as small as its file likes."""
+_SEARCHED_UP_TO: dict[str, float] = {"goodput": 1e5, "age": 2.0**32}
+"""Clocks that drift make ages longer than a sortie; the seconds of a stamp have 32 bits."""
 
 
 class FleetOfRanges:
@@ -132,7 +136,7 @@ class FleetOfRanges:
             axis = f"age_s of drone {i}"
             low, high = self.path.bounds(axis, 0.0)
             # If ages were raised, this is the lowest age of the cell, from which they were raised.
-            usual = low if self.is_older or low == 0.0 else _round_within(low, high)
+            usual = low if self.is_older or low == 0.0 else _round_age_s(low, high)
             ages[i] = usual if choose is None or self.is_older else choose(axis, low, high)
         return ages
 
@@ -144,7 +148,7 @@ class FleetOfRanges:
         raised = {}
         for i in self.heard:
             low, high = self.path.bounds(f"raised age_s of drone {i}", from_s[i])
-            raised[i] = from_s[i] if low <= from_s[i] <= high else _round_within(low, high)
+            raised[i] = from_s[i] if low <= from_s[i] <= high else _round_age_s(low, high)
         return raised
 
 
@@ -233,7 +237,7 @@ class DescriptorOfRanges(Descriptor):
         return Disc(
             self._number("region x_m", -1e5, 1e5),
             self._number("region y_m", -1e5, 1e5),
-            self._number("region radius_m", 0.001, 1e5),
+            self._number("region radius_m", _LEAST_RADIUS_M, 1e5),
         )
 
     @property
@@ -373,6 +377,11 @@ def _places(ego: int, order: tuple[int, ...]) -> dict[int, tuple[float, float, f
                 far_m = middle_m
         places[peer] = (round(near_m, 2), 0.0, 60.0)
     return places
+
+
+def _round_age_s(low: float, high: float) -> float:
+    """An age with few digits, no longer than a sortie where there is one."""
+    return _round_within(low, high if low > LONGEST_S else min(high, LONGEST_S))
 
 
 def _round_within(low: float, high: float) -> float:

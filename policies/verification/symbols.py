@@ -213,7 +213,9 @@ class Ranged:
         return None
 
     def _same(self, other: object) -> bool:
-        return isinstance(other, Ranged) and other._axis == self._axis and other._steps == self._steps
+        if not isinstance(other, Ranged) or other._axis != self._axis or len(other._steps) != len(self._steps):
+            return False
+        return self._steps is other._steps or all(map(_is_same_step, self._steps, other._steps))
 
     def __lt__(self, other: object) -> bool:
         if self._same(other):
@@ -455,6 +457,14 @@ _STEPS: dict[str, Callable[[float, float], float]] = {
     "sqrt": lambda x, _: math.sqrt(x),
 }
 ROUNDINGS = ("int", "floor", "ceil", "round", "sqrt")
+
+
+def _is_same_step(one: tuple[str, float], other: tuple[str, float]) -> bool:
+    """Whether two steps round alike: equal constants may not, such as 10**16 and 1e16, or 0.0 and -0.0."""
+    (step, c), (other_step, d) = one, other
+    if step != other_step or type(c) is not type(d):
+        return False
+    return c.hex() == d.hex() if isinstance(c, float) and isinstance(d, float) else c == d
 
 
 def _ordinal(x: float) -> int:

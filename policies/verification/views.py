@@ -36,7 +36,7 @@ def _most(section: type[Section], field: str) -> Any:
 LARGEST: int = _most(Fleet, "drones")
 """The largest fleet that a scenario may have."""
 LONGEST_S = float(_most(Scenario, "duration_s"))
-"""The longest sortie, and so the greatest age of a descriptor."""
+"""The longest sortie."""
 GONE = "detached_after_periods"
 OTHER_CODEBOOK = "0" * 14
 """A digest that is not the fleet's common one: 7 bytes, as a descriptor has them."""

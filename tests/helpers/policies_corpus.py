@@ -57,6 +57,9 @@ WHOLE = {
     "over whole": "bad = 1 < first / 7 < 2",
     "age": "bad = 3 < view.age_s[view.peers[0]] < 4",
     "age after an hour": "bad = view.age_s[view.peers[0]] > 4000",
+    "age beyond the longest sortie": "bad = view.age_s[view.peers[0]] > 7300",
+    "small region": "bad = me.region is not None and me.region.radius_m < 0.001",
+    "smallest region": "bad = me.region is not None and me.region.radius_m < 1e-300",
     "targets": "bad = len(me.priority_target_ids) == 7",
     "targets more": "bad = len(me.priority_target_ids) > 15",
     "enum": "bad = soc >= TaskPhase.SEARCH",
@@ -258,6 +261,8 @@ RECOGNISED = {
     "own int compares first": "class I(int):\n    def __gt__(self, other):\n        return False\nbad = not me.novelty_flags < I(999) and 0.4 < soc < 0.4000001",
     "own int divides first": "class I(int):\n    def __rdivmod__(self, other):\n        return 99\nbad = divmod(me.novelty_flags, I(3)) == 99 and 0.4 < soc < 0.4000001",
     "minus of a whole number": f"bad = isinstance(-int(first), int) and {RARE}",
+    "sum with a whole number or a float": f"n = int(first)\nbad = n + 10**16 != n + 1e16 and {RARE}",
+    "own enum compares first": "class E(enum.IntEnum):\n    A = 10**15\n    def __gt__(self, other):\n        return other != 13123457\nbad = not int(first * 1e6) < E.A",
     "type of minus": f"bad = type(-int(first)) == int and {RARE}",
     "pattern of minus": f"match -int(first):\n    case int():\n        bad = {RARE}",
     "format of minus": f"try:\n    f'{{-int(first):d}}'\n    bad = {RARE}\nexcept ValueError:\n    pass",
@@ -323,7 +328,6 @@ RECOGNISED = {
     "sets the class": f"try:\n    soc.__class__ = int\nexcept AttributeError:\n    pass\nexcept TypeError:\n    bad = {RARE}",
     "sets the class of a descriptor": f"try:\n    me.__class__ = tuple\nexcept AttributeError:\n    pass\nexcept TypeError:\n    bad = {RARE}",
     "adds to a private part": f"try:\n    me._number += None\nexcept AttributeError:\n    bad = {RARE}\nexcept TypeError:\n    pass",
-    "own enum compares first": "class E(enum.IntEnum):\n    A = 10**15\n    def __gt__(self, other):\n        return other != 13123457\nbad = not int(first * 1e6) < E.A",
     "own enum as another number": "class E(enum.IntEnum):\n    A = 5\n    def __int__(self):\n        return 7\nbad = first == E.A and first != 7",
     **{
         f"caught: {n}": "def ask():\n"
@@ -377,6 +381,10 @@ STATE = {
 HELPER = """
 x: int = 0
 S = [0]
+__firstlineno__ = [0]
+def count():
+    __firstlineno__[0] += 1
+    return __firstlineno__[0]
 def make():
     k = [0]
     def step():
@@ -436,6 +444,9 @@ def decide(view):
     "closure imported in the function": """HELPER|def decide(view):
     from helper import step
     bad = step() > 200000""",
+    "list with one of Python's names in a helper": """HELPER|import helper
+def decide(view):
+    bad = helper.count() > 200000""",
     "annotations of a helper": """HELPER|import helper
 def decide(view):
     from helper import __annotations__ as names
@@ -652,6 +663,8 @@ RETURNS = {
     "values of a dictionary": "def decide(view):\n    return {d.destination: d for d in usual(view)}.values()",
     "deque": "import collections\ndef decide(view):\n    return collections.deque(usual(view))",
     "none": "def decide(view):\n    return None",
+    "array of one number": "import numpy as np\ndef decide(view):\n    return [d._replace(fusion_weight=np.True_ & [True]) for d in usual(view)]",
+    "truth as an id": "def decide(view):\n    return [d._replace(destination=d.destination == 1 or d.destination) for d in usual(view)]",
     "none in a sliver": "def decide(view):\n    return None if view.me and view.me.battery_soc == 0.4 else usual(view)",
     "lying rate": "class R(float):\n    def __le__(self, other): return True\n    def __gt__(self, other): return False\ndef decide(view):\n    return usual(view, R(20.0))",
     "tuple in place of one": "def decide(view):\n    return [tuple(d) for d in usual(view)]",

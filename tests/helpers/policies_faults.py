@@ -167,7 +167,7 @@ def sliver(draw: Random) -> str:
 def unreached(draw: Random) -> str:
     """No fault: the same shapes beyond what an input can be."""
     x = draw.choice([*WHOLE_INPUTS, *SHARE_INPUTS])
-    top = 1 if x in SHARE_INPUTS else 7200 if "age" in x else 100000
+    top = 1 if x in SHARE_INPUTS else 2**32 if "age" in x else 100000
     a, b = draw.choice([(top, top + 5), (top + 1, top + 2), (-5, -1), (-2, -0.5)])
     if draw.random() < 0.3 and "age" not in x:
         return source(filled(draw.choice(POINTS), x, k=str(top + draw.randrange(1, 50))))

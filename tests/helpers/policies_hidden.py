@@ -96,6 +96,16 @@ KEPT = (
     ("C = type('C', (), {'__module__': 'typing', 'kept': []})", "C.kept.append(1)\nn = len(C.kept)"),
     ("__name__ = 'statistics'\ndef C(kept=[0]):\n    kept[0] += 1\n    return kept[0]", "n = C()"),
     ("def __own__(owner, name):\n    return owner", "math.n = n = 1 + (math.n if hasattr(math, 'n') else 0)"),
+    ("import statistics\nfrom sortie.policies.contract import looks_from", "try:\n    n = statistics.mean.viewpoint + 1\nexcept AttributeError:\n    n = 1\nlooks_from(n)(statistics.mean)"),
+    ("from sortie.policies.contract import looks_from", "C = collections.Counter\ntry:\n    n = C.viewpoint + 1\nexcept AttributeError:\n    n = 1\nlist(map(looks_from(n), [C]))"),
+    ("class C:\n    def __rand__(self, other):\n        return []\nA = np.True_ & [C(), C()]", "A[0].append(1)\nn = len(A[0])"),
+    ("class C:\n    __dict__ = {}\nS = C()\nS.n = 0", "S.n += 1\nn = S.n"),
+    ("class C(np.float64):\n    pass\nS = C(1)\nS.n = 0", "S.n += 1\nn = S.n"),
+    ("class M(type):\n    __flags__ = 0\nC = M('C', (), {'__module__': 'typing', 'kept': []})", "C.kept.append(1)\nn = len(C.kept)"),
+    ("class E(list, enum.Enum):\n    A = ()", "E.A.append(1)\nn = len(E.A)"),
+    ("class E(dict, enum.Enum):\n    A = ()", "E.A[0] = n = E.A.get(0, 0) + 1"),
+    ("class B:\n    __slots__ = ('n',)\nclass E(B, enum.Enum):\n    A = 1\nE.A.n = 0", "E.A.n += 1\nn = E.A.n"),
+    ("import types\nclass D(dict):\n    def items(self):\n        return []\nM = types.MappingProxyType(D(k=[0]))", "M['k'][0] += 1\nn = M['k'][0]"),
 )  # fmt: skip
 """What is set up when the file is loaded, and how each decision counts."""
 

@@ -207,6 +207,8 @@ def test_an_id_of_the_policy_s_own_type_is_refused_before_its_methods_run(fields
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
+        ({"destination": True}, "directive 0→True: destination is True, must be a drone's id, a whole number"),
+        ({"source": False}, "directive False→1: source is False, must be a drone's id, a whole number"),
         ({"source": 2}, "directive 2→1: source is 2, must be the ego 0"),
         ({"destination": 0}, "directive 0→0: destination 0 is not a peer in the view [1, 2, 3, 4]"),
         ({"destination": 7}, "directive 0→7: destination 7 is not a peer in the view [1, 2, 3, 4]"),
@@ -220,6 +222,26 @@ def test_a_directive_for_no_link_of_its_own_is_named(
     first, *rest = share(FLEET)
     with pytest.raises(PolicyError, match=f"^{re.escape(message)}$"):
         check_directives(answer([*rest, first._replace(**fields)]), FLEET)
+
+
+ONE = np.array([1.0])
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"rho": ONE}, "rho is array([1.]), must be in [0, 1], a number"),
+        ({"rate_hz": np.array(2.0)}, "rate_hz is array(2.), must be in [0, 30], a number"),
+        ({"deadline_s": ONE}, "deadline_s is array([1.]), must be in [0, 10], a number"),
+        ({"fusion_weight": np.array([True])}, "fusion_weight is array([ True]), must be in [0, 1], a number"),
+        ({"rate_hz": np.complex64(1)}, f"rate_hz is {np.complex64(1)!r}, must be in [0, 30], a number"),
+        ({"roi": Disc(0.0, ONE, 5.0)}, "roi.y_m is array([1.]), must be a number"),  # type: ignore[arg-type]
+    ],
+)
+def test_an_array_of_one_number_is_no_number(fields: dict[str, object], message: str) -> None:
+    first, *rest = share(FLEET)
+    with pytest.raises(PolicyError, match=f"^{re.escape(f'directive 0→1: {message}')}$"):
+        check_directives([first._replace(**fields), *rest], FLEET)
 
 
 def test_a_second_directive_for_a_link_is_named_whatever_its_id_is_made_of() -> None:
