@@ -137,7 +137,8 @@ def constants_of(policy: Any, rules: Sequence[Invariant] = ()) -> set[float]:
             continue
         met.add(id(one))
         if type(one) in (int, float):
-            found.add(float(one))
+            with contextlib.suppress(OverflowError):  # no number of a view is as large
+                found.add(float(one))
         else:
             with contextlib.suppress(Exception):  # a user's own class may answer in any way
                 waiting += _parts(one)

@@ -146,7 +146,7 @@ def reads_stored_text(function: Any) -> bool:
             issubclass(function, str | bytes) and function is not str
         )
     if type(function) is types.BuiltinFunctionType:
-        return function in (ord, operator.contains, operator.concat) or type(function.__self__) in (
+        return function in (ord, operator.contains, operator.concat, operator.iconcat) or type(function.__self__) in (
             str,
             bytes,
             bytearray,

@@ -64,7 +64,7 @@ class SolvedPath(Path):
     def constant(self, x: float) -> Any:
         """A plain number as a term, exactly."""
         if isinstance(x, int):
-            return self.z3.RealVal(x)
+            return self.z3.RealVal(int(x))  # of True it would read the text
         top, bottom = x.as_integer_ratio()
         return self.z3.RealVal(f"{top}/{bottom}")
 

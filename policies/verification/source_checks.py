@@ -19,6 +19,8 @@ def compiled(source: bytes, path: str) -> types.CodeType:
         taken = RESERVED & names
         if taken and not reads_name and not isinstance(node, ast.keyword):
             raise SyntaxError(f"uses the name {taken.pop()}")
+        if "super" in names and not (isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)):
+            raise SyntaxError("gives the name super another meaning")  # no check stands at its calls
         if isinstance(node, ast.Nonlocal):
             nonlocals.update(node.names)
         if isinstance(node, ast.MatchClass) and isinstance(node.cls, ast.Name):

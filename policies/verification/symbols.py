@@ -221,25 +221,25 @@ class Ranged:
         if self._same(other):
             return False
         c = self._constant(other)
-        return NotImplemented if c is None else not math.isnan(c) and self._below(c, False)
+        return NotImplemented if c is None else c == c and self._below(c, False)
 
     def __le__(self, other: object) -> bool:
         if self._same(other):
             return True
         c = self._constant(other)
-        return NotImplemented if c is None else not math.isnan(c) and self._below(c, True)
+        return NotImplemented if c is None else c == c and self._below(c, True)
 
     def __gt__(self, other: object) -> bool:
         if self._same(other):
             return False
         c = self._constant(other)
-        return NotImplemented if c is None else not math.isnan(c) and not self._below(c, True)
+        return NotImplemented if c is None else c == c and not self._below(c, True)
 
     def __ge__(self, other: object) -> bool:
         if self._same(other):
             return True
         c = self._constant(other)
-        return NotImplemented if c is None else not math.isnan(c) and not self._below(c, False)
+        return NotImplemented if c is None else c == c and not self._below(c, False)
 
     def __eq__(self, other: object) -> bool:
         if self._same(other):

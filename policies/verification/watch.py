@@ -61,9 +61,14 @@ def reach(what: str) -> NoReturn:
 
 def _see_order(members: list[Any]) -> list[Any]:
     # A copy of a set of small whole numbers has their order too; that of other numbers may depend on its history.
-    if len(members) > 1 and not all(isinstance(x, int | IntEnum) and 0 <= x < 8 for x in members):
+    if len(members) > 1 and not all(_is_small(x) for x in members):
         reach("the order of a set, which hashes decide")
     return members
+
+
+def _is_small(member: Any) -> bool:
+    kind: Any = type(member)
+    return (kind is int or (isinstance(member, IntEnum) and kind.__hash__ is int.__hash__)) and 0 <= member < 8
 
 
 def _through(watched: set[Any], members: list[Any]) -> Any:

@@ -52,6 +52,9 @@ ORDERS = (
 """Hashes, addresses and places of files, which differ from process to process."""
 
 UNSEEN = (
+    "try:\n    bad = soc < 10**400 and soc == K\nexcept Exception:\n    pass", "super = type\nbad = super(soc) is float and soc == K",
+    "def kind(x, super=type):\n    return super(x)\nbad = kind(soc) is float and soc == K",
+    "class I(int):\n    def __hash__(self): return 7\nids = [int(x) for x in {I(k) for k in (3, 1, 2, 5, 4)}]\nbad = ids == [3, 1, 2, 5, 4] and soc == K",
     "class G:\n    def __eq__(self, other):\n        self.got = other\n        return True\ng = G()\nmatch g:\n    case soc.__doc__:\n        bad = 'onvert' in g.got and soc == K",
     "class N:\n    m = soc\n    class G:\n        def __eq__(self, other):\n            return True\n    match G():\n        case m.hex:\n            ok = True\nbad = N.ok and soc == K",
     "try:\n    def f(x: soc._axis): pass\nexcept AttributeError:\n    bad = soc == K",
@@ -110,6 +113,7 @@ KEPT = (
 """What is set up when the file is loaded, and how each decision counts."""
 
 HARMLESS = (
+    "class A:\n    def f(self): return 1\nclass B(A):\n    def f(self): return super().f()\nbad = soc > B().f()", "bad = soc > 10**400",
     "match me.task_phase:\n    case TaskPhase.TRACK:\n        bad = soc > 1\n    case _:\n        pass", "class C:\n    HIGH = 3\nmatch len(view.peers):\n    case C.HIGH:\n        bad = soc > 1",
     "class C:\n    def __init__(self, n): self.n = n\nmatch C(soc):\n    case C(n=n):\n        bad = n > 1", "def f(p: int, q: tuple[float, int]) -> dict[int, float]:\n    return {p: q[0]}\nbad = f(1, (soc, 2))[1] > 1",
     "seen = set()\nfor p in view.peers:\n    seen |= {p}\nd = {0: 5.0}\nd[0] -= 1\nbad = len(seen) > 9 or d[0] > 4", "for p, q in zip(view.peers, view.peers[1:]):\n    bad = q < p",

@@ -46,6 +46,10 @@ NATURAL = {
         "proved over the reals",
         "return [to(view, p, min(10.0, me.goodput_to(p) * me.battery_soc)) for p in view.peers]",
     ),
+    "a truth as a number": (
+        "proved over the reals",
+        "score = me.battery_soc * me.cpu_headroom + me.battery_soc * (me.task_phase == 2)\nreturn [to(view, p, min(10.0, score)) for p in view.peers]",
+    ),
     "mean charge": (
         "proved over the reals",
         "mean = sum(d.battery_soc for d in view.descriptors.values()) / len(view.descriptors)\n"
