@@ -193,7 +193,7 @@ def attribute(owner: Any, name: str) -> Any:
     return checked(found) if isinstance(owner, BaseException) and name == "args" else found
 
 
-def _kind(*kinds: Any) -> None:
+def _own_kinds(*kinds: Any) -> None:
     """Classes in patterns that name attributes: an object of the policy's own class, by no rule of that class, has them."""
     if not all(type(kind) in (type, EnumType) and is_users(home_of(kind)) for kind in kinds):
         stop("matches an attribute that a search cannot follow")
@@ -328,6 +328,6 @@ class Written:
 WRITTEN = {write.__name__: Written(write) for write in (repr, ascii, format, str)}
 CHECKS: dict[str, Any] = {
     "__called__": _called, "__own__": _own, "__attribute__": attribute, "__decorator__": _decorator, "__each__": _each,
-    "__unordered__": unordered, "__pattern__": _pattern, "__kind__": _kind, **VALUE_CHECKS,
+    "__unordered__": unordered, "__pattern__": _pattern, "__own_kinds__": _own_kinds, **VALUE_CHECKS,
 }  # fmt: skip
 """By the names under which `source_checks` calls them."""

@@ -34,7 +34,7 @@ def compiled(source: bytes, path: str) -> types.CodeType:
 
 RESERVED = {
     "__called__", "__same__", "__text__", "__written__", "__percent__", "__own__", "__attribute__", "__decorator__",
-    "__each__", "__among__", "__pattern__", "__kind__", "__unordered__", "__caught__", "__shown__", "__made__", "__kinds__", "__subject__", "__raised__", "__passed__", "__doubtful__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
+    "__each__", "__among__", "__pattern__", "__own_kinds__", "__unordered__", "__caught__", "__shown__", "__made__", "__kinds__", "__subject__", "__raised__", "__passed__", "__doubtful__", "__held__", "__key__", "__part__", "__builtins__", "__build_class__", "__name__", "__module__",
     "__qualname__", "__match_args__", "__del__", "__file__", "__spec__", "__loader__", "__cached__", "__path__", "__package__",
 }  # fmt: skip
 """The checks, and names by which a policy would say that it is another one, or find where it lies."""
@@ -216,7 +216,7 @@ class Checks(ast.NodeTransformer):
         patterns = [part for case in node.cases for part in ast.walk(case.pattern)]
         classes = [p for p in patterns if isinstance(p, ast.MatchClass) and isinstance(p.cls, ast.Name)]
         kinds = {ast.unparse(p.cls) for p in classes}
-        if kinds & _bound(node):
+        if kinds & _bound_within(node):
             raise SyntaxError("binds the name of a class in the match that uses it")
         of_own = {ast.unparse(p.cls) for p in classes if not _OF_SORTIE.issuperset(p.kwd_attrs)}
         dotted = [p.value for p in patterns if isinstance(p, ast.MatchValue) and isinstance(p.value, ast.Attribute)]
@@ -224,7 +224,7 @@ class Checks(ast.NodeTransformer):
         if any(isinstance(part, ast.MatchMapping) for part in patterns):
             node.subject = ast.Call(_name("__subject__"), [node.subject], [])
         checks: list[ast.expr] = []
-        for check, names in (("__kinds__", kinds), ("__kind__", of_own)):
+        for check, names in (("__kinds__", kinds), ("__own_kinds__", of_own)):
             if names:
                 checks.append(ast.Call(_name(check), [_name(name) for name in sorted(names)], []))
         for value in dotted:
@@ -278,7 +278,7 @@ def _names_bound_in(function: ast.FunctionDef) -> set[str]:
     return {name for name in (*fields, *stored) if isinstance(name, str)}
 
 
-def _bound(node: ast.Match) -> set[str]:
+def _bound_within(node: ast.Match) -> set[str]:
     """The names that get another value within a `match`."""
     bound = set[str]()
     for part in ast.walk(node):

@@ -12,7 +12,7 @@ import sys
 import types
 from abc import ABCMeta
 from collections import Counter, OrderedDict, defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from enum import Enum
 from string import Formatter
 from typing import Any
@@ -98,20 +98,34 @@ _STAND_IN_NAMES = re.compile(
 """In the text of an error that real objects raise with another text."""
 
 
-def _shown() -> None:
-    """A policy can look at the present error."""
+def _present_errors() -> Iterator[BaseException]:
+    """The error that is handled now; of a group, each of its errors."""
     parts: list[Any] = [sys.exc_info()[1]]
     while parts:
         error = parts.pop()
         if isinstance(error, BaseExceptionGroup):
             parts += error.exceptions
         elif error is not None:
-            last = error.__traceback__
-            while last is not None and last.tb_next is not None:
-                last = last.tb_next
-            home = "" if last is None else last.tb_frame.f_globals.get("__name__")
-            if home in STAND_INS or any(type(a) is str and _STAND_IN_NAMES.search(a) for a in error.args):
-                stop("looks at an error whose text is another one in flight")
+            yield error
+
+
+def _origin(error: BaseException) -> types.TracebackType | None:
+    """Where an error was raised."""
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    return last
+
+
+def _home(origin: types.TracebackType | None) -> str:
+    return "" if origin is None else str(origin.tb_frame.f_globals.get("__name__"))
+
+
+def _shown() -> None:
+    """A policy can look at the present error."""
+    for error in _present_errors():
+        if _home(_origin(error)) in STAND_INS or any(type(a) is str and _STAND_IN_NAMES.search(a) for a in error.args):
+            stop("looks at an error whose text is another one in flight")
 
 
 DOUBTFUL = (TypeError, AttributeError, SystemError)
@@ -131,22 +145,14 @@ _PLAIN_OWNERS = (type(None), int, float, str, bytes, tuple, list, dict, types.Ma
 
 def passed() -> None:
     """An error is caught, or leaves a function, whose caller may catch it."""
-    parts: list[Any] = [sys.exc_info()[1]]
-    while parts:
-        error = parts.pop()
-        if isinstance(error, BaseExceptionGroup):
-            parts += error.exceptions
-        elif isinstance(error, DOUBTFUL) and not _is_alike(error):
-            WATCH.doubtful.append(error)
+    WATCH.doubtful += [e for e in _present_errors() if isinstance(e, DOUBTFUL) and not _is_alike(e)]
 
 
 def _is_alike(error: BaseException) -> bool:
     """Whether real objects raise this error as well."""
-    last = error.__traceback__
-    while last is not None and last.tb_next is not None:
-        last = last.tb_next
-    if last is not None and is_users(str(last.tb_frame.f_globals.get("__name__"))):
-        step = last.tb_frame.f_code.co_code[last.tb_lasti]
+    origin = _origin(error)
+    if origin is not None and is_users(_home(origin)):
+        step = origin.tb_frame.f_code.co_code[origin.tb_lasti]
         if step == _RAISES or (step in _SETS and isinstance(error, AttributeError)):  # the second: see `_own`
             return True
     if isinstance(error, AttributeError):
