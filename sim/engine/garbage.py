@@ -26,7 +26,7 @@ def older_objects_kept() -> Iterator[None]:
 
 
 class Leftovers:
-    """The parts of flights that have ended. Without this, a campaign by torch grew by ten megabytes a flight."""
+    """The parts of flights that have ended. Without this, a campaign by torch grows with each flight."""
 
     def __init__(self) -> None:
         self._took_s, self._free_s = 0.0, 0.0
