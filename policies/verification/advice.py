@@ -5,7 +5,9 @@ from __future__ import annotations
 _ADVICE = (
     ("combines", "compare each input with constants, or let z3 follow sums, products and comparisons"),
     ("compares or combines", "use plain numbers of Python in thresholds"),
-    ("that real objects may not raise", "ask for what could raise it, in place of catching it"),
+    ("not plain Python", "keep to what a proof follows (policies/README.md, \"Plain Python\")"),
+    ("writes text with", "use an f-string"),
+    ("derives ", "derive classes from nothing, from NamedTuple or from Enum"),
     ("without peers_by_overlap", "rank the peers with peers_by_overlap"),
     ("uses the text of", "put numbers into the reason alone"),
     ("is not a policy of Sortie", "verify it as file.py:function"),

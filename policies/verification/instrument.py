@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path as File
 from typing import Any
 
-from sortie.policies.verification.call_checks import CHECKS, WRITTEN, attribute, guarded
+from sortie.policies.verification.call_checks import CHECKS, attribute, guarded
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import Kept, kept_by
 from sortie.policies.verification.outside import Outside
@@ -48,19 +48,12 @@ class Instrumented:
         """
         if self._kept is None:
             self._kept = kept_by(self.function, self.module)
-        WATCH.stopped, WATCH.doubtful = None, []
-        escaped: BaseException | None = None
+        WATCH.stopped = None
         try:
             return self.function(view, **params)
-        except BaseException as error:
-            escaped = error
-            raise
         finally:
             if WATCH.stopped is not None:
                 raise WATCH.stopped
-            caught = next((e for e in WATCH.doubtful if e is not escaped), None)
-            if caught is not None:
-                raise Refused(f"catches an error ({type(caught).__name__}) that real objects may not raise")
             changed = self._kept.changed() or WATCH.changed()
             if changed:
                 raise Remembers(changed)
@@ -85,9 +78,7 @@ def instrumented(path: File, attribute: str) -> Instrumented:
     return Instrumented(getattr(module, attribute), module)
 
 
-BUILTINS = {name: guarded(value) for name, value in vars(builtins).items() if name[:2] != "__"} | {
-    name: value for name, value in WRITTEN.items() if name != "str"
-}
+BUILTINS = {name: guarded(value) for name, value in vars(builtins).items() if name[:2] != "__"}
 """What a policy finds under the builtins' names."""
 
 
@@ -98,9 +89,9 @@ def _builtins(find: Callable[..., Any]) -> dict[str, Any]:
         module = find(name, *rest)
         wanted: Sequence[str] = (rest[2] or ()) if len(rest) > 2 else ()
         home = module.__name__
-        if is_users(home) or is_trusted(home):
-            return _Names(module, wanted) if wanted and not is_users(home) else module
-        if home.partition(".")[0] in PURE_MODULES:
+        if is_users(home):
+            return module
+        if is_trusted(home) or home.partition(".")[0] in PURE_MODULES:
             return _Names(module, wanted) if wanted else module
         return Outside(home)
 

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sortie.policies.verification.pure import HEAP, flags_of, home_of, is_own_cache
-from sortie.policies.verification.source_checks import RESERVED
 from sortie.policies.verification.symbols import Refused
 from sortie.scenarios.plugins.user_code import is_users, modules_with
 
@@ -74,7 +73,7 @@ def kept_by(function: Callable[..., Any], module: types.ModuleType) -> Kept:
     def roots() -> dict[str, Any]:
         others = {f"the module {m.__name__.partition('.')[2]}": m for m in modules.values() if m is not module}
         others.pop("the module ", None)  # their package, which holds no more than them
-        own = {name: value for name, value in vars(module).items() if name not in RESERVED}
+        own = {name: value for name, value in vars(module).items() if name[:2] != "__"}
         alone = {n: v for n, v in own.items() if type(v) is not types.ModuleType or not is_users(v.__name__)}
         return {**alone, "the policy itself": function, **others}
 
@@ -158,7 +157,7 @@ def _parts(value: Any, met: dict[int, tuple[int, Any]]) -> Any:
             *([] if is_others else value.__annotations__.values()),
         ]
     elif issubclass(kind, types.ModuleType):
-        found = [v for n, v in vars(value).items() if n not in RESERVED] if is_users(value.__name__) else []
+        found = [v for n, v in vars(value).items() if n[:2] != "__"] if is_users(value.__name__) else []
     elif issubclass(kind, type):
         if issubclass(value, Flag) and is_users(home_of(value)):
             _fill_cache(value)

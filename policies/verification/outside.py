@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from sortie.policies.verification.pure import is_seeded
 from sortie.policies.verification.watch import reach, stop
-from sortie.scenarios.plugins.user_code import is_users
 
 
 class Outside:
@@ -21,12 +18,6 @@ class Outside:
         if name.startswith("__"):
             raise AttributeError(name)
         return Outside(f"{self._path}.{name}")
-
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:
-        if is_users(str(sys._getframe(1).f_globals.get("__name__"))):  # a pattern with a class
-            self._used()
-        return type(self)
 
     def __mro_entries__(self, _: object) -> NoReturn:
         self._used()
@@ -45,8 +36,6 @@ _OPERATORS = (
 )
 for _operator in _OPERATORS.split():
     setattr(Outside, f"__{_operator}__", Outside._used)
-
-Sequence.register(Outside)  # a pattern of a sequence meets its length
 
 
 class Unknown(Outside):

@@ -253,11 +253,8 @@ class Solved(Ranged):
         return self if self >= 0 else -self
 
     def _text(self, spec: str = "") -> str:
-        format(self._example(), spec)
+        format(0.0 if isinstance(self, float) else 0, spec)  # a wrong spec must raise
         return Text(self._path, self._axis, f"{MARK}{self._axis}{MARK}")
-
-    def _example(self) -> float:
-        return 0.0 if isinstance(self, float) else 0
 
     def _value_in(self, values: Mapping[str, float]) -> float:
         path: Any = self._path

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import operator
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from sortie.policies.contract import plain_copy
@@ -203,7 +203,6 @@ for _kind, _refusal in (
     for _operator in _OPERATORS.split():
         if f"__{_operator}__" not in vars(_kind):
             setattr(_kind, f"__{_operator}__", _refusal)
-Sequence.register(TargetIds)  # a pattern of a sequence meets its length
 
 
 def space_of(peer: int, field: str = "feature_space") -> str:

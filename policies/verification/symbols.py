@@ -348,10 +348,6 @@ class Ranged:
     def __repr__(self) -> str:
         return self._cannot() if for_policy(sys._getframe(1)) else self._text()
 
-    def _example(self) -> float:
-        """One of its values, to see what plain Python says of its type."""
-        return self._at(self._path.ranges[self._axis][0])
-
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
         """The plain number's class, so that `isinstance` and `match` give the same result as in flight. `type` does not."""
@@ -406,9 +402,6 @@ class Text(str):
     def __radd__(self, other: str) -> Text:
         return Text(self._path, self._axis, str.__add__(other, self._plain()))
 
-    def __rmod__(self, other: str) -> Text:
-        return Text(self._path, self._axis, str.__mod__(other, self._plain()))
-
     def _text(self, spec: str = "") -> Text:
         return Text(self._path, self._axis, str.__format__(self, spec))
 
@@ -420,9 +413,6 @@ class Text(str):
 
     def __repr__(self) -> str:
         return self._refused() if for_policy(sys._getframe(1)) else self
-
-    def _example(self) -> str:
-        return "0"
 
     def __bool__(self) -> bool:
         return True  # the text of a number is never empty

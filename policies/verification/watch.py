@@ -21,8 +21,6 @@ class Watch:
     def begin(self) -> None:
         """Forget the policy before."""
         self.stopped: Reached | Refused | None = None
-        self.doubtful: list[BaseException] = []
-        """Errors that real objects may not raise. They may end the decision; the policy may not go on after one."""
         self._others: dict[str, tuple[Any, Any]] = {}
 
     def stop(self, why: Reached | Refused) -> NoReturn:
@@ -108,6 +106,9 @@ class UnorderedFrozen(frozenset[Any]):
         return frozenset
 
 
+WATCHED = (Unordered, UnorderedFrozen)
+
+
 def unordered(value: Any) -> Any:
     """A plain set as one that watches its order; anything else as it is."""
     return Unordered(value) if type(value) is set else UnorderedFrozen(value) if type(value) is frozenset else value
@@ -139,7 +140,7 @@ def ordered_for(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) ->
 
     def one(value: Any) -> Any:
         if value is set or value is frozenset:
-            return value if function in (isinstance, issubclass) else Unordered if value is set else UnorderedFrozen
+            return value if function is isinstance else Unordered if value is set else UnorderedFrozen
         if is_blind and type(value) in (Unordered, UnorderedFrozen):
             members = list((set if type(value) is Unordered else frozenset).__iter__(value))
             alike = any({type(x) for x in members} <= kinds for kinds in _COMPARABLE)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from policies_corpus import FAULTY, HELPER, LINE, RIGHT
+from policies_corpus import FAULTY, HELPER, LINE, RIGHT, UNPLAIN, source
 
 from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants import parse
@@ -16,7 +16,9 @@ Verify = Callable[[str], list[ProofVerdict]]
 FOUND = ("whole: ", "sliver: ", "returns: ")
 """Kinds in which the search itself finds a view, not only declines to prove."""
 DECLINED = {
-    "sliver: division by a zero charge", "returns: list that changes", "returns: quiet list", "returns: swallows",
+    "sliver: division by a zero charge", "sliver: match of a class", "returns: list that changes", "returns: quiet list",
+    "returns: swallows", "returns: lying subclass", "returns: lying item", "returns: quiet subclass", "returns: lying rate",
+    "returns: array of one number", "returns: changes an age", "returns: removes a drone", "returns: alias",
 }  # fmt: skip
 """Entries of these kinds that the search cannot follow."""
 
@@ -52,6 +54,13 @@ def test_no_planted_fault_is_proved(name: str, verify: Verify) -> None:
 @pytest.mark.parametrize("name", RIGHT)
 def test_correct_policies_are_proved(name: str, verify: Verify) -> None:
     assert [(v.outcome, v.what) for v in verify(RIGHT[name]) if v.outcome != "proved"] == []
+
+
+@pytest.mark.parametrize("name", UNPLAIN)
+def test_correct_policies_in_other_python_are_drawn_and_told_why(name: str, verify: Verify) -> None:
+    verdicts = verify(source(UNPLAIN[name]))
+    assert {v.outcome for v in verdicts} == {"drawn"}
+    assert all(v.what.startswith("Cannot analyse: it ") and "To make it provable: " in v.what for v in verdicts)
 
 
 def test_the_corpus_is_as_large_as_promised() -> None:

@@ -148,4 +148,4 @@ def test_numbers_that_no_table_can_keep_are_refused(tmp_path: Path, number: str)
         "def decide(view):\n"
         f"    return [Directive(view.ego, p, rate_hz={number}, reason='r') for p in view.peers]\n"
     )
-    assert [v.outcome for v in verdicts(tmp_path, text)] == ["refuted"] * 3
+    assert [v.outcome for v in verdicts(tmp_path, text, views=5)] == ["refuted"] * 3

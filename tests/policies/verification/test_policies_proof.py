@@ -240,13 +240,3 @@ def test_a_global_that_another_function_of_the_file_changes_is_named_with_its_li
         "Cannot analyse: it changes the global calls in line 5. To make it provable: decide from the view alone, and keep "
         "functions that change globals in another file"
     )
-
-
-@pytest.mark.parametrize("text", ["drone %d: %.0f%% charge", "%d%%critical %.1f", "%d%%, 3 * x %g"])
-def test_a_percent_sign_in_a_reason_is_no_obstacle(text: str, tmp_path: Path) -> None:
-    file = tmp_path / "told.py"
-    file.write_text(
-        "from sortie import Directive\n\ndef decide(view):\n"
-        f"    return [Directive(view.ego, p, reason={text!r} % (p, view.me.battery_soc)) for p in view.peers]\n"
-    )
-    assert [v.outcome for v in prove(resolve(f"{file}:decide"), [], max_drones=2, views=5)] == ["proved"] * 2

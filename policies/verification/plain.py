@@ -1,0 +1,174 @@
+"""The plain Python that a search follows. Whatever else a policy's source has is refused before it runs.
+
+A stand-in must behave as the real object wherever Python meets it. Python has many places where it asks an object without a
+visible call: operators of own classes, patterns, `with`, caught errors, annotations, special names. So a proof does not
+follow all of Python: it follows what is listed here, each part of which has been thought through. A policy that needs more
+is tested by drawn views.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+
+_PLAIN = (
+    ast.Module, ast.FunctionDef, ast.ClassDef, ast.Return, ast.Delete, ast.Assign, ast.AugAssign, ast.AnnAssign, ast.For,
+    ast.While, ast.If, ast.Match, ast.match_case, ast.Raise, ast.Try, ast.ExceptHandler, ast.Assert, ast.Import,
+    ast.ImportFrom, ast.alias, ast.Nonlocal, ast.Expr, ast.Pass, ast.Break, ast.Continue,
+    ast.BoolOp, ast.NamedExpr, ast.BinOp, ast.UnaryOp, ast.Lambda, ast.IfExp, ast.Dict, ast.Set, ast.ListComp, ast.SetComp,
+    ast.DictComp, ast.GeneratorExp, ast.Yield, ast.YieldFrom, ast.Compare, ast.Call, ast.FormattedValue, ast.JoinedStr,
+    ast.Constant, ast.Attribute, ast.Subscript, ast.Starred, ast.Name, ast.List, ast.Tuple, ast.Slice, ast.comprehension,
+    ast.arguments, ast.arg, ast.keyword, ast.expr_context, ast.boolop, ast.operator, ast.unaryop, ast.cmpop,
+    ast.MatchValue, ast.MatchSingleton, ast.MatchOr, ast.MatchAs,
+)  # fmt: skip
+_WORDS: dict[type[ast.AST], str] = {
+    ast.With: "a with statement", ast.TryStar: "except*", ast.MatMult: "the operator @", ast.MatchClass: "a class in a pattern",
+    ast.MatchSequence: "a sequence in a pattern", ast.MatchMapping: "a mapping in a pattern", ast.Await: "await",
+    ast.AsyncFunctionDef: "asynchronous code", ast.AsyncFor: "asynchronous code", ast.AsyncWith: "asynchronous code",
+}  # fmt: skip
+CAUGHT = frozenset(
+    {"ValueError", "KeyError", "IndexError", "LookupError", "ZeroDivisionError", "StopIteration", "StatisticsError"}
+)
+"""Errors that a policy may catch: a stand-in raises them where, and only where, the real object does."""
+_RAISED = CAUGHT | {"TypeError", "RuntimeError", "AssertionError", "NotImplementedError"}
+_METHODS = frozenset({"__init__", "__post_init__", "__call__"})
+"""Methods with special names that a class may have."""
+_ALONE = frozenset({"property", "staticmethod", "classmethod"})
+"""What may only stand over a method, without another decorator."""
+_FIXED = _RAISED | _ALONE | {"super"}
+"""Names to which nothing may give another meaning."""
+
+
+def refuse_other_python(tree: ast.Module) -> None:
+    """Check that a source is plain Python.
+
+    Raises:
+        SyntaxError: it is not; the message has the line, and what is there.
+    """
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Global):
+            raise SyntaxError(f"changes the global {node.names[0]} in line {node.lineno}")
+        for what in _others(node):
+            line = f" in line {node.lineno}" if hasattr(node, "lineno") else ""
+            raise SyntaxError(f"has {what}{line}, which is not plain Python")
+    _only_at_their_places(tree)
+
+
+def _others(node: ast.AST) -> Iterator[str]:
+    """What one node has that is not plain Python, in words."""
+    if not isinstance(node, _PLAIN) or isinstance(node, ast.MatMult):
+        yield _WORDS.get(type(node), type(node).__name__)
+    for name in _names_of(node):
+        if name[:2] == "__":
+            yield f"the name {name}"
+        if name in _FIXED and not _is_read(node):
+            yield f"another meaning of {name}"
+    match node:
+        case ast.Attribute(attr=name) if name[:2] == "__" and not (name in _METHODS and _is_super(node.value)):
+            yield f"the name {name}"
+        case ast.comprehension(is_async=1):
+            yield "asynchronous code"
+        case ast.FormattedValue(conversion=97):
+            yield "a conversion by ascii"
+        case ast.Constant(value=complex()):
+            yield "a complex number"
+        case ast.Try(finalbody=[_, *_]):
+            yield "finally"
+        case ast.ExceptHandler(name=str()):
+            yield "an error with a name"
+        case ast.ExceptHandler(type=None):
+            yield "an except without a kind of error"
+        case ast.ExceptHandler(type=ast.Tuple(elts=kinds)):
+            yield from (f"an except for {ast.unparse(kind)}" for kind in kinds if _error(kind) not in CAUGHT)
+        case ast.ExceptHandler(type=ast.expr() as kind) if _error(kind) not in CAUGHT:
+            yield f"an except for {ast.unparse(kind)}"
+        case ast.Raise(cause=ast.expr()):
+            yield "a raise with a cause"
+        case ast.Raise(exc=ast.Call(func=error) | (ast.expr() as error)) if _error(error) not in _RAISED:
+            yield f"a raise of {ast.unparse(error)}"
+        case ast.ClassDef():
+            yield from _others_in_class(node)
+        case ast.FunctionDef(decorator_list=[_, _, *_] as decorators) if any(map(_is_alone, decorators)):
+            yield "a decorator beside one that must be alone"
+
+
+def _is_read(node: ast.AST) -> bool:
+    """Whether a node with a name reads what it means, or imports it from where it has this meaning."""
+    if isinstance(node, ast.alias):
+        return node.asname is None and node.name in ("StatisticsError", "statistics.StatisticsError")
+    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
+
+
+def _is_super(node: ast.AST) -> bool:
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "super"
+
+
+def _others_in_class(node: ast.ClassDef) -> Iterator[str]:
+    if node.keywords:
+        yield "a class with keywords"
+    for part in node.body:
+        match part:
+            case ast.FunctionDef():
+                if part.name[:2] == "__" and part.decorator_list:
+                    yield f"a decorator of {part.name}"
+            case ast.AnnAssign(target=ast.Name()) | ast.Pass() | ast.Expr(value=ast.Constant()):
+                pass
+            case ast.Assign(targets=targets) if all(isinstance(target, ast.Name) for target in targets):
+                pass
+            case _:
+                yield "statements in a class"
+
+
+def _names_of(node: ast.AST) -> Iterator[str]:
+    """The names that a node binds or reads, but for those that have a place of their own (`_only_at_their_places`)."""
+    match node:
+        case ast.Name(id=name) if name != "__name__":
+            yield name
+        case ast.arg(arg=name) | ast.ClassDef(name=name) | ast.MatchAs(name=str(name)):
+            yield name
+        case ast.FunctionDef(name=name) if name not in _METHODS:
+            yield name
+        case ast.alias(name=name, asname=asname):
+            yield from (part for part in (*name.split("."), asname) if part is not None and part != "__future__")
+        case ast.Nonlocal(names=names):
+            yield from names
+
+
+def _error(node: ast.AST) -> str:
+    """The name of an error that is caught or raised; empty for anything else."""
+    match node:
+        case ast.Name(id=name):
+            return name
+        case ast.Attribute(value=ast.Name(id="statistics"), attr="StatisticsError"):
+            return "StatisticsError"
+    return ""
+
+
+def _is_alone(node: ast.AST) -> bool:
+    return isinstance(node, ast.Name) and node.id in _ALONE
+
+
+def _only_at_their_places(tree: ast.Module) -> None:
+    """Refuse what is plain at some places alone, anywhere else."""
+    allowed = set[ast.AST]()
+    for node in ast.walk(tree):
+        match node:
+            case ast.If(test=ast.Compare(left=left, ops=[ast.Eq()], comparators=[ast.Constant(value="__main__")])):
+                allowed.add(left)
+            case ast.Expr(value=made):
+                allowed.add(made)
+            case ast.ClassDef(body=body):
+                methods = [part for part in body if isinstance(part, ast.FunctionDef)]
+                allowed.update(methods, (d for method in methods for d in method.decorator_list))
+    for node in ast.walk(tree):
+        if node in allowed:
+            continue
+        if isinstance(node, ast.Name) and (node.id == "__name__" or node.id in _ALONE):
+            what = f"the name {node.id}"
+        elif isinstance(node, ast.FunctionDef) and node.name in _METHODS:
+            what = f"the name {node.name}"
+        elif isinstance(node, ast.Yield | ast.YieldFrom):
+            what = "a yield that gives something back"
+        else:
+            continue
+        raise SyntaxError(f"has {what} in line {node.lineno}, which is not plain Python")
