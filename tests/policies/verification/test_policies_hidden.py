@@ -48,11 +48,12 @@ def test_what_is_kept_elsewhere_is_not_proved(tmp_path: Path, number: int, monke
     [
         "def use(kept=[]):\n    kept.append(1)",
         "def use(*, kept=[]):\n    kept.append(1)",
-        "def use():\n    use.kept = getattr(use, 'kept', 0) + 1",
         "use = (lambda kept: lambda: kept.append(1))([])",
-        "import functools\nuse = functools.partial(list.append, [], 1)",
+        "import functools\nuse = functools.partial([].append, 1)",
+        "import dataclasses\n@dataclasses.dataclass(slots=True)\nclass Use:\n    n: int = 0\n    def __call__(self):\n        self.n += 1\nuse = Use()",
+        "import enum\nclass E(enum.Enum):\n    A = [0]\n    def __call__(self):\n        self.value[0] += 1\nuse = E.A",
+        "from typing import NamedTuple\nclass Use(NamedTuple):\n    kept: list = []\n    def __call__(self):\n        self.kept.append(1)\nuse = Use()",
         "class Use:\n    kept = []\n    def __call__(self):\n        self.kept.append(1)\nuse = Use()",
-        "class Use(list):\n    def __call__(self):\n        self.append(1)\nuse = Use()",
     ],
 )
 def test_what_changes_is_noticed_wherever_a_function_keeps_it(tmp_path: Path, keeper: str) -> None:
@@ -62,18 +63,6 @@ def test_what_changes_is_noticed_wherever_a_function_keeps_it(tmp_path: Path, ke
     kept = Kept(lambda: {"it": use})
     assert kept.changed() == ""
     use()
-    assert kept.changed() == "changes it"
-
-
-@pytest.mark.parametrize("kind", ["Flag", "IntFlag"])
-def test_what_python_keeps_of_flags_is_no_memory_and_what_a_policy_keeps_is(tmp_path: Path, kind: str) -> None:
-    path = tmp_path / "flags.py"
-    path.write_text(f"import enum\nclass Mode(enum.{kind}):\n    A = 1\n    B = 2\n    C = 4\n")
-    mode = load(path).Mode
-    kept = Kept(lambda: {"it": mode})
-    assert (mode.A | mode.B) & ~mode.B == mode.A
-    assert kept.changed() == ""
-    (mode.A | mode.B).often = 1
     assert kept.changed() == "changes it"
 
 
