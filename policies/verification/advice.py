@@ -5,7 +5,7 @@ from __future__ import annotations
 _ADVICE = (
     ("combines", "compare each input with constants, or let z3 follow sums, products and comparisons"),
     ("compares or combines", "use plain numbers of Python in thresholds"),
-    ("not plain Python", "keep to what a proof follows (policies/README.md, \"Plain Python\")"),
+    ("not plain Python", "keep to the Python that a proof follows (policies/README.md, \"Plain Python\")"),
     ("writes text with", "use an f-string"),
     ("derives ", "derive classes from nothing, from NamedTuple or from Enum"),
     ("without peers_by_overlap", "rank the peers with peers_by_overlap"),

@@ -19,7 +19,7 @@ _PLAIN = (
     ast.DictComp, ast.GeneratorExp, ast.Yield, ast.YieldFrom, ast.Compare, ast.Call, ast.FormattedValue, ast.JoinedStr,
     ast.Constant, ast.Attribute, ast.Subscript, ast.Starred, ast.Name, ast.List, ast.Tuple, ast.Slice, ast.comprehension,
     ast.arguments, ast.arg, ast.keyword, ast.expr_context, ast.boolop, ast.operator, ast.unaryop, ast.cmpop,
-    ast.MatchValue, ast.MatchSingleton, ast.MatchOr, ast.MatchAs,
+    ast.MatchValue, ast.MatchSingleton, ast.MatchOr, ast.MatchAs, ast.withitem,
 )  # fmt: skip
 _WORDS: dict[type[ast.AST], str] = {
     ast.With: "a with statement", ast.TryStar: "except*", ast.MatMult: "the operator @", ast.MatchClass: "a class in a pattern",
@@ -39,19 +39,29 @@ _FIXED = _RAISED | _ALONE | {"super"}
 """Names to which nothing may give another meaning."""
 
 
+_MOST_NAMED = 3
+"""How many parts of a source an error names."""
+
+
 def refuse_other_python(tree: ast.Module) -> None:
     """Check that a source is plain Python.
 
     Raises:
-        SyntaxError: it is not; the message has the line, and what is there.
+        SyntaxError: it is not; the message has the first places and what is there.
     """
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Global):
-            raise SyntaxError(f"changes the global {node.names[0]} in line {node.lineno}")
-        for what in _others(node):
-            line = f" in line {node.lineno}" if hasattr(node, "lineno") else ""
-            raise SyntaxError(f"has {what}{line}, which is not plain Python")
-    _only_at_their_places(tree)
+    changed = next((node for node in ast.walk(tree) if isinstance(node, ast.Global)), None)
+    if changed is not None:
+        raise SyntaxError(f"changes the global {changed.names[0]} in line {changed.lineno}")
+    allowed = _allowed_at_their_places(tree)
+    found = {
+        (getattr(node, "lineno", 0), what): None
+        for node in ast.walk(tree)
+        for what in (*_others(node), *(() if node in allowed else _out_of_place(node)))
+    }
+    if found:
+        said = [f"{what} in line {line}" if line else what for line, what in sorted(found)]
+        more = f" and {len(said) - _MOST_NAMED} more" if len(said) > _MOST_NAMED else ""
+        raise SyntaxError(f"has {', '.join(said[:_MOST_NAMED])}{more}, which is not plain Python")
 
 
 def _others(node: ast.AST) -> Iterator[str]:
@@ -72,6 +82,10 @@ def _others(node: ast.AST) -> Iterator[str]:
             yield "a conversion by ascii"
         case ast.Constant(value=complex()):
             yield "a complex number"
+        case ast.BinOp(op=ast.Mod(), left=ast.Constant(value=str()) | ast.JoinedStr()):
+            yield "`%` on text (f-strings may be used)"
+        case ast.Attribute(value=ast.Constant(value=str()), attr="format"):
+            yield "`format` on text (f-strings may be used)"
         case ast.Try(finalbody=[_, *_]):
             yield "finally"
         case ast.ExceptHandler(name=str()):
@@ -120,7 +134,7 @@ def _others_in_class(node: ast.ClassDef) -> Iterator[str]:
 
 
 def _names_of(node: ast.AST) -> Iterator[str]:
-    """The names that a node binds or reads, but for those that have a place of their own (`_only_at_their_places`)."""
+    """The names that a node binds or reads, but for those that have a place of their own (`_out_of_place`)."""
     match node:
         case ast.Name(id=name) if name != "__name__":
             yield name
@@ -148,8 +162,8 @@ def _is_alone(node: ast.AST) -> bool:
     return isinstance(node, ast.Name) and node.id in _ALONE
 
 
-def _only_at_their_places(tree: ast.Module) -> None:
-    """Refuse what is plain at some places alone, anywhere else."""
+def _allowed_at_their_places(tree: ast.Module) -> set[ast.AST]:
+    """What is plain where it is, and not anywhere else (`_out_of_place`)."""
     allowed = set[ast.AST]()
     for node in ast.walk(tree):
         match node:
@@ -160,15 +174,13 @@ def _only_at_their_places(tree: ast.Module) -> None:
             case ast.ClassDef(body=body):
                 methods = [part for part in body if isinstance(part, ast.FunctionDef)]
                 allowed.update(methods, (d for method in methods for d in method.decorator_list))
-    for node in ast.walk(tree):
-        if node in allowed:
-            continue
-        if isinstance(node, ast.Name) and (node.id == "__name__" or node.id in _ALONE):
-            what = f"the name {node.id}"
-        elif isinstance(node, ast.FunctionDef) and node.name in _METHODS:
-            what = f"the name {node.name}"
-        elif isinstance(node, ast.Yield | ast.YieldFrom):
-            what = "a yield that gives something back"
-        else:
-            continue
-        raise SyntaxError(f"has {what} in line {node.lineno}, which is not plain Python")
+    return allowed
+
+
+def _out_of_place(node: ast.AST) -> Iterator[str]:
+    if isinstance(node, ast.Name) and (node.id == "__name__" or node.id in _ALONE):
+        yield f"the name {node.id}"
+    elif isinstance(node, ast.FunctionDef) and node.name in _METHODS:
+        yield f"the name {node.name}"
+    elif isinstance(node, ast.Yield | ast.YieldFrom):
+        yield "a yield that gives something back"

@@ -348,3 +348,13 @@ def test_what_a_policy_reached_is_raised_though_it_caught_it_and_not_at_the_next
             decide(None, what="keeps")
     with pytest.raises(Reached, match="remembers: changes LIST"):  # compared with how it was before the first decision
         decide(None)
+
+
+def test_the_first_places_of_other_python_are_named_in_their_order() -> None:
+    source = b"x = 'a %s' % 1\nwith f(): pass\ny = z.__dict__\nw = '{}'.format(1)\nv = 1j\n"
+    with pytest.raises(SyntaxError) as caught:
+        compiled(source, "mine.py")
+    assert str(caught.value) == (
+        "has `%` on text (f-strings may be used) in line 1, a with statement in line 2, the name __dict__ in line 3 "
+        "and 2 more, which is not plain Python"
+    )
