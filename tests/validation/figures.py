@@ -737,7 +737,7 @@ FIGURES: dict[str, Figure] = {
     "disagreement": Figure(2, _disagreement),
     "learned_example": Figure(10, _learned_example, network=True),
     "compare": Figure(2, _compare, network=True),
-    "coverage": Figure(0.5, _coverage, network=True),
+    "coverage": Figure(0.5, _coverage),
     "price": Figure(0.2, _price, timed=True, network=True),
     "half_width": Figure(1, _half_width),
     "worked_over_silence": Figure(2, _worked_over_silence, network=True),
