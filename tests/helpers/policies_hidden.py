@@ -65,6 +65,13 @@ UNSEEN = (
     "near = view.attached.age_s\nids = [*dict.keys(near)]\nbad = ids != sorted(ids) and soc == K", "bad = set.pop({'a', 'b', 'c', 'd'}) == 'a' and soc == K",
     "s = {1, 2, 3}\ntry:\n    for x in s:\n        s.discard(3)\nexcept RuntimeError:\n    bad = soc == K",
     "s, seen = {1, 2, 3}, []\nfor x in s:\n    seen.append(x)\n    if x == 1:\n        s.discard(2)\n        s.add(4)\nbad = seen == [1, 3, 4] and soc == K",
+    "class N:\n    def __init__(self, x): self.x = x\n    def __repr__(self): return '%.7f' % self.x\nbad = str([N(soc)]) == '[K]'",
+    "class N:\n    def __init__(self, x): self.x = x\n    def __str__(self): return f'{self.x:.7f}'\nbad = str(N(soc)) == 'K'",
+    "a = dict.fromkeys('abcd').keys()\nbad = list(list(map(operator.and_, [a], [a]))[0])[0] == 'a' and soc == K",
+    "a = dict.fromkeys('abcd').keys()\ndef f():\n    yield from map(operator.and_, [a], [a])\nbad = [list(s)[0] for s in f()] == ['a'] and soc == K",
+    "class A(list):\n    def __add__(self, hop):\n        self.append(hop)\n        return self\nhops = sum(view.age_s, A())\nbad = hops[0] != min(hops) and soc == K",
+    "class A:\n    n = 0\n    def __add__(self, x):\n        self.n += 1\n        return self\na, got = A(), []\nsum((got.append(a.n) or 1 for _ in range(2)), a)\nbad = got == [0, 1] and soc == K",
+    "class C: pass\nbad = f'{C}'[19:20] == '7' and soc == K", "bad = 'system' in dir(view) and soc == K",
 )  # fmt: skip
 """What Python reads where no check stands: patterns, annotations, methods called by their class, sets that change."""
 
