@@ -16,7 +16,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Any
 
-from sortie.policies.contract import looks_from
+from sortie.policies.contract import FleetView, looks_from
 from sortie.policies.verification.outside import Outside, Unknown
 from sortie.policies.verification.pure import (
     IMPURE,
@@ -32,15 +32,15 @@ from sortie.policies.verification.pure import (
     reads_stored_text,
     takes_ranges,
 )
-from sortie.policies.verification.stand_ins import FOR_USER
+from sortie.policies.verification.stand_ins import SORTS, InAnyOrder
 from sortie.policies.verification.symbols import Ranged, Text
 from sortie.policies.verification.value_checks import (
     VALUE_CHECKS,
+    are_plain,
     cannot_ask,
     checked,
     is_stand_in,
-    may_hold_stand_in,
-    stands_for_text,
+    join,
     text_of,
 )
 from sortie.policies.verification.watch import WATCH, WATCHED, ordered_for, reach, stop, unordered
@@ -50,9 +50,18 @@ from sortie.scenarios.plugins.user_code import is_users
 def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
     """A call of the policy's code."""
     _refuse_others(function)
-    if type(function) is types.FunctionType and is_users(function.__module__):
+    if _is_own_code(function):
         return function(*args, **kwargs)
     return on_behalf_of_the_policy(function, args, kwargs)
+
+
+def _is_own_code(function: Any) -> bool:
+    """Whether a call runs the policy's own code, which has checks, or makes an object of its own class."""
+    while type(function) is types.MethodType:
+        function = function.__func__
+    if type(function) is types.FunctionType:
+        return is_users(function.__globals__.get("__name__"))
+    return is_users(home_of(function if isinstance(function, type) else type(function)))
 
 
 def _refuse_others(function: Any) -> None:
@@ -79,17 +88,20 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
             or (reads_stored_text(value) and not (value is int and function is map and len(args) == 2))
         ):
             stop(f"hands on {getattr(value, '__qualname__', value)}")
-    args, kwargs = ordered_for(function, args, kwargs)
-    if calls_others(function) or "key" in kwargs:
-        args = tuple([_str if value is str else value for value in args])
-        kwargs = {name: _str if value is str else value for name, value in kwargs.items()}
-    owner = getattr(function, "__self__", None)
-    has_text = any(map(may_hold_stand_in, (*args, *kwargs.values())))
-    reads = reads_stored_text(function) and function is not int and type(owner) is not str  # of which below
-    if has_text and (reads or not takes_ranges(function)):
-        stop(f"gives a range to {getattr(function, '__qualname__', function)}")
-    if has_text and function is int and len(args) + len(kwargs) > 1:
-        stop("reads a number in the text of a range")
+    args, kwargs = ordered_for(function, args, kwargs, _str)
+    owner, given = getattr(function, "__self__", None), (*args, *kwargs.values())
+    if type(owner) is str and function.__name__ == "join" and len(args) == 1 and not kwargs:
+        return join(function, list(args[0]))
+    if type(owner) is str or not takes_ranges(function):
+        args = tuple([list(value) if _is_lazy(value) else value for value in args])
+        if not are_plain((*args, *kwargs.values())):
+            stop(f"gives more than plain numbers and texts to {getattr(function, '__qualname__', function)}")
+    elif function in (ord, int) and not all(isinstance(value, Ranged) or are_plain([value]) for value in given):
+        stop(f"reads what {function.__name__} is given")
+    elif _is_sorties(function) and not all(map(_is_for_sortie, given)):
+        stop(f"gives an object of its own to {function.__qualname__}")
+    if function is int and any(type(value) is str and len(value) > _LONGEST_TEXT for value in given):
+        stop("reads a number in a long text")
     if function is isinstance and len(args) == 2 and (why := cannot_ask(args[1])):
         stop(why)
     if _decorates(function):
@@ -97,12 +109,32 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
     if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
         return found
-    if type(owner) is str and has_text:
-        return stands_for_text(function, args, kwargs)
     return checked(function(*args, **kwargs))
 
 
-assert on_behalf_of_the_policy.__name__ == FOR_USER  # noqa: S101
+_LONGEST_TEXT = 600
+"""Of a number; Python's settings decide from where on it is an error."""
+
+
+def _is_lazy(value: Any) -> bool:
+    """Whether what a value yields is worked out when somebody asks for it, or by whoever asks."""
+    return not isinstance(value, str | bytes) and hasattr(type(value), "__iter__") and type(value) not in (list, tuple)
+
+
+def _is_sorties(function: Any) -> bool:
+    """Whether this is a function or a method of Sortie's, whose code has no checks."""
+    while type(function) is types.MethodType:
+        function = function.__func__
+    return type(function) is types.FunctionType and is_trusted(str(function.__module__)) and not _decorates(function)
+
+
+def _is_for_sortie(value: Any) -> bool:
+    """Whether Sortie's functions may be given this: they go through it, and write it, as they like."""
+    if type(value) in (list, tuple):
+        return all(map(_is_for_sortie, value))
+    if type(value) is types.FunctionType:
+        return True  # a policy, to be wrapped
+    return are_plain([value]) or (home_of(type(value)).startswith("sortie.") and not isinstance(value, InAnyOrder))
 
 
 def _str(*args: Any) -> Any:
@@ -147,6 +179,8 @@ def attribute(owner: Any, name: str) -> Any:
     kind = type(owner)
     if isinstance(owner, Outside):
         return Outside(f"{owner._path}.{name}")
+    if kind is super:
+        return _of_base(owner, name)
     if kind is types.ModuleType:
         return getattr(owner, name) if is_users(owner.__name__) else _of_module(owner, name)
     real: type = owner.__class__  # of which a stand-in may have more
@@ -166,11 +200,21 @@ def _may_read(owner: Any, kind: type, name: str) -> bool:
         members = vars(owner).get("_member_map_", ())
         return own or name in members or (name in _OF_TUPLES and issubclass(owner, tuple))
     home = home_of(kind)
-    if is_users(home) or kind is super:
+    if is_users(home):
         return True
     if home.startswith("sortie."):
-        return name[0] != "_" or (name in _OF_TUPLES and isinstance(owner, tuple))
+        makes = name in _OF_TUPLES and isinstance(owner, tuple) and not isinstance(owner, FleetView)
+        return name[0] != "_" or makes
     return may_read(owner, name)
+
+
+def _of_base(owner: Any, name: str) -> Any:
+    """A method of a base class (`super().name`)."""
+    mro = owner.__self_class__.__mro__
+    bases = mro[mro.index(owner.__thisclass__) + 1 :]
+    if name not in ("__init__", "__post_init__") and not any(name in vars(b) for b in bases if is_users(home_of(b))):
+        stop(f"reads {name} of a base class that is not its own")
+    return getattr(owner, name)
 
 
 def _of_module(module: types.ModuleType, name: str) -> Any:
@@ -180,13 +224,18 @@ def _of_module(module: types.ModuleType, name: str) -> Any:
     if name in NAMED.get(home, ()):
         return found
     if isinstance(found, types.ModuleType):
+        known = found.__name__ == path and (path in NAMED or path in ONLY_TYPES or is_trusted(path))
+        return found if known else Outside(found.__name__)
+    if name[0] == "_":
+        return Unknown(f"reads {path}")
+    if home in ONLY_TYPES:
         return (
-            found
-            if found.__name__ in NAMED or is_trusted(found.__name__) or found.__name__ in ONLY_TYPES
-            else Outside(found.__name__)
+            guarded(found)
+            if isinstance(found, type | bool) or home_of(type(found)) == "typing"
+            else Unknown(f"reads {path}")
         )
-    if is_trusted(home) or home in ONLY_TYPES:
-        if not isinstance(found, _LASTS_UNCHANGED) and not callable(found) and home not in ONLY_TYPES:
+    if is_trusted(home):
+        if not isinstance(found, _LASTS_UNCHANGED) and not callable(found):
             WATCH.sees(path, found)
         return guarded(found)
     if home in NAMED and isinstance(found, _LASTS_UNCHANGED):
@@ -196,7 +245,8 @@ def _of_module(module: types.ModuleType, name: str) -> Any:
 
 def guarded(found: Any) -> Any:
     """A function that a policy may not call as one that says so, whoever calls it; anything else as it is."""
-    if isinstance(found, type) or not callable(found) or (why := cannot_call(found)) is None:
+    is_type = isinstance(found, type) or home_of(type(found)) == "typing"  # which may stand in annotations
+    if is_type or not callable(found) or (why := cannot_call(found)) is None:
         return found
     return Outside(why[1:]) if why[0] == "!" else Unknown(why)
 
@@ -268,6 +318,7 @@ def _finite(answer: bool) -> Callable[..., Any]:
     return lambda *args: answer if len(args) == 1 and isinstance(args[0], Ranged) else NotImplemented
 
 
+assert _sorted_ids.__name__ == SORTS  # noqa: S101
 _SPECIAL: dict[Any, Callable[..., Any]] = {
     type: _type_of, float: _float, int: _rounding("int"), round: _rounding("round"), math.floor: _rounding("floor"),
     math.ceil: _rounding("ceil"), math.trunc: _rounding("int"), math.sqrt: _rounding("sqrt"), sum: _sum,

@@ -21,7 +21,7 @@ from sortie.policies.verification.outside import Outside
 from sortie.policies.verification.pure import PURE_MODULES, is_trusted
 from sortie.policies.verification.source_checks import compiled
 from sortie.policies.verification.symbols import Refused
-from sortie.policies.verification.watch import WATCH
+from sortie.policies.verification.watch import WATCH, stop
 from sortie.scenarios.plugins.user_code import is_users, load
 
 
@@ -90,6 +90,8 @@ def _builtins(find: Callable[..., Any]) -> dict[str, Any]:
         wanted: Sequence[str] = (rest[2] or ()) if len(rest) > 2 else ()
         home = module.__name__
         if is_users(home):
+            if module.__file__ and not module.__file__.endswith(".py"):
+                stop(f"imports compiled code ({File(module.__file__).name})")
             return module
         if is_trusted(home) or home.partition(".")[0] in PURE_MODULES:
             return _Names(module, wanted) if wanted else module

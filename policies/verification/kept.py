@@ -26,7 +26,8 @@ class Kept:
         self._before = self._now()
 
     def _now(self) -> dict[str, Any]:
-        return {name: fingerprint(value) for name, value in self._roots().items()}
+        met: dict[int, tuple[int, Any]] = {}  # of all: two names may have the same object, or equal ones
+        return {name: _fingerprint(value, met) for name, value in self._roots().items()}
 
     def changed(self) -> str:
         """What has changed since, in words; empty if nothing has."""

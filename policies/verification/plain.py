@@ -35,7 +35,7 @@ _METHODS = frozenset({"__init__", "__post_init__", "__call__"})
 """Methods with special names that a class may have."""
 _ALONE = frozenset({"property", "staticmethod", "classmethod"})
 """What may only stand over a method, without another decorator."""
-_FIXED = _RAISED | _ALONE | {"super"}
+_FIXED = _RAISED | _ALONE | {"super", "statistics"}
 """Names to which nothing may give another meaning."""
 
 
@@ -69,7 +69,7 @@ def _others(node: ast.AST) -> Iterator[str]:
     if not isinstance(node, _PLAIN) or isinstance(node, ast.MatMult):
         yield _WORDS.get(type(node), type(node).__name__)
     for name in _names_of(node):
-        if name[:2] == "__":
+        if name[:2] == "__" and not (name == "__all__" and not _is_read(node)):
             yield f"the name {name}"
         if name in _FIXED and not _is_read(node):
             yield f"another meaning of {name}"
@@ -86,6 +86,8 @@ def _others(node: ast.AST) -> Iterator[str]:
             yield "`%` on text (f-strings may be used)"
         case ast.Attribute(value=ast.Constant(value=str()), attr="format"):
             yield "`format` on text (f-strings may be used)"
+        case ast.Assert(test=test) if any(isinstance(part, ast.NamedExpr) for part in ast.walk(test)):
+            yield "a name that an assert gives"
         case ast.Try(finalbody=[_, *_]):
             yield "finally"
         case ast.ExceptHandler(name=str()):
@@ -109,7 +111,7 @@ def _others(node: ast.AST) -> Iterator[str]:
 def _is_read(node: ast.AST) -> bool:
     """Whether a node with a name reads what it means, or imports it from where it has this meaning."""
     if isinstance(node, ast.alias):
-        return node.asname is None and node.name in ("StatisticsError", "statistics.StatisticsError")
+        return node.asname is None and node.name in ("StatisticsError", "statistics")
     return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
 
 
@@ -171,6 +173,8 @@ def _allowed_at_their_places(tree: ast.Module) -> set[ast.AST]:
                 allowed.add(left)
             case ast.Expr(value=made):
                 allowed.add(made)
+            case ast.Call(func=ast.Name(id="super") as called, args=[], keywords=[]):
+                allowed.add(called)
             case ast.ClassDef(body=body):
                 methods = [part for part in body if isinstance(part, ast.FunctionDef)]
                 allowed.update(methods, (d for method in methods for d in method.decorator_list))
@@ -178,7 +182,7 @@ def _allowed_at_their_places(tree: ast.Module) -> set[ast.AST]:
 
 
 def _out_of_place(node: ast.AST) -> Iterator[str]:
-    if isinstance(node, ast.Name) and (node.id == "__name__" or node.id in _ALONE):
+    if isinstance(node, ast.Name) and (node.id in ("__name__", "super") or node.id in _ALONE):
         yield f"the name {node.id}"
     elif isinstance(node, ast.FunctionDef) and node.name in _METHODS:
         yield f"the name {node.name}"

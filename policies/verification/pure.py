@@ -22,6 +22,7 @@ import zlib
 from enum import Enum
 from typing import Any
 
+from sortie.policies.contract import FleetView
 from sortie.scenarios.plugins.user_code import PREFIX, is_users
 
 _FUNCTIONS: dict[types.ModuleType, str] = {
@@ -30,8 +31,8 @@ _FUNCTIONS: dict[types.ModuleType, str] = {
     abc: "ABC abstractmethod",
     bisect: "bisect bisect_left bisect_right insort insort_left insort_right",
     collections: "Counter OrderedDict defaultdict deque namedtuple",
-    dataclasses: "dataclass field replace",
-    enum: "Enum IntEnum StrEnum auto",
+    dataclasses: "InitVar KW_ONLY dataclass field replace",
+    enum: "Enum IntEnum auto",
     functools: "partial reduce wraps",
     hashlib: "blake2b blake2s md5 sha1 sha224 sha256 sha384 sha512",
     heapq: "heapify heappop heappush heappushpop heapreplace nlargest nsmallest",
@@ -41,7 +42,7 @@ _FUNCTIONS: dict[types.ModuleType, str] = {
     operator: "add eq ge gt itemgetter le lt mul ne neg truediv",
     statistics: "StatisticsError fmean geometric_mean harmonic_mean mean median median_high median_low mode multimode pstdev "
     "pvariance stdev variance",
-    typing: "NamedTuple Protocol cast",
+    typing: "NamedTuple Protocol TypeVar cast",
     zlib: "adler32 crc32",
 }
 """The functions and classes that a policy may call, by the module in which it finds them."""
@@ -202,9 +203,12 @@ def cannot_call(function: Any) -> str | None:
     if kind is types.BuiltinFunctionType:
         return _compiled_function(function)
     if kind is types.MethodType:
-        return None if _is_tuple_method(function) else cannot_call(function.__func__)
+        may = _is_tuple_method(function) or may_read(function.__self__, function.__name__)
+        return None if may else cannot_call(function.__func__)
     if isinstance(function, type):
         home = home_of(function)
+        if function is FleetView:
+            return "makes a view of its own"
         return None if is_users(home) or is_trusted(home) else _unknown(home, function.__name__)
     if kind is functools.partial:
         return cannot_call(function.func)

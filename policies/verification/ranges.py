@@ -26,6 +26,7 @@ from sortie.policies.verification.stand_ins import (
 )
 from sortie.policies.verification.symbols import Path, Ranged
 from sortie.policies.verification.views import LONGEST_S, OTHER_CODEBOOK
+from sortie.policies.verification.watch import WATCH
 from sortie.scenarios.disc import disc_overlap
 from sortie.scenarios.link_state import state_of
 
@@ -59,6 +60,7 @@ class FleetOfRanges:
     def _view(self, age_s: dict[int, Any]) -> FleetView:
         if self._descriptors is None:
             self._descriptors = _in_any_order(self, {i: DescriptorOfRanges(self, i) for i in self.heard})
+        WATCH.path = self.path
         return ViewOfRanges(self.ego, self.period_s, self._descriptors, _in_any_order(self, age_s))
 
     def _age(self, i: int) -> Ranged:

@@ -115,7 +115,9 @@ class Checks(ast.NodeTransformer):
 
     def visit_Assign(self, node: ast.Assign) -> Any:
         self.generic_visit(node)
-        if any(isinstance(target, ast.Tuple | ast.List | ast.Subscript) for target in node.targets):
+        if any(map(_unpacks, node.targets)):
+            if len(node.targets) > 1:
+                raise SyntaxError("unpacks a value that it also keeps")
             node.value = _call("__each__", node.value)
         return node
 
@@ -165,6 +167,11 @@ class Checks(ast.NodeTransformer):
     def visit_arg(self, node: ast.arg) -> ast.AST:
         node.annotation = None  # nothing reads it
         return node
+
+
+def _unpacks(target: ast.expr) -> bool:
+    of_slice = isinstance(target, ast.Subscript) and isinstance(target.slice, ast.Slice)
+    return of_slice or isinstance(target, ast.Tuple | ast.List)
 
 
 def _matches(pattern: ast.pattern, subject: str) -> ast.expr:

@@ -81,12 +81,16 @@ class InAnyOrder(dict[int, Any]):
 def is_blind(frame: Any) -> bool:
     """Whether the code that iterates is Sortie's own, and does not do so on behalf of a user's."""
     home = str(frame.f_globals.get("__name__", ""))
+    if home in _CHECKS:
+        return bool(frame.f_code.co_name == SORTS)
     # a copy has the order of its original, which whoever gets the copy can see
-    return home.startswith("sortie.") and frame.f_code.co_name != FOR_USER and frame.f_code is not plain_copy.__code__
+    return home.startswith("sortie.") and frame.f_code is not plain_copy.__code__
 
 
-FOR_USER = "on_behalf_of_the_policy"
-"""The name of the function that calls builtins for a policy's code (`instrument`)."""
+_CHECKS = {f"sortie.policies.verification.{m}" for m in ("call_checks", "value_checks", "watch")}
+"""What acts on behalf of a policy's code."""
+SORTS = "_sorted_ids"
+"""The function there that sees ids in no order."""
 
 
 class Flags:

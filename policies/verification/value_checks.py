@@ -7,16 +7,18 @@ raise `Reached`. `call_checks` has the checks on calls and attributes.
 from __future__ import annotations
 
 import types
+from abc import ABC
 from collections import Counter, OrderedDict, defaultdict, deque
-from collections.abc import Callable
-from enum import Enum
-from typing import Any
+from collections.abc import Callable, Iterable
+from enum import Enum, IntEnum, ReprEnum
+from typing import Any, Generic, NamedTuple, Protocol
 
+from sortie.policies.contract import Directive
 from sortie.policies.verification.outside import Outside
 from sortie.policies.verification.pure import home_of
 from sortie.policies.verification.symbols import MARK, Ranged, Text
-from sortie.policies.verification.watch import Unordered, UnorderedFrozen, reach, stop, unordered
-from sortie.scenarios.plugins.user_code import PREFIX, is_users
+from sortie.policies.verification.watch import WATCH, WATCHED, reach, stop, unordered
+from sortie.scenarios.plugins.user_code import is_users
 
 STAND_INS = (
     "sortie.policies.verification.symbols",
@@ -33,37 +35,50 @@ def is_stand_in(value: object) -> bool:
 def checked(found: Any) -> Any:
     """What a call returned, each set as one that watches its order.
 
-    Plain text into which a number was written is refused, because its use is not noticed. So is text with an address, or with
-    the name of the policy's module, which depends on where its file lies.
+    Plain text into which a number was written is refused, because its use is not noticed.
     """
-    found = unordered(found)
+    found = unordered(_told(found))
     parts, met = [found], set[int]()
     while parts:
         part = parts.pop()
         kind = type(part)
         if kind is str and MARK in part:
             stop("uses the text of a number inside other text for more than a reason")
-        if kind is str and (" at 0x" in part or PREFIX in part):
-            reach(f"the address in {part!r}" if PREFIX not in part else "the place of its file")
         if kind is set or kind is frozenset:
             stop("makes sets within another object")
-        if kind in _CONTAINERS and id(part) not in met:
+        if (kind in _CONTAINERS or isinstance(part, tuple)) and not is_stand_in(part) and id(part) not in met:
             met.add(id(part))
             parts += [x for item in part.items() for x in item] if isinstance(part, dict) else part
     return found
 
 
-_CONTAINERS = (list, tuple, dict, deque, defaultdict, OrderedDict, Counter)
-_BASES = ("builtins.object", "builtins.tuple", "builtins.int", "builtins.str", "typing.Protocol", "typing.Generic", "abc.ABC",
-    "enum.Enum", "enum.IntEnum", "enum.StrEnum", "enum.ReprEnum")  # fmt: skip
+_CONTAINERS = (list, dict, deque, defaultdict, OrderedDict, Counter)
+
+
+def _told(found: Any) -> Any:
+    """Directives of Sortie's own policies, with their reasons as texts that can only be reasons."""
+    if type(found) is Directive and type(found.reason) is str and MARK in found.reason and WATCH.path is not None:
+        return found._replace(reason=Text(WATCH.path, "a number of the view", found.reason))
+    if type(found) in (list, tuple) and any(type(part) is Directive for part in found):
+        return type(found)(map(_told, found))
+    return found
 
 
 def _made(kind: type) -> type:
     """A class of the policy's, if what it is derived from is plain: nothing, a named tuple, an enum, a class like it."""
     for base in kind.__mro__:
-        if not is_users(home_of(base)) and f"{base.__module__}.{base.__qualname__}" not in _BASES:
+        named = NamedTuple in vars(base).get("__orig_bases__", ())
+        allowed = base in _BASES or (base is int and Enum in kind.__mro__) or (base is tuple and _is_named(kind))
+        if not (named or allowed or is_users(home_of(base))):
             stop(f"derives {kind.__name__} from {base.__name__}")
     return kind
+
+
+def _is_named(kind: type) -> bool:
+    return any(NamedTuple in vars(base).get("__orig_bases__", ()) for base in kind.__mro__)
+
+
+_BASES = (object, Protocol, Generic, ABC, Enum, IntEnum, ReprEnum)
 
 
 def cannot_ask(kinds: Any) -> str | None:
@@ -72,7 +87,7 @@ def cannot_ask(kinds: Any) -> str | None:
         return next((why for one in kinds if (why := cannot_ask(one))), None)
     if isinstance(kinds, types.UnionType):
         return cannot_ask(kinds.__args__)
-    if kinds in (Unordered, UnorderedFrozen) or kinds in _ASKED or (isinstance(kinds, type) and _is_own(kinds)):
+    if kinds in WATCHED or kinds in _ASKED or (isinstance(kinds, type) and _is_own(kinds)):
         return None
     return f"asks whether something is a {getattr(kinds, '__name__', kinds)}"
 
@@ -86,23 +101,22 @@ def _is_own(kind: type) -> bool:
     return (is_users(home) or home.startswith("sortie.")) and not getattr(kind, "_is_protocol", False)
 
 
-def may_hold_stand_in(value: Any) -> bool:
-    if type(value) in (list, tuple):
-        return any(map(may_hold_stand_in, value))
-    return is_stand_in(value) or isinstance(value, types.GeneratorType | map | filter)
+_NUMBERS = (int, float, bool, str, bytes, type(None))
 
 
-def stands_for_text(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """A method of a plain text that is given the text of a range, or something that may yield one."""
-    if function.__name__ != "join" or len(args) != 1 or kwargs:
-        stop(f"gives the text of a number to str.{function.__name__}")
-    parts = args[0] if isinstance(args[0], Text) else list(args[0])
-    found = next((part for part in parts if is_stand_in(part)), None)
-    if found is None:
-        return checked(function(parts))
-    if isinstance(found, Text):
+def join(function: Any, parts: list[Any]) -> Any:
+    """A text's `join` of these parts."""
+    found = next((part for part in parts if type(part) is Text), None)
+    if found is not None:
         return Text(found._path, found._axis, "text with a number")
-    return stop("makes text of what is known as a range alone")
+    if any(map(is_stand_in, parts)):
+        stop("makes text of what is known as a range alone")
+    return checked(function(parts))
+
+
+def are_plain(values: Iterable[Any]) -> bool:
+    """Whether these are numbers and texts of Python's own, which compiled code may read as it likes."""
+    return all(type(value) in _NUMBERS or (type(value) in (list, tuple) and are_plain(value)) for value in values)
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -114,17 +128,36 @@ def _same(a: Any, b: Any) -> bool:
             return a is b
     if is_stand_in(a) or is_stand_in(b) or isinstance(a, _VALUES) or isinstance(b, _VALUES):
         reach("the identity of a value (`is`)")
-    return a is b
+    stop("asks whether two objects are the same (`is`)")
 
 
 _VALUES = (int, float, str, bytes, tuple, frozenset)
+
+
+_LONGEST = 10**600
+"""Python's settings decide from where on the text of a number is an error."""
+
+
+def _is_writable(value: Any) -> bool:
+    """Whether the text of an object is the same in every process, in every folder, and in a search."""
+    kind = type(value)
+    if kind is int:
+        return bool(-_LONGEST < value < _LONGEST)
+    if kind is dict:
+        return all(map(_is_writable, value)) and all(map(_is_writable, value.values()))
+    if kind in (list, tuple):
+        return all(map(_is_writable, value))
+    return kind in _NUMBERS or kind in WATCHED or isinstance(value, Enum | Text | Ranged)
 
 
 def _text_of(write: Callable[[Any], str]) -> Callable[..., Any]:
     def act(*args: Any, **kwargs: Any) -> Any:
         if len(args) != 1 or kwargs:
             return NotImplemented
-        return args[0]._text() if isinstance(args[0], Text | Ranged) else checked(write(args[0]))
+        (value,) = args
+        if not _is_writable(value):
+            stop(f"makes text of a {type(value).__name__}")
+        return value._text() if isinstance(value, Text | Ranged) else checked(write(value))
 
     return act
 
@@ -141,6 +174,8 @@ def _written(value: Any, conversion: int, spec: str) -> Any:
     value = _WRITES[conversion](value)
     if is_stand_in(spec) or (is_stand_in(value) and spec[-1:] == "c"):
         stop("lets a number of the view decide the form of a text")
+    if not _is_writable(value):
+        stop(f"makes text of a {type(value).__name__}")
     return value._text(spec) if isinstance(value, Text | Ranged) else checked(format(value, spec))
 
 

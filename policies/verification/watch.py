@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import collections
+import functools
+import itertools
+import types
 from collections.abc import Callable
-from enum import IntEnum
 from typing import Any, NoReturn
 
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import fingerprint
 from sortie.policies.verification.pure import is_cache_key, is_own_cache
-from sortie.policies.verification.symbols import Refused
+from sortie.policies.verification.symbols import Path, Refused
 
 
 class Watch:
@@ -21,6 +24,8 @@ class Watch:
     def begin(self) -> None:
         """Forget the policy before."""
         self.stopped: Reached | Refused | None = None
+        self.path: Path | None = None
+        """The run that the decision belongs to."""
         self._others: dict[str, tuple[Any, Any]] = {}
 
     def stop(self, why: Reached | Refused) -> NoReturn:
@@ -58,15 +63,9 @@ def reach(what: str) -> NoReturn:
 
 
 def _see_order(members: list[Any]) -> list[Any]:
-    # A copy of a set of small whole numbers has their order too; that of other numbers may depend on its history.
-    if len(members) > 1 and not all(_is_small(x) for x in members):
+    if len(members) > 1:
         reach("the order of a set, which hashes decide")
     return members
-
-
-def _is_small(member: Any) -> bool:
-    kind: Any = type(member)
-    return (kind is int or (isinstance(member, IntEnum) and kind.__hash__ is int.__hash__)) and 0 <= member < 8
 
 
 def _through(watched: set[Any], members: list[Any]) -> Any:
@@ -90,6 +89,9 @@ class Unordered(set[Any]):
         _see_order(list(set.__iter__(self)))
         return set.pop(self)
 
+    def __repr__(self) -> str:
+        return repr(set(_see_order(list(set.__iter__(self)))))
+
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
         return set
@@ -100,6 +102,9 @@ class UnorderedFrozen(frozenset[Any]):
 
     def __iter__(self) -> Any:
         return iter(_see_order(list(frozenset.__iter__(self))))
+
+    def __repr__(self) -> str:
+        return repr(frozenset(_see_order(list(frozenset.__iter__(self)))))
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
@@ -128,23 +133,40 @@ _MAKE_SETS = (
 for _name in _MAKE_SETS.split():
     setattr(Unordered, _name, _watched(getattr(set, _name)))
     setattr(UnorderedFrozen, _name, _watched(getattr(frozenset, _name)))
-_BLIND = (sorted, min, max, any, all)
+_BLIND = (sorted, min, max, any, all, sum)
 _COMPARABLE = ({str}, {bytes}, {int, float, bool})
 
 
-def ordered_for(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Arguments of a call, with plain sets for functions that sort them, and watched ones to be made by others."""
+_CALLS_AT: dict[Any, int] = {
+    map: 0, filter: 0, functools.reduce: 0, functools.partial: 0, collections.defaultdict: 0, itertools.starmap: 0,
+    itertools.takewhile: 0, itertools.dropwhile: 0, itertools.filterfalse: 0, itertools.accumulate: 1, itertools.groupby: 1,
+}  # fmt: skip
+"""Which argument compiled code calls."""
+_CALLED = {"key", "func", "default_factory"}
+
+
+def ordered_for(
+    function: Any, args: tuple[Any, ...], kwargs: dict[str, Any], text: Any = str
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Arguments of a call, with plain sets for functions that sort them, and watched ones to be made by others.
+
+    `text` is what others call in place of `str`.
+    """
     if is_own_cache(function) and not all(map(is_cache_key, (*args, *kwargs.values()))):
         stop(f"gives {function.__name__} something that it keeps from one decision to the next")
     is_blind = any(function is f for f in _BLIND) and "key" not in kwargs  # equal keys would show the order
+    called_at = _CALLS_AT.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
 
-    def one(value: Any) -> Any:
-        if value is set or value is frozenset:
-            return value if function is isinstance else Unordered if value is set else UnorderedFrozen
-        if is_blind and type(value) in (Unordered, UnorderedFrozen):
+    def one(value: Any, is_called: bool) -> Any:
+        if (value is set or value is frozenset or value is str) and function is not isinstance:
+            if not is_called:
+                stop(f"hands on {value.__name__}")
+            return Unordered if value is set else UnorderedFrozen if value is frozenset else text
+        if is_blind and type(value) in WATCHED:
             members = list((set if type(value) is Unordered else frozenset).__iter__(value))
             alike = any({type(x) for x in members} <= kinds for kinds in _COMPARABLE)
             return members if alike and all(x == x for x in members) else value  # NaN leaves the order as it was
         return value
 
-    return tuple(map(one, args)), {name: one(value) for name, value in kwargs.items()}
+    listed = tuple([one(value, k == called_at) for k, value in enumerate(args)])
+    return listed, {name: one(value, name in _CALLED) for name, value in kwargs.items()}

@@ -72,6 +72,25 @@ UNSEEN = (
     "class A(list):\n    def __add__(self, hop):\n        self.append(hop)\n        return self\nhops = sum(view.age_s, A())\nbad = hops[0] != min(hops) and soc == K",
     "class A:\n    n = 0\n    def __add__(self, x):\n        self.n += 1\n        return self\na, got = A(), []\nsum((got.append(a.n) or 1 for _ in range(2)), a)\nbad = got == [0, 1] and soc == K",
     "class C: pass\nbad = f'{C}'[19:20] == '7' and soc == K", "bad = 'system' in dir(view) and soc == K",
+    # what a search of all 22 causes found in the first version of plain Python
+    "bad = not f\"{f'{soc}':.0}\" and soc == K", "class T(str):\n    pass\nbad = T('K') == f'{soc:.7f}'",
+    "class E(enum.StrEnum):\n    A = 'K'\nbad = E.A == f'{soc:.7f}'", "N = namedtuple('N', 'x')\nbad = 'K'.startswith(N(f'{soc:.7f}'))",
+    "t = ''.join([f'{soc:.7f}'])\nbad = ''.join({0: t}.values()) == 'K'", "t = collections.deque([f'{soc:.7f}'])\nbad = zlib.crc32(''.join(t).encode()) == 7",
+    "from sortie.policies.catalogue.worked import worked\nbad = any('goodput 3.1 ' in d.reason for d in worked(view))",
+    "bad = str({5}) == '{5}' and soc == K", "bad = f'{frozenset([1])}' == 'frozenset({1})' and soc == K", "l = []\nl.append(set)\nbad = l[0] is set and soc == K",
+    "bad = {set: True}.get(set, False) and soc == K", "bad = next(itertools.repeat(str)) is str and soc == K", "bad = functools.partial(lambda k: k is str, str)() and soc == K",
+    "d = {}\nit = zip([1], [2])\nd[0] = it\nbad = d[0] is it and soc == K", "d = {}\nd[0] = zip([1], [2])\nbad = type(d[0]) is zip and soc == K",
+    "s = {8, 9, 10, 11, 12}\nfor x in (1, 16, 0):\n    s.add(x)\nfor x in (16, 8, 9, 10, 11, 12):\n    s.discard(x)\nbad = list(s) == [0, 1] and soc == K",
+    "bad = ''.join(map(str, itertools.chain(view.descriptors))) == '10'", "it = itertools.chain(view.descriptors)\nbad = 1 in it and list(it) == [0]",
+    "seen = []\nsum(map(lambda p: seen.append(p) or 0, itertools.chain(view.descriptors)))\nbad = seen == [1, 0]",
+    "from sortie.scenarios.plain_sum import plain_sum\nbad = plain_sum(itertools.chain([1e16], view.descriptors)) != 1e16 and soc == K",
+    "v = view._replace(age_s={7: 0.0})\nbad = 7 in v.age_s and soc == K", "v = FleetView(view.ego, view.period_s, {}, {})\nbad = v.me is None and soc == K",
+    "class D(tuple):\n    def values(self): return [self[1]]\nbad = D((1, 2)).values() == [2] and soc == K", "bad = '0x' in str(hashlib.md5()) and soc == K",
+    "class C:\n    x = dataclasses.builtins.property(str)\nbad = C().x[-4] == '7' and soc == K", "C = namedtuple('C', 'x')\nbad = 'call_checks' not in str(C) and soc == K",
+    "from sortie.policies.catalogue.baselines import _send_to\nbad = 'f7' in _send_to(view, [], 0.5, decide)[0].reason",
+    "class I(int): pass\nclass J(int): pass\nbad = type(statistics.mean([I(1), J(3)])) is I and soc == K",
+    "try:\n    bad = not str(10**5000)\nexcept ValueError:\n    bad = soc == K", "safe = False\nassert (safe := True)\nbad = not safe and soc == K",
+    "class statistics:\n    StatisticsError = RecursionError\ndef f(n):\n    try:\n        return f(n + 1)\n    except statistics.StatisticsError:\n        return n\nbad = f(0) > 600 and soc == K",
 )  # fmt: skip
 """What Python reads where no check stands: patterns, annotations, methods called by their class, sets that change."""
 
@@ -115,6 +134,9 @@ KEPT = (
     ("class E(list, enum.Enum):\n    A = ()", "E.A.append(1)\nn = len(E.A)"),
     ("class E(dict, enum.Enum):\n    A = ()", "E.A[0] = n = E.A.get(0, 0) + 1"),
     ("class B:\n    __slots__ = ('n',)\nclass E(B, enum.Enum):\n    A = 1\nE.A.n = 0", "E.A.n += 1\nn = E.A.n"),
+    ("A = [0]\nB = [A]", "n = 1 if B[0] is A else 0\nB[0] = [0]"),
+    ("class E(enum.Enum):\n    A = 1", "d = super(E, E)._member_map_\nd['n'] = n = d.get('n', 0) + 1"),
+    ("import typing", "typing._cleanups.append(1)\nn = len(typing._cleanups)"),
     ("import types\nclass D(dict):\n    def items(self):\n        return []\nM = types.MappingProxyType(D(k=[0]))", "M['k'][0] += 1\nn = M['k'][0]"),
 )  # fmt: skip
 """What is set up when the file is loaded, and how each decision counts."""
@@ -129,7 +151,7 @@ HARMLESS = (
     "kinds = {'a', 'b'}\nbad = 'c' in kinds or soc > 1", "names = {TaskPhase.TRACK, TaskPhase.SEARCH}\nbad = me.task_phase in names and me.task_phase == 4",
     "bad = sorted({'b', 'a'} | {'c'}) != ['a', 'b', 'c'] or soc > 1", "strong = {p for p in view.peers if me.goodput_to(p) > 5}\nfor p in strong:\n    bad = bad or me.goodput_to(p) < 5",
     "d = collections.defaultdict(set)\nfor p in view.peers:\n    d[0].add(p)\nbad = d[0] != set(view.peers) or type(d[0]) is not set", "why = f'{soc:.1%} of {first:.0f}'\nbad = soc > 1",
-    "names = ', '.join(str(p) for p in view.peers)\nbad = not names", "def f(x: float) -> list[float] | None:\n    return None\nbad = f(soc) is not None",
+    "from sortie.policies.catalogue.worked import worked\nbad = any(d.rate_hz > 10 for d in worked(view))", "names = ', '.join(str(p) for p in view.peers)\nbad = not names", "def f(x: float) -> list[float] | None:\n    return None\nbad = f(soc) is not None",
     "import sortie.policies.contract as contract\nbad = contract.PHASE_NAMES[me.task_phase] == 'x'", "bad = me.novelty_flags + 0.5 < 0 or me.novelty_flags == 0.5", "bad = soc not in (soc,)",
 )  # fmt: skip
 """The same words in correct policies, which stay proved."""

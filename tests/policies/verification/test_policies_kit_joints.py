@@ -199,7 +199,7 @@ BODIES = (
     "return [x for x in range(9) if x % 2], {k: v for k, v in zip('ab', (1, 2))}, sum([1, 2, 3]), sum([0.5, 0.25], 1.0)",
     "return math.floor(-1.5), math.ceil(-1.5), math.trunc(-1.5), int(-1.5), round(2.5), math.isnan(1.0), math.isinf(1.0), math.isfinite(1.0)",
     "return isinstance(True, int), isinstance(1.0, (int, str)), type(1) is int, type('a') is int, max((3, 1), key=lambda x: -x)",
-    "p = C(2)\n    p.n += 3\n    p.n -= 1\n    return p.n, p.twice, C.of(4).n, p == C(4), str(p), f'{p!r}'",
+    "p = C(2)\n    p.n += 3\n    p.n -= 1\n    return p.n, p.twice, C.of(4).n, p == C(4), f'{[1, 2]!r}'",
     "match 3:\n        case 1 | 2:\n            return 'low'\n        case math.pi:\n            return 'pi'\n        case (3 | 4) as x if x > 2:\n            return x\n        case _:\n            return None",
     "out = []\n    for x in (None, True, 1, -2, 'a', 2.5):\n        match x:\n            case None | True:\n                out.append(0)\n            case 1 | -2:\n                out.append(1)\n            case y if y == 'a':\n                out.append(y)\n            case z:\n                out.append((z, 'rest'))\n    return out",
     "def low():\n        yield 1\n        yield from [2, 3]\n    return list(low()), [y := 5, y + 1], (lambda a, b=2: a + b)(1)",

@@ -369,11 +369,15 @@ def test_a_watch_keeps_what_stopped_it_first_and_forgets_the_policy_before() -> 
     assert watch.stopped is not None
 
 
-def test_functions_that_make_sets_make_watched_ones_by_name_too() -> None:
-    args, kwargs = ordered_for(map, (set, [1]), {"default": frozenset})
+def test_what_makes_sets_and_texts_is_replaced_where_it_is_called_and_refused_elsewhere() -> None:
+    args, _ = ordered_for(map, (set, [1]), {})
     assert args[0] is not set
-    assert kwargs["default"] is not frozenset
+    _, kwargs = ordered_for(sorted, ([],), {"key": str}, float)
+    assert kwargs["key"] is float
     assert ordered_for(isinstance, (1, set), {})[0] == (1, set)
+    for function, args in ((map, (abs, set)), (print, (frozenset,)), (itertools.repeat, (str,))):
+        with pytest.raises(Refused, match="hands on"):
+            ordered_for(function, args, {})
 
 
 def test_the_whole_name_of_what_is_outside_is_said() -> None:
