@@ -767,6 +767,10 @@ CORRECT_FILES = {
     "partial": "import functools\ndef at(view, limit):\n    return usual(view, 10.0 if view.me and view.me.battery_soc == limit else 2.0)\ndecide = functools.partial(at, limit=0.4)",
     "rate of the charge": "def decide(view):\n    return usual(view, 0.0 if view.me is None else view.me.battery_soc * 10)",
     "dataclass": "import dataclasses\n@dataclasses.dataclass(frozen=True)\nclass Rates:\n    low: float = 2.0\n    high: float = 8.0\nRATES = Rates()\ndef decide(view):\n    return usual(view, RATES.low if view.me and view.me.battery_soc < 0.5 else RATES.high)",
+    "class variable": "import dataclasses\nfrom typing import TYPE_CHECKING, ClassVar, Optional\nif TYPE_CHECKING:\n    from sortie import FleetView\n__all__ = ['decide']\n@dataclasses.dataclass(slots=True)\nclass Rates:\n    kind: ClassVar[str] = 'x'\n    low: Optional[float] = 2.0\ndef decide(view):\n    return usual(view, Rates().low)\nif __name__ == '__main__':\n    decide(None)",
+    "most common": "from collections import Counter\ndef decide(view):\n    best = Counter(1 if view.me and view.me.goodput_to(p) > 5 else 2 for p in view.peers).most_common(1)\n    return usual(view, float(best[0][0]) if best else 1.0)",
+    "numbers of its own": "import statistics\nRATES = (2.0, 4.0)\nMEAN = statistics.mean(RATES)\ndef decide(view):\n    return usual(view, MEAN)",
+    "wrapped catalogue": "from sortie.policies.catalogue.worked import worked\ndef decide(view):\n    return [d._replace(rate_hz=min(d.rate_hz, 9.0), reason=f'capped: {d.reason}') for d in worked(view)]",
     "table": "TABLE = [(0.6, 10.0), (0.3, 5.0), (0.0, 2.0)]\ndef decide(view):\n    if view.me is None: return []\n    return usual(view, next(rate for limit, rate in TABLE if view.me.battery_soc >= limit))",
 }  # fmt: skip
 
