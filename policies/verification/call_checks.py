@@ -73,43 +73,52 @@ def _refuse_others(function: Any) -> None:
 
 def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Call something that is not the policy's own code, with arguments that it treats as it would treat real ones."""
+    _refuse_to_hand_on(function, args, kwargs)
+    args, kwargs = ordered_for(function, args, kwargs, _str)
+    if _is_of_text(function) and function.__name__ == "join" and len(args) == 1 and not kwargs:
+        return join(function, list(args[0]))
+    if _is_of_text(function) or not takes_ranges(function):  # what is lazy is asked here, not there
+        args = tuple([list(value) if _is_lazy(value) else value for value in args])
+    _refuse_arguments(function, args, kwargs)
+    special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
+    if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
+        return found
+    return checked(function(*args, **kwargs))
+
+
+def _refuse_to_hand_on(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    """Functions that compiled code would call without a check."""
     for value in (*args, *kwargs.values()):
         if isinstance(value, Outside):
             value._used()
         if not callable(value) or function is isinstance:
             continue
         _refuse_others(value)
-        if (
-            value is isinstance
-            or value is type
-            or calls_others(value)
-            or is_own_cache(value)
-            or _decorates(value)
-            or (reads_stored_text(value) and not (value is int and function is map and len(args) == 2))
-        ):
+        is_known = value is isinstance or value is type or calls_others(value) or is_own_cache(value)
+        reads = reads_stored_text(value) and not (value is int and function is map and len(args) == 2)
+        if is_known or reads or _decorates(value):
             stop(f"hands on {getattr(value, '__qualname__', value)}")
-    args, kwargs = ordered_for(function, args, kwargs, _str)
-    owner, given = getattr(function, "__self__", None), (*args, *kwargs.values())
-    if type(owner) is str and function.__name__ == "join" and len(args) == 1 and not kwargs:
-        return join(function, list(args[0]))
-    if type(owner) is str or not takes_ranges(function):
-        args = tuple([list(value) if _is_lazy(value) else value for value in args])
-        if not are_plain((*args, *kwargs.values())):
-            stop(f"gives more than plain numbers and texts to {getattr(function, '__qualname__', function)}")
-    elif function in (ord, int) and not all(isinstance(value, Ranged) or are_plain([value]) for value in given):
-        stop(f"reads what {function.__name__} is given")
-    elif _is_sorties(function) and not all(map(_is_for_sortie, given)):
-        stop(f"gives an object of its own to {function.__qualname__}")
+
+
+def _refuse_arguments(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    """Arguments whose stand-ins would be treated otherwise than the real objects."""
+    given, name = (*args, *kwargs.values()), getattr(function, "__qualname__", function)
+    if (_is_of_text(function) or not takes_ranges(function)) and not are_plain(given):
+        stop(f"gives more than plain numbers and texts to {name}")
+    if function in (ord, int) and not all(isinstance(value, Ranged) or are_plain([value]) for value in given):
+        stop(f"reads what {name} is given")
     if function is int and any(type(value) is str and len(value) > _LONGEST_TEXT for value in given):
         stop("reads a number in a long text")
+    if _is_sorties(function) and not all(map(_is_for_sortie, given)):
+        stop(f"gives an object of its own to {name}")
     if function is isinstance and len(args) == 2 and (why := cannot_ask(args[1])):
         stop(why)
     if _decorates(function):
         _refuse_foreign(function, (*args, *(kwargs[n] for n in ("cls", "wrapped") if n in kwargs)))
-    special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
-    if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
-        return found
-    return checked(function(*args, **kwargs))
+
+
+def _is_of_text(function: Any) -> bool:
+    return type(getattr(function, "__self__", None)) is str
 
 
 _LONGEST_TEXT = 600
@@ -229,11 +238,8 @@ def _of_module(module: types.ModuleType, name: str) -> Any:
     if name[0] == "_":
         return Unknown(f"reads {path}")
     if home in ONLY_TYPES:
-        return (
-            guarded(found)
-            if isinstance(found, type | bool) or home_of(type(found)) == "typing"
-            else Unknown(f"reads {path}")
-        )
+        is_type = isinstance(found, type | bool) or home_of(type(found)) == "typing"
+        return guarded(found) if is_type else Unknown(f"reads {path}")
     if is_trusted(home):
         if not isinstance(found, _LASTS_UNCHANGED) and not callable(found):
             WATCH.sees(path, found)
@@ -277,14 +283,10 @@ def _type_of(*args: Any, **kwargs: Any) -> Any:
         stop("makes a class by type(…)")
     if callable(args[0]) and not isinstance(args[0], type):
         stop("asks what kind of function something is")  # Python functions stand for compiled ones
-    # `type` shows a stand-in, `__class__` does not
-    return (
-        str
-        if isinstance(args[0], Text)
-        else args[0].__class__
-        if is_stand_in(args[0]) or type(args[0]) in WATCHED
-        else type(args[0])
-    )
+    if isinstance(args[0], Text):
+        return str
+    shows = is_stand_in(args[0]) or type(args[0]) in WATCHED  # `type` does, `__class__` does not
+    return args[0].__class__ if shows else type(args[0])
 
 
 def _float(*args: Any) -> Any:
