@@ -198,7 +198,7 @@ def tables(seeds: Sequence[int] = SEEDS) -> dict[str, Table]:
     """What `docs/results/tables/ns3.json` stores."""
     about = (
         f"Seeds: {len(seeds)}. Every drone sends a descriptor of 208 B and its payloads ten times a second, at MCS 9 in the "
-        "cross and MCS 7 elsewhere. Delays are of delivered payloads; speed compares processor time."
+        "cross and MCS 7 elsewhere, unless the row names another. Delays are of delivered payloads; speed compares processor time."
     )
     flows = [
         [case.name, ns3["saturated_mbps"], ours["saturated_mbps"], ours["saturated_mbps"] / ns3["saturated_mbps"] - 1,
