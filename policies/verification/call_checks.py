@@ -6,6 +6,7 @@ They let pure code through (`pure`). Clocks, dice, files and hashes raise `Reach
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import functools
 import math
@@ -43,13 +44,15 @@ from sortie.policies.verification.value_checks import (
     join,
     text_of,
 )
-from sortie.policies.verification.watch import WATCH, WATCHED, ordered_for, reach, stop, unordered
+from sortie.policies.verification.watch import WATCH, WATCHED, ordered_for, plain_set, reach, stop, unordered
 from sortie.scenarios.plugins.user_code import is_users
 
 
 def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
     """A call of the policy's code."""
     _refuse_others(function)
+    if _decorates(function) and not _makes_decorator(function, args):
+        stop("decorates by a call")  # something that may be older than this decision
     if _is_own_code(function):
         return function(*args, **kwargs)
     return on_behalf_of_the_policy(function, args, kwargs)
@@ -95,8 +98,10 @@ def _refuse_to_hand_on(function: Any, args: tuple[Any, ...], kwargs: dict[str, A
             continue
         _refuse_others(value)
         is_known = value is isinstance or value is type or calls_others(value) or is_own_cache(value)
-        reads = reads_stored_text(value) and not (value is int and function is map and len(args) == 2)
-        if is_known or reads or _decorates(value):
+        makes = function in (collections.defaultdict, dataclasses.field) or (function is map and len(args) == 2)
+        reads = reads_stored_text(value) and not (value is int and makes)
+        others = _is_sorties(value) and not isinstance(value, types.MethodType) and function is not functools.partial
+        if is_known or reads or others or _decorates(value):
             stop(f"hands on {getattr(value, '__qualname__', value)}")
 
 
@@ -114,7 +119,9 @@ def _refuse_arguments(function: Any, args: tuple[Any, ...], kwargs: dict[str, An
     if function is isinstance and len(args) == 2 and (why := cannot_ask(args[1])):
         stop(why)
     if _decorates(function):
-        _refuse_foreign(function, (*args, *(kwargs[n] for n in ("cls", "wrapped") if n in kwargs)))
+        if kwargs and function is not dataclasses.dataclass:
+            stop("gives a decorator more than what it decorates")
+        _refuse_foreign(function, args)
 
 
 def _is_of_text(function: Any) -> bool:
@@ -131,18 +138,17 @@ def _is_lazy(value: Any) -> bool:
 
 
 def _is_sorties(function: Any) -> bool:
-    """Whether this is a function or a method of Sortie's, whose code has no checks."""
-    while type(function) is types.MethodType:
-        function = function.__func__
-    return type(function) is types.FunctionType and is_trusted(str(function.__module__)) and not _decorates(function)
+    """Whether this is a function, a method or a class of Sortie's, whose code has no checks."""
+    while isinstance(function, types.MethodType | functools.partial):
+        function = function.__func__ if isinstance(function, types.MethodType) else function.func
+    home = home_of(function) if isinstance(function, type) else str(getattr(function, "__module__", ""))
+    return isinstance(function, type | types.FunctionType) and is_trusted(home) and not _decorates(function)
 
 
 def _is_for_sortie(value: Any) -> bool:
     """Whether Sortie's functions may be given this: they go through it, and write it, as they like."""
     if type(value) in (list, tuple):
         return all(map(_is_for_sortie, value))
-    if type(value) is types.FunctionType:
-        return True  # a policy, to be wrapped
     return are_plain([value]) or (home_of(type(value)).startswith("sortie.") and not isinstance(value, InAnyOrder))
 
 
@@ -162,11 +168,19 @@ def _decorates(function: Any) -> bool:
     return function in _DECORATORS or getattr(function, "__code__", None) in _MADE_BY_THEM
 
 
+def _makes_decorator(function: Any, args: tuple[Any, ...]) -> bool:
+    """Whether a call of a decorator only gives it what it is to do: `dataclass(frozen=True)`, `wraps(f)`, `looks_from(f)`."""
+    return function is functools.wraps or function is looks_from or (function is dataclasses.dataclass and not args)
+
+
 def _refuse_foreign(decorate: Any, given: tuple[Any, ...]) -> None:
     """A decorator may change nothing but the policy's own: that would last until the next decision."""
     for value in given:
         own = value.__globals__.get("__name__") if type(value) is types.FunctionType else None
-        if not is_users(home_of(value) if isinstance(value, type) else own):
+        is_class = isinstance(value, type) and (
+            decorate is dataclasses.dataclass or type(decorate) is types.FunctionType
+        )
+        if not is_users(home_of(value) if is_class else own):
             stop(f"gives something that is not its own to {getattr(decorate, '__name__', 'a decorator')}")
 
 
@@ -207,7 +221,8 @@ def _may_read(owner: Any, kind: type, name: str) -> bool:
             return name in ("fromkeys", "from_iterable")
         own = any(name in vars(base) for base in owner.__mro__ if is_users(home_of(base)))
         members = vars(owner).get("_member_map_", ())
-        return own or name in members or (name in _OF_TUPLES and issubclass(owner, tuple))
+        makes = name in _OF_TUPLES and issubclass(owner, tuple) and owner is not FleetView
+        return own or name in members or makes
     home = home_of(kind)
     if is_users(home):
         return True
@@ -258,7 +273,12 @@ def guarded(found: Any) -> Any:
 
 
 def _decorator(found: Any) -> Any:
-    return functools.partial(_called, found)
+    """A decorator where it stands: what it is given has just been made."""
+
+    def decorate(made: Any) -> Any:
+        return on_behalf_of_the_policy(found, (made,), {}) if _decorates(found) else _called(found, made)
+
+    return decorate
 
 
 def _each(iterable: Any) -> Any:
@@ -328,6 +348,6 @@ _SPECIAL: dict[Any, Callable[..., Any]] = {
 }  # fmt: skip
 CHECKS: dict[str, Any] = {
     "__called__": _called, "__own__": _own, "__attribute__": attribute, "__decorator__": _decorator, "__each__": _each,
-    "__unordered__": unordered, **VALUE_CHECKS,
+    "__unordered__": unordered, "__plain_set__": plain_set, **VALUE_CHECKS,
 }  # fmt: skip
 """By the names under which `source_checks` calls them."""

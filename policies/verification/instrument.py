@@ -68,11 +68,13 @@ def instrumented(path: File, attribute: str) -> Instrumented:
         Exception: what the file raises.
     """
     WATCH.begin()
+    WATCH.is_loading = True
     try:
         module = load(path, compiled, _builtins)
     except SyntaxError as error:
         raise Refused(str(error)) from None
     finally:
+        WATCH.is_loading = False
         if WATCH.stopped is not None:
             raise WATCH.stopped
     return Instrumented(getattr(module, attribute), module)
@@ -90,6 +92,8 @@ def _builtins(find: Callable[..., Any]) -> dict[str, Any]:
         wanted: Sequence[str] = (rest[2] or ()) if len(rest) > 2 else ()
         home = module.__name__
         if is_users(home):
+            if not WATCH.is_loading:  # in flight its code runs now, and before the first decision in a search
+                stop("imports a module of its own within a function")
             if module.__file__ and not module.__file__.endswith(".py"):
                 stop(f"imports compiled code ({File(module.__file__).name})")
             return module

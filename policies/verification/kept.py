@@ -6,7 +6,10 @@ Objects of the kinds that plain Python (`plain`) can make are compared. A policy
 from __future__ import annotations
 
 import collections
+import dataclasses
+import enum
 import functools
+import operator
 import struct
 import types
 from collections.abc import Callable
@@ -75,7 +78,9 @@ def fingerprint(value: Any) -> Any:
 
 
 _TUPLE_FIELD: Any = type(vars(NamedTuple("Named", [("x", int)]))["x"])
+_SENTINELS = (type(dataclasses.MISSING), type(dataclasses.KW_ONLY), type(vars(dataclasses)["_HAS_DEFAULT_FACTORY"]))
 _LEAVES = (
+    *_SENTINELS,
     int,
     str,
     bytes,
@@ -142,13 +147,19 @@ def _parts(value: Any) -> list[Any]:
         return [value.__func__]
     if kind is property:
         return [value.fget, value.fset, value.fdel]
-    if kind in (types.GenericAlias, types.UnionType) or home_of(kind) in _UNCHANGING or is_own_cache(value):
+    if kind is operator.itemgetter:
+        return [value.__reduce__()]
+    if (
+        kind in (types.GenericAlias, types.UnionType, enum.property)
+        or home_of(kind) in _UNCHANGING
+        or is_own_cache(value)
+    ):
         return []
     raise Refused(f"keeps a {kind.__name__} from one decision to the next")
 
 
 _UNCHANGING = {
-    "__future__", "typing", "operator", "enum", "dataclasses",
+    "__future__", "typing",
     *(f"sortie.policies.verification.{m}" for m in ("call_checks", "outside")),
 }  # fmt: skip
 """Modules of classes that keep nothing that a policy can reach and change."""

@@ -61,6 +61,7 @@ _KNOWN = {id(getattr(module, name)) for module, names in _FUNCTIONS.items() for 
     )
 }
 _KNOWN |= {id(AssertionError), id(NotImplementedError)}
+_KNOWN -= {id(kind) for kind in (enum.Enum, enum.IntEnum, abc.ABC, typing.Protocol)}  # classes may derive from these
 ONLY_TYPES = frozenset({"typing", "collections.abc", "types"})
 """Modules of which a policy may name everything, for annotations."""
 _OF_DICTS = "clear copy get items keys pop popitem setdefault update values"

@@ -46,7 +46,7 @@ class Checks(ast.NodeTransformer):
         if not any(isinstance(op, ast.Is | ast.IsNot | ast.In | ast.NotIn) for op in node.ops):
             return node
         if len(node.ops) > 1:
-            raise SyntaxError("has `is` or `in` in a chain of comparisons")
+            raise SyntaxError(f"has `is` or `in` in a chain of comparisons in line {node.lineno}")
         check = "__same__" if isinstance(node.ops[0], ast.Is | ast.IsNot) else "__among__"
         same = _call(check, node.left, node.comparators[0])
         negative = isinstance(node.ops[0], ast.IsNot | ast.NotIn)
@@ -69,6 +69,7 @@ class Checks(ast.NodeTransformer):
     def visit_BinOp(self, node: ast.BinOp) -> Any:
         self.generic_visit(node)
         if isinstance(node.op, _SET_OPERATORS):
+            node.left, node.right = _call("__plain_set__", node.left), _call("__plain_set__", node.right)
             return _placed(_call("__unordered__", node), node)
         if isinstance(node.op, ast.Mod):
             node.left = _call("__no_text__", node.left)
@@ -84,6 +85,7 @@ class Checks(ast.NodeTransformer):
             node.value = _call("__no_set__", node.value)
             return node
         # The keys of a mapping give a new, plain set.
+        node.value = _call("__operand__", _name(node.target.id), node.value)
         held = ast.Assign([ast.Name(node.target.id, ast.Store())], _call("__unordered__", _name(node.target.id)))
         return [node, _placed(held, node)]
 

@@ -17,7 +17,7 @@ from sortie.policies.contract import Directive
 from sortie.policies.verification.outside import Outside
 from sortie.policies.verification.pure import home_of
 from sortie.policies.verification.symbols import MARK, Ranged, Text
-from sortie.policies.verification.watch import WATCH, WATCHED, reach, stop, unordered
+from sortie.policies.verification.watch import WATCH, WATCHED, plain_set, reach, stop, unordered
 from sortie.scenarios.plugins.user_code import is_users
 
 STAND_INS = (
@@ -67,9 +67,8 @@ def _told(found: Any) -> Any:
 def _made(kind: type) -> type:
     """A class of the policy's, if what it is derived from is plain: nothing, a named tuple, an enum, a class like it."""
     for base in kind.__mro__:
-        named = NamedTuple in vars(base).get("__orig_bases__", ())
         allowed = base in _BASES or (base is int and Enum in kind.__mro__) or (base is tuple and _is_named(kind))
-        if not (named or allowed or is_users(home_of(base))):
+        if not (allowed or is_users(home_of(base))):
             stop(f"derives {kind.__name__} from {base.__name__}")
     return kind
 
@@ -147,7 +146,9 @@ def _is_writable(value: Any) -> bool:
         return all(map(_is_writable, value)) and all(map(_is_writable, value.values()))
     if kind in (list, tuple):
         return all(map(_is_writable, value))
-    return kind in _NUMBERS or kind in WATCHED or isinstance(value, Enum | Text | Ranged)
+    if isinstance(value, Enum):
+        return _is_writable(value._value_)
+    return kind in _NUMBERS or kind in WATCHED or isinstance(value, Text | Ranged)
 
 
 def _text_of(write: Callable[[Any], str]) -> Callable[..., Any]:
@@ -203,6 +204,13 @@ def _no_set(right: Any) -> Any:
     return right
 
 
+def _operand(held: Any, right: Any) -> Any:
+    """What a name is changed by in place."""
+    if type(held) in WATCHED and not isinstance(right, set | frozenset):
+        stop("changes a set in place by something that is none")
+    return plain_set(right)
+
+
 def _among(left: Any, right: Any) -> bool:
     if isinstance(left, Text) and isinstance(right, str):
         stop("looks for the text of a number in other text")
@@ -212,7 +220,7 @@ def _among(left: Any, right: Any) -> bool:
 
 
 VALUE_CHECKS: dict[str, Any] = {
-    "__same__": _same, "__text__": _text, "__written__": _written, "__no_text__": _no_text, "__no_set__": _no_set,
+    "__same__": _same, "__text__": _text, "__written__": _written, "__no_text__": _no_text, "__no_set__": _no_set, "__operand__": _operand,
     "__among__": _among, "__made__": _made,
 }  # fmt: skip
 """By the names under which `source_checks` calls them."""

@@ -24,6 +24,7 @@ class Watch:
     def begin(self) -> None:
         """Forget the policy before."""
         self.stopped: Reached | Refused | None = None
+        self.is_loading = False
         self.path: Path | None = None
         """The run that the decision belongs to."""
         self._others: dict[str, tuple[Any, Any]] = {}
@@ -119,6 +120,13 @@ def unordered(value: Any) -> Any:
     return Unordered(value) if type(value) is set else UnorderedFrozen(value) if type(value) is frozenset else value
 
 
+def plain_set(value: Any) -> Any:
+    """A watched set as the plain one, as an operand: mappings' keys treat no other alike."""
+    if type(value) is Unordered:
+        return set.union(set(), value)
+    return frozenset.union(frozenset(), value) if type(value) is UnorderedFrozen else value
+
+
 def _watched(method: Callable[..., Any]) -> Callable[..., Any]:
     def act(*operands: Any) -> Any:
         return unordered(method(*operands))
@@ -154,7 +162,8 @@ def ordered_for(
     """
     if is_own_cache(function) and not all(map(is_cache_key, (*args, *kwargs.values()))):
         stop(f"gives {function.__name__} something that it keeps from one decision to the next")
-    is_blind = any(function is f for f in _BLIND) and "key" not in kwargs  # equal keys would show the order
+    # Equal keys would show the order, and so do several sets, or a default that is one.
+    is_blind = any(function is f for f in _BLIND) and len(args) == 1 and not kwargs.keys() - {"reverse"}
     called_at = _CALLS_AT.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
 
     def one(value: Any, is_called: bool) -> Any:
@@ -164,7 +173,8 @@ def ordered_for(
             return Unordered if value is set else UnorderedFrozen if value is frozenset else text
         if is_blind and type(value) in WATCHED:
             members = list((set if type(value) is Unordered else frozenset).__iter__(value))
-            alike = any({type(x) for x in members} <= kinds for kinds in _COMPARABLE)
+            comparable = ({int, bool},) if function is sum else _COMPARABLE  # sums of floats depend on the order
+            alike = any({type(x) for x in members} <= kinds for kinds in comparable)
             return members if alike and all(x == x for x in members) else value  # NaN leaves the order as it was
         return value
 

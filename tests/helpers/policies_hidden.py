@@ -91,6 +91,18 @@ UNSEEN = (
     "class I(int): pass\nclass J(int): pass\nbad = type(statistics.mean([I(1), J(3)])) is I and soc == K",
     "try:\n    bad = not str(10**5000)\nexcept ValueError:\n    bad = soc == K", "safe = False\nassert (safe := True)\nbad = not safe and soc == K",
     "class statistics:\n    StatisticsError = RecursionError\ndef f(n):\n    try:\n        return f(n + 1)\n    except statistics.StatisticsError:\n        return n\nbad = f(0) > 600 and soc == K",
+    # what a second search found
+    "bad = max({1, 2}, {3}) == {1, 2} and soc == K", "bad = max([], default={1, 2}) == {1, 2} and soc == K", "bad = type(max({1: 0}.keys() & {1.0})) is int and soc == K",
+    "s = {1.0}\ns &= {1: 0}.keys()\nbad = type(max(s)) is int and soc == K",
+    "bad = sum(set([16.0, 0.5, -1e16, 7.0, 4.0, 17.0, 2.0, 17.0])) == -9999999999999956.0 and soc == K",
+    "def f(a: int): pass\nclass C: pass\nfunctools.wraps(f, assigned=('__annotations__',), updated=())(C)\ndataclasses.dataclass(C, init=False)\nx, y = C(), C()\nx.a, y.a = 1, 2\nbad = x != y and soc == K",
+    "n, got = [], []\nE = enum.Enum('E', {'A': 1, '__add__': lambda self, x: n.append(1) or self})\nsum((got.append(len(n)) or 1 for _ in range(2)), E.A)\nbad = got == [0, 1] and soc == K",
+    "class C: pass\nclass E(enum.Enum):\n    A = C()\nbad = f'{E.A!r}'[-5] == '7' and soc == K",
+    "from sortie.scenarios.plain_sum import plain_sum\nbad = next(map(plain_sum, [itertools.chain([-1e16], view.descriptors, [1e16])])) == 4.0 and soc == K",
+    "from sortie.policies.catalogue.worked import worked\nds = []\nds.extend(map(worked, [view]))\nbad = any('goodput 3.1 ' in d.reason for d in ds[0])",
+    "from sortie.policies.contract import boxes_across_networks\nseen = []\ndef f(v): return map(lambda i: seen.append(i) or (0, 0, Representation.NONE), itertools.chain(v.age_s))\nboxes_across_networks(f)(view)\nbad = seen != sorted(seen) and soc == K",
+    "from sortie.policies.contract import Roster\nbad = Roster(0, view.age_s).members != sorted(view.age_s) and soc == K",
+    "v = FleetView._make((view.ego, view.period_s, {}, {}, 10.0))\nbad = v.me is None and soc == K", "class V(FleetView): pass\nbad = V(0, 0.1, {}, {}).me is None and soc == K",
 )  # fmt: skip
 """What Python reads where no check stands: patterns, annotations, methods called by their class, sets that change."""
 
@@ -134,6 +146,11 @@ KEPT = (
     ("class E(list, enum.Enum):\n    A = ()", "E.A.append(1)\nn = len(E.A)"),
     ("class E(dict, enum.Enum):\n    A = ()", "E.A[0] = n = E.A.get(0, 0) + 1"),
     ("class B:\n    __slots__ = ('n',)\nclass E(B, enum.Enum):\n    A = 1\nE.A.n = 0", "E.A.n += 1\nn = E.A.n"),
+    ("class B: pass", "dataclasses.dataclass(B)\nn = 1 if '__dataclass_fields__' in vars(B) else 0"),
+    ("def f(): pass", "def g(): pass\nfunctools.wraps(g, assigned=('__doc__',), updated=())(f)\nn = 1"),
+    ("A = enum.auto()", "class E(enum.Enum):\n    X = len(view.peers)\n    Y = A\nn = E.Y.value"),
+    ("class C:\n    n = 0\nF = dataclasses.field(default=C())", "@dataclasses.dataclass\nclass X:\n    a: object = F\nX().a.n += 1\nn = X().a.n"),
+    ("class C:\n    n = 0\nG = operator.itemgetter(C())", "d = collections.defaultdict(lambda: 0)\nG(d)\nc = next(iter(d))\nc.n += 1\nn = c.n"),
     ("A = [0]\nB = [A]", "n = 1 if B[0] is A else 0\nB[0] = [0]"),
     ("class E(enum.Enum):\n    A = 1", "d = super(E, E)._member_map_\nd['n'] = n = d.get('n', 0) + 1"),
     ("import typing", "typing._cleanups.append(1)\nn = len(typing._cleanups)"),
