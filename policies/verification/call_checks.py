@@ -14,7 +14,7 @@ import sys
 import types
 from abc import abstractmethod
 from collections.abc import Callable
-from enum import Enum
+from enum import Enum, EnumType
 from typing import Any
 
 from sortie.policies.contract import FleetView, looks_from
@@ -43,6 +43,7 @@ from sortie.policies.verification.value_checks import (
     is_stand_in,
     join,
     text_of,
+    with_texts,
 )
 from sortie.policies.verification.watch import WATCH, WATCHED, ordered_for, plain_set, reach, stop, unordered
 from sortie.scenarios.plugins.user_code import is_users
@@ -51,6 +52,8 @@ from sortie.scenarios.plugins.user_code import is_users
 def _called(function: Any, /, *args: Any, **kwargs: Any) -> Any:
     """A call of the policy's code."""
     _refuse_others(function)
+    if isinstance(function, EnumType) and (len(args) != 1 or kwargs):
+        stop(f"makes an enum by a call of {function.__name__}")
     if _decorates(function) and not _makes_decorator(function, args):
         stop("decorates by a call")  # something that may be older than this decision
     if _is_own_code(function):
@@ -86,7 +89,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
     if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
         return found
-    return checked(function(*args, **kwargs))
+    found = function(*args, **kwargs)
+    return checked(with_texts(found) if _is_sorties(function) else found)
 
 
 def _refuse_to_hand_on(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
@@ -97,10 +101,10 @@ def _refuse_to_hand_on(function: Any, args: tuple[Any, ...], kwargs: dict[str, A
         if not callable(value) or function is isinstance:
             continue
         _refuse_others(value)
-        is_known = value is isinstance or value is type or calls_others(value) or is_own_cache(value)
+        is_known = value in (isinstance, type, sum) or calls_others(value) or is_own_cache(value)
         makes = function in (collections.defaultdict, dataclasses.field) or (function is map and len(args) == 2)
         reads = reads_stored_text(value) and not (value is int and makes)
-        others = _is_sorties(value) and not isinstance(value, types.MethodType) and function is not functools.partial
+        others = _is_sorties(value) and not isinstance(value, types.MethodType)
         if is_known or reads or others or _decorates(value):
             stop(f"hands on {getattr(value, '__qualname__', value)}")
 
@@ -319,7 +323,7 @@ def _sum(items: Any, /, start: Any = 0) -> Any:
     found = sum(listed, start)
     floats = len(listed) + (type(start) is not int or start != 0)
     # Two floats have the same sum either way, and the solver follows combined inputs without rounding.
-    if sys.version_info >= (3, 12) and floats > 2 and type(found).__name__ == "Ranged":
+    if sys.version_info >= (3, 12) and floats > 2 and any(map(is_stand_in, (*listed, found))):
         stop("adds up floats with sum(…), which compensates rounding")
     return found
 

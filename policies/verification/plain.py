@@ -9,6 +9,7 @@ is tested by drawn views.
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from collections.abc import Iterator
 
 _PLAIN = (
@@ -52,6 +53,8 @@ def refuse_other_python(tree: ast.Module) -> None:
     changed = next((node for node in ast.walk(tree) if isinstance(node, ast.Global)), None)
     if changed is not None:
         raise SyntaxError(f"changes the global {changed.names[0]} in line {changed.lineno}")
+    if not any(isinstance(part, ast.ImportFrom) and part.module == "__future__" for part in tree.body):
+        _refuse_computing_annotations(tree)  # with it, Python evaluates none
     allowed = _allowed_at_their_places(tree)
     found = {
         (getattr(node, "lineno", 0), what): None
@@ -162,6 +165,48 @@ def _error(node: ast.AST) -> str:
 
 def _is_alone(node: ast.AST) -> bool:
     return isinstance(node, ast.Name) and node.id in _ALONE
+
+
+_IN_ANNOTATIONS = (
+    ast.Name, ast.Attribute, ast.Subscript, ast.Constant, ast.Tuple, ast.List, ast.BinOp, ast.BitOr, ast.Load,
+)  # fmt: skip
+_TYPES = frozenset(
+    {"bool", "bytes", "dict", "float", "frozenset", "int", "list", "object", "set", "str", "tuple", "type"}
+)
+
+
+def _refuse_computing_annotations(tree: ast.Module) -> None:
+    """Annotations are evaluated, and no check sees it: they may be made of types alone, which are there in time."""
+    names = (n for n in ast.walk(tree) if isinstance(n, ast.Name) and not isinstance(n.ctx, ast.Load))
+    stored = Counter(name.id for name in names)
+    known = set(_TYPES - stored.keys())
+    for part in tree.body:
+        match part:
+            case ast.Import(names=aliases) | ast.ImportFrom(names=aliases):
+                bound = [(alias.asname or alias.name).partition(".")[0] for alias in aliases]
+                known.update(name for name in bound if not stored[name])
+            case ast.ClassDef(name=name) if not stored[name]:
+                known.add(name)
+            case ast.Assign(targets=[ast.Name(id=name)], value=value) if stored[name] == 1 and not _computes(
+                value, known
+            ):
+                known.add(name)
+    for node in ast.walk(tree):
+        for annotation in (getattr(node, "annotation", None), getattr(node, "returns", None)):
+            if annotation is not None and (what := _computes(annotation, known)):
+                line = annotation.lineno
+                raise SyntaxError(f"computes an annotation ({what}) in line {line}, which is not plain Python")
+
+
+def _computes(annotation: ast.expr, known: set[str]) -> str:
+    """The part of an annotation that is more than a type; empty if there is none."""
+    for part in ast.walk(annotation):
+        is_other = not isinstance(part, _IN_ANNOTATIONS)
+        is_unknown = isinstance(part, ast.Name) and part.id not in known
+        is_deep = isinstance(part, ast.Attribute) and (part.attr[0] == "_" or not isinstance(part.value, ast.Name))
+        if is_other or is_unknown or (is_deep and ast.unparse(part)[:16] != "collections.abc."):
+            return ast.unparse(part) if isinstance(part, ast.expr) else type(part).__name__
+    return ""
 
 
 def _allowed_at_their_places(tree: ast.Module) -> set[ast.AST]:

@@ -38,7 +38,7 @@ _FUNCTIONS: dict[types.ModuleType, str] = {
     heapq: "heapify heappop heappush heappushpop heapreplace nlargest nsmallest",
     itertools: "accumulate chain combinations combinations_with_replacement compress count cycle dropwhile filterfalse groupby "
     "islice pairwise permutations product repeat starmap takewhile zip_longest",
-    math: " ".join(name for name, value in vars(math).items() if callable(value)),
+    math: " ".join(name for name, value in vars(math).items() if callable(value) and name != "sumprod"),
     operator: "add eq ge gt itemgetter le lt mul ne neg truediv",
     statistics: "StatisticsError fmean geometric_mean harmonic_mean mean median median_high median_low mode multimode pstdev "
     "pvariance stdev variance",
@@ -80,7 +80,7 @@ METHODS: dict[type, frozenset[str]] = {
         dict: _OF_DICTS,
         collections.defaultdict: _OF_DICTS,
         collections.OrderedDict: f"{_OF_DICTS} move_to_end",
-        collections.Counter: f"{_OF_DICTS} elements most_common subtract total",
+        collections.Counter: f"{_OF_DICTS} elements most_common subtract",
         types.MappingProxyType: "copy get items keys values",
         set: f"{_OF_SETS} add clear difference_update discard intersection_update pop remove symmetric_difference_update update",
         frozenset: _OF_SETS,

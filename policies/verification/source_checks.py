@@ -22,9 +22,6 @@ def compiled(source: bytes, path: str) -> types.CodeType:
     return code
 
 
-_IN_ANNOTATIONS = (
-    ast.Name, ast.Attribute, ast.Subscript, ast.Constant, ast.Tuple, ast.List, ast.BinOp, ast.operator, ast.Load,
-)  # fmt: skip
 _SET_OPERATORS = (ast.BitAnd, ast.BitOr, ast.BitXor, ast.Sub)
 
 
@@ -32,7 +29,6 @@ class Checks(ast.NodeTransformer):
     """Puts the checks into a source."""
 
     def __init__(self) -> None:
-        self._in_class = False
         self._matches = 0
 
     def visit_Call(self, node: ast.Call) -> Any:
@@ -97,18 +93,15 @@ class Checks(ast.NodeTransformer):
         return _placed(_call("__attribute__", node.value, ast.Constant(node.attr)), node)
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> Any:
-        outer, self._in_class = self._in_class, False
-        node.returns = None
+        returns, node.returns = node.returns, None
         self.generic_visit(node)
+        node.returns = returns
         node.decorator_list = [_call("__decorator__", d) for d in node.decorator_list]
-        self._in_class = outer
         return node
 
     def visit_ClassDef(self, node: ast.ClassDef) -> Any:
-        outer, self._in_class = self._in_class, True
         self.generic_visit(node)
         node.decorator_list = [*(_call("__decorator__", d) for d in node.decorator_list), _name("__made__")]
-        self._in_class = outer
         return node
 
     def visit_ExceptHandler(self, node: ast.ExceptHandler) -> ast.AST:
@@ -158,17 +151,12 @@ class Checks(ast.NodeTransformer):
         return [x for part in (held, *rest) for x in _listed(self.visit(_placed(part, node)))]
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
-        if self._in_class:
-            _refuse_computing(node.annotation)
-        else:
-            node.annotation = ast.Constant(None)  # nothing reads it
         node.target = self.visit(node.target)
         node.value = None if node.value is None else self.visit(node.value)
         return node
 
-    def visit_arg(self, node: ast.arg) -> ast.AST:
-        node.annotation = None  # nothing reads it
-        return node
+    def visit_arg(self, node: ast.arg) -> Any:
+        return node  # with its annotation, which is made of types alone
 
 
 def _unpacks(target: ast.expr) -> bool:
@@ -191,12 +179,6 @@ def _matches(pattern: ast.pattern, subject: str) -> ast.expr:
             bound = ast.Tuple([ast.NamedExpr(ast.Name(name, ast.Store()), _name(subject))], ast.Load())  # always true
             return bound if inner is None else ast.BoolOp(ast.And(), [_matches(inner, subject), bound])
     raise SyntaxError(f"has {type(pattern).__name__} in a pattern, which is not plain Python")
-
-
-def _refuse_computing(annotation: ast.expr) -> None:
-    """An annotation in a class, which stays for dataclasses and named tuples, must compute nothing."""
-    if not all(isinstance(part, _IN_ANNOTATIONS) for part in ast.walk(annotation)):
-        raise SyntaxError("computes an annotation")
 
 
 def _part(value: ast.expr) -> ast.expr:

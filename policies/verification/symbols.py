@@ -414,8 +414,8 @@ class Text(str):
     def __repr__(self) -> str:
         return self._refused() if for_policy(sys._getframe(1)) else self
 
-    def __bool__(self) -> bool:  # a format may have left nothing of it
-        return self._refused() if for_policy(sys._getframe(1)) else True
+    def __bool__(self) -> bool:
+        return True  # the text of a number is never empty, and the checks let no format cut it
 
     def _refused(self, *_: object, **__: object) -> NoReturn:
         self._path.refuse(f"uses the text of {self._axis} for more than a reason")

@@ -37,7 +37,7 @@ def checked(found: Any) -> Any:
 
     Plain text into which a number was written is refused, because its use is not noticed.
     """
-    found = unordered(_told(found))
+    found = unordered(found)
     parts, met = [found], set[int]()
     while parts:
         part = parts.pop()
@@ -55,12 +55,12 @@ def checked(found: Any) -> Any:
 _CONTAINERS = (list, dict, deque, defaultdict, OrderedDict, Counter)
 
 
-def _told(found: Any) -> Any:
+def with_texts(found: Any) -> Any:
     """Directives of Sortie's own policies, with their reasons as texts that can only be reasons."""
     if type(found) is Directive and type(found.reason) is str and MARK in found.reason and WATCH.path is not None:
         return found._replace(reason=Text(WATCH.path, "a number of the view", found.reason))
     if type(found) in (list, tuple) and any(type(part) is Directive for part in found):
-        return type(found)(map(_told, found))
+        return type(found)(map(with_texts, found))
     return found
 
 
@@ -148,7 +148,7 @@ def _is_writable(value: Any) -> bool:
         return all(map(_is_writable, value))
     if isinstance(value, Enum):
         return _is_writable(value._value_)
-    return kind in _NUMBERS or kind in WATCHED or isinstance(value, Text | Ranged)
+    return kind in _NUMBERS or isinstance(value, Text | Ranged)
 
 
 def _text_of(write: Callable[[Any], str]) -> Callable[..., Any]:
@@ -177,6 +177,8 @@ def _written(value: Any, conversion: int, spec: str) -> Any:
         stop("lets a number of the view decide the form of a text")
     if not _is_writable(value):
         stop(f"makes text of a {type(value).__name__}")
+    if isinstance(value, Text) and spec:  # which may leave nothing of it
+        stop("formats a text that has a number of the view")
     return value._text(spec) if isinstance(value, Text | Ranged) else checked(format(value, spec))
 
 

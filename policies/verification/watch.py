@@ -90,9 +90,6 @@ class Unordered(set[Any]):
         _see_order(list(set.__iter__(self)))
         return set.pop(self)
 
-    def __repr__(self) -> str:
-        return repr(set(_see_order(list(set.__iter__(self)))))
-
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
         return set
@@ -103,9 +100,6 @@ class UnorderedFrozen(frozenset[Any]):
 
     def __iter__(self) -> Any:
         return iter(_see_order(list(frozenset.__iter__(self))))
-
-    def __repr__(self) -> str:
-        return repr(frozenset(_see_order(list(frozenset.__iter__(self)))))
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:

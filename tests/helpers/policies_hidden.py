@@ -103,6 +103,15 @@ UNSEEN = (
     "from sortie.policies.contract import boxes_across_networks\nseen = []\ndef f(v): return map(lambda i: seen.append(i) or (0, 0, Representation.NONE), itertools.chain(v.age_s))\nboxes_across_networks(f)(view)\nbad = seen != sorted(seen) and soc == K",
     "from sortie.policies.contract import Roster\nbad = Roster(0, view.age_s).members != sorted(view.age_s) and soc == K",
     "v = FleetView._make((view.ego, view.period_s, {}, {}, 10.0))\nbad = v.me is None and soc == K", "class V(FleetView): pass\nbad = V(0, 0.1, {}, {}).me is None and soc == K",
+    # what a third search found
+    "y = 0\ndef f(x: (y := 1)): pass\nbad = y == 1 and soc == K", "try:\n    def h() -> 1 // 0: pass\nexcept ZeroDivisionError:\n    bad = soc == K",
+    "out = []\ndef f(x: out.append(1)): pass\nbad = len(out) == 1 and soc == K", "D = collections.defaultdict(int)\ndef f(x: D['a']): pass\nbad = len(D) == 1 and soc == K",
+    "D = {'verify': 0}\ntry:\n    class C:\n        x: D[dataclasses.sys.argv[1]]\nexcept LookupError:\n    bad = soc == K",
+    "class B(enum.Enum): pass\nT = B('T', {'A': 'K'}, type=str)\nbad = T.A == f'{soc:.7f}'", "a = [Directive(0, 1)]\nmax([a], key=len).clear()\nbad = not a and soc == K",
+    "g = {}\nfor p in (1, 2):\n    g.setdefault(0, []).append(Directive(0, p))\nbad = len(g[0]) == 2 and soc == K",
+    "from sortie.scenarios.plain_sum import plain_sum\nbad = functools.partial(plain_sum, itertools.chain([-1e16], view.descriptors, [1e16]))() == 4.0 and soc == K",
+    "bad = False in set().union(map(bool, [f\"{f'{soc}':.0}\"])) and soc == K", "class C: pass\nbad = str({C()})[-4] == '7' and soc == K",
+    "bad = f'{[{decide}]}'[-4] == '7' and soc == K", "bad = next(map(sum, [[soc, 1e16, -1e16]])) == 7 and soc == K",
 )  # fmt: skip
 """What Python reads where no check stands: patterns, annotations, methods called by their class, sets that change."""
 
@@ -168,7 +177,7 @@ HARMLESS = (
     "kinds = {'a', 'b'}\nbad = 'c' in kinds or soc > 1", "names = {TaskPhase.TRACK, TaskPhase.SEARCH}\nbad = me.task_phase in names and me.task_phase == 4",
     "bad = sorted({'b', 'a'} | {'c'}) != ['a', 'b', 'c'] or soc > 1", "strong = {p for p in view.peers if me.goodput_to(p) > 5}\nfor p in strong:\n    bad = bad or me.goodput_to(p) < 5",
     "d = collections.defaultdict(set)\nfor p in view.peers:\n    d[0].add(p)\nbad = d[0] != set(view.peers) or type(d[0]) is not set", "why = f'{soc:.1%} of {first:.0f}'\nbad = soc > 1",
-    "from sortie.policies.catalogue.worked import worked\nbad = any(d.rate_hz > 10 for d in worked(view))", "names = ', '.join(str(p) for p in view.peers)\nbad = not names", "def f(x: float) -> list[float] | None:\n    return None\nbad = f(soc) is not None",
+    "from sortie.policies.catalogue.worked import worked\nbad = any(d.rate_hz > 10 for d in worked(view))", "g = {}\nfor p in view.peers:\n    g.setdefault(0, []).append(Directive(view.ego, p))\nbad = len(g[0]) != len(view.peers)", "names = ', '.join(str(p) for p in view.peers)\nbad = not names", "def f(x: float) -> list[float] | None:\n    return None\nbad = f(soc) is not None",
     "import sortie.policies.contract as contract\nbad = contract.PHASE_NAMES[me.task_phase] == 'x'", "bad = me.novelty_flags + 0.5 < 0 or me.novelty_flags == 0.5", "bad = soc not in (soc,)",
 )  # fmt: skip
 """The same words in correct policies, which stay proved."""

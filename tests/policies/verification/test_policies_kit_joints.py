@@ -287,6 +287,11 @@ def test_a_checked_policy_is_given_its_parameters(tmp_path: Path) -> None:
         "async def f(): pass",
         "def f():\n    return [x async for x in y]",
         "class C:\n    x: g() = 1",
+        "def f(x: g()): pass",
+        "def f() -> 1 // 0: pass",
+        "x: D['a'] = 1",
+        "import dataclasses\nclass C:\n    x: list[dataclasses.sys.argv[1]]",
+        "class D: pass\nD = {}\nx: D['a'] = 1",
         "if __name__ == 'other': pass",
     ],
 )
@@ -298,7 +303,7 @@ def test_a_source_that_no_check_could_follow_is_refused(source: str) -> None:
 
 def test_a_source_that_checks_can_follow_is_compiled() -> None:
     compiled(
-        b"f(__name__=1)\nx = 1 < 2 < 3\nif __name__ == '__main__':\n    f()\ndef f(x: g()) -> g(): y: g() = x",
+        b"f(__name__=1)\nx = 1 < 2 < 3\nif __name__ == '__main__':\n    f()\ndef f(x: list[int]) -> 'g()': y: int | None = x",
         "mine.py",
     )
 
