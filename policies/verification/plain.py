@@ -53,7 +53,8 @@ def refuse_other_python(tree: ast.Module) -> None:
     changed = next((node for node in ast.walk(tree) if isinstance(node, ast.Global)), None)
     if changed is not None:
         raise SyntaxError(f"changes the global {changed.names[0]} in line {changed.lineno}")
-    if not any(isinstance(part, ast.ImportFrom) and part.module == "__future__" for part in tree.body):
+    later = (part for part in tree.body if isinstance(part, ast.ImportFrom) and part.module == "__future__")
+    if not any(alias.name == "annotations" for part in later for alias in part.names):
         _refuse_computing_annotations(tree)  # with it, Python evaluates none
     allowed = _allowed_at_their_places(tree)
     found = {
@@ -187,10 +188,8 @@ def _refuse_computing_annotations(tree: ast.Module) -> None:
                 known.update(name for name in bound if not stored[name])
             case ast.ClassDef(name=name) if not stored[name]:
                 known.add(name)
-            case ast.Assign(targets=[ast.Name(id=name)], value=value) if stored[name] == 1 and not _computes(
-                value, known
-            ):
-                known.add(name)
+            case ast.Assign(targets=[ast.Name(id=name)], value=alias) if stored[name] == 1:
+                known |= set() if _computes(alias, known) else {name}
     for node in ast.walk(tree):
         for annotation in (getattr(node, "annotation", None), getattr(node, "returns", None)):
             if annotation is not None and (what := _computes(annotation, known)):

@@ -288,6 +288,7 @@ def test_a_checked_policy_is_given_its_parameters(tmp_path: Path) -> None:
         "def f():\n    return [x async for x in y]",
         "class C:\n    x: g() = 1",
         "def f(x: g()): pass",
+        "from __future__ import division\ndef f(x: g()): pass",
         "def f() -> 1 // 0: pass",
         "x: D['a'] = 1",
         "import dataclasses\nclass C:\n    x: list[dataclasses.sys.argv[1]]",
