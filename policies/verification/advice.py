@@ -7,6 +7,7 @@ _ADVICE = (
     ("compares or combines", "use plain numbers of Python in thresholds"),
     ("not plain Python", "keep to the Python that a proof follows (policies/README.md, \"Plain Python\")"),
     ("in a chain of comparisons", "write the parts with `and`"),
+    ("hands on ", "call it in a function or a lambda of your own"),
     ("by a call", "decorate a function or a class where it is defined"),
     ("within a function", "import it at the top of the file"),
     ("writes text with", "use an f-string"),

@@ -18,10 +18,6 @@ from sortie.scenarios.representation import AT_LEVEL
 
 _FIRST_LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0)
 _PLAIN = frozenset({float, int, Representation})
-Wanted = dict[int, float]
-"""Values of fields, by their places in a link."""
-
-
 Known = dict[Any, tuple[Link, tuple[int, ...], "dict[Box, Link | None]"]]
 """By a link's fields: the first link that had them, the lines that it breaks, and the nearest link, by the box within which
 it is to be."""

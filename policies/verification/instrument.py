@@ -1,9 +1,8 @@
 """A user's policy loaded so that the search sees everything that could tell its stand-ins from real objects.
 
-The source is compiled with a check at each place where plain Python would answer for a stand-in without asking it: calls,
-`is`, text with numbers in it, private attributes, assignments to attributes (`call_checks`, `value_checks`). What they raise
-is also recorded, so that no `except` in the policy hides it. What the policy keeps from one decision to the next is
-compared after every one.
+The source must be plain Python (`plain`). It is compiled with a check at each place where Python would answer for a stand-in
+without asking it: calls, `is`, text with numbers in it, attributes, sets (`call_checks`, `value_checks`). What the checks raise
+is also recorded. What the policy keeps from one decision to the next is compared after every one.
 """
 
 from __future__ import annotations

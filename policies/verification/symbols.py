@@ -446,7 +446,6 @@ _STEPS: dict[str, Callable[[float, float], float]] = {
     "round": lambda x, _: round(x),
     "sqrt": lambda x, _: math.sqrt(x),
 }
-ROUNDINGS = ("int", "floor", "ceil", "round", "sqrt")
 
 
 def _is_same_step(one: tuple[str, float], other: tuple[str, float]) -> bool:
