@@ -16,6 +16,7 @@ from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
 from sortie.perception.geometry import Geometry
 from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.decode import decode
+from sortie.perception.network.devices import gpu_name
 from sortie.perception.network.fusion.base import Fusion, PerCell
 from sortie.perception.network.fusion.disconet import DiscoNet
 from sortie.perception.network.inference import folded
@@ -32,10 +33,16 @@ class CarNetInstrument:
     """A network on frames that carry `images` uint8 [n, d, 4, px, px]."""
 
     def __init__(self, net: CarNet, device: torch.device = CPU, fusion_params: Params | None = None) -> None:
-        """Args: `fusion_params` change how the network's fusion mixes (`Fusion.tune`)."""
+        """
+        Args:
+            device: where it computes; a GPU is part of the fingerprint, because it rounds in its own way.
+            fusion_params: change how the network's fusion mixes (`Fusion.tune`).
+        """
         params = fusion_params or {}
         net.fusion.tune(**params)
         self.fingerprint = fingerprint(net) + "".join(f" {k}={v!r}" for k, v in sorted(params.items()))
+        if gpu := gpu_name(device):
+            self.fingerprint += f" on {gpu}"
         self.geometry: Geometry = net.config.geometry
         self.fused_cells = net.config.fused_cells
         """Cells along a side of the maps that are fused."""

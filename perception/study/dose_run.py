@@ -14,13 +14,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames, load_frames, make_split
 from sortie.perception.code_digest import boxes_digest
 from sortie.perception.evaluation.condition import SINGLE, Sharing
 from sortie.perception.evaluation.evaluate import exchanges, frame_hash, frame_keys, in_order, match_all, truth
-from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.evaluation.instrument import CPU, CarNetInstrument
 from sortie.perception.evaluation.matched import FrameResult, Settings, assemble, read_frames, write_frames
 from sortie.perception.evaluation.results import TAU
 from sortie.perception.evaluation.scores import Bootstrap
@@ -45,6 +46,7 @@ def measure(
     weights: Path = SHIPPED,
     frames: Sequence[FrameRange] | None = None,
     workers: int = 1,
+    device: torch.device = CPU,
     progress: Progress | None = None,
 ) -> Iterator[DoseRow]:
     """Every network at every dose, one row after the other.
@@ -61,7 +63,9 @@ def measure(
     """
     tell = progress or (lambda stage, done, of: None)
     data = frames_of(plan.frames if frames is None else frames, root, tell)
-    found = measure_frames(plan, folder, data, weights=weights, workers=workers, progress=partial(tell, "frames"))
+    found = measure_frames(
+        plan, folder, data, weights=weights, workers=workers, device=device, progress=partial(tell, "frames")
+    )
     for network, several in found.items():
         for dose in plan.dose:
             wanted = tuple(plan.conditions(dose))
@@ -78,10 +82,11 @@ def measure_frames(
     *,
     weights: Path = SHIPPED,
     workers: int = 1,
+    device: torch.device = CPU,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, list[Found]]:
     """By network: every frame in turn under every dose. One frame is finished in all networks before the next begins."""
-    networks = {n: CarNetInstrument(load_weights(weights / f"{n}.safetensors")) for n in plan.networks}
+    networks = {n: CarNetInstrument(load_weights(weights / f"{n}.safetensors"), device) for n in plan.networks}
     keys, of_plan = frame_keys(data), _digest(plan)
     start = next(iter(networks.values())).start_worker
 

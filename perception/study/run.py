@@ -9,12 +9,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
 from sortie.perception.benchmark.difficulty import Density, Difficulty
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing
 from sortie.perception.evaluation.evaluate import evaluate
-from sortie.perception.evaluation.instrument import CarNetInstrument
+from sortie.perception.evaluation.instrument import CPU, CarNetInstrument
 from sortie.perception.evaluation.matched import FLOOR, Evaluation
 from sortie.perception.evaluation.measures import under
 from sortie.perception.network.checkpoint import load_weights
@@ -82,6 +83,7 @@ def measure(
     shipped: Path | None = None,
     frames: int = 80,
     workers: int = 1,
+    device: torch.device = CPU,
     progress: Progress | None = None,
 ) -> Iterator[tuple[str, list[StudyRow]]]:
     """Rows of every network that has weights, one network after the other; what has none gives no rows.
@@ -95,7 +97,7 @@ def measure(
         weights = weights_of(job, *folders)
         if weights is None:
             continue
-        instrument = CarNetInstrument(load_weights(weights))
+        instrument = CarNetInstrument(load_weights(weights), device)
         first = variant is plan.variants[0] and seed == variant.seeds[0]
         tau_f1 = _f1(instrument, root, folder, workers, partial(tell, f"{job}: tau split"))
         rows: list[StudyRow] = []

@@ -29,6 +29,7 @@ from sortie.perception.benchmark.difficulty import VARIED
 from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference
 from sortie.perception.network.checkpoint import load_weights, read_config
+from sortie.perception.network.devices import device_named, gpu_name
 from sortie.perception.network.fusion.own import OwnFusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.model import CarNet, ModelConfig
@@ -228,23 +229,9 @@ def _drawn_ahead(
         yield step, [job.result() for job in coming.popleft()]
 
 
-def device_named(name: str | None) -> torch.device:
-    """Where to train: "cpu", "cuda" or one of several as in "cuda:1"; "auto" or left out, cuda where there is one.
-
-    Raises:
-        ValueError: there is none of that name here.
-    """
-    there = ["auto", "cpu"]
-    if torch.cuda.is_available():
-        there += ["cuda", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))]
-    if name is not None and name not in there:
-        raise ValueError(f"device is {name!r}, must be one of {', '.join(there)} here")
-    return torch.device(("cuda" if "cuda" in there else "cpu") if name in (None, "auto") else name)
-
-
 def _called(device: torch.device) -> str:
     """What a card calls the machine of a run."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{SHARDS} cores"
+    return gpu_name(device) or f"{SHARDS} cores"
 
 
 def _first(frames: Frames, count: int) -> Frames:

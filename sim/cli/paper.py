@@ -16,7 +16,7 @@ from sortie.perception.evaluation.condition import Absent, CellsBy, Serve, Ways
 from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow, differ_by_chance
 from sortie.perception.evaluation.verdict import ClaimVerdict
 from sortie.sim.cli.console import out, stages
-from sortie.sim.cli.options import refuse
+from sortie.sim.cli.options import DeviceOption, WorkersOption, refuse
 from sortie.sim.folders import RunError, ensure_between
 
 if TYPE_CHECKING:
@@ -57,9 +57,8 @@ def paper(
     ] = 0.0,
     tau: Annotated[float, typer.Option(help="Score threshold.")] = 0.1,
     scenes: Annotated[bool, typer.Option("--by-scene", help="Resample whole scenes instead of frames.")] = False,
-    workers: Annotated[
-        int | None, typer.Option(help="Number of frames evaluated in parallel; default: one per core.", min=1)
-    ] = None,
+    workers: WorkersOption = None,
+    device: DeviceOption = None,
     out_dir: Annotated[Path, typer.Option("--out", help="The report's folder.")] = Path("runs/paper"),
     work: Annotated[
         Path, typer.Option(help="Folder that keeps the benchmark and finished frames between runs.")
@@ -89,6 +88,7 @@ def paper(
     from sortie.perception.evaluation import figures, rows
     from sortie.perception.evaluation.results import TableSettings
     from sortie.perception.network.detector import named_weights  # here: torch takes a second to import
+    from sortie.perception.network.devices import measuring_device
     from sortie.sim.studies import paper as making
 
     chosen = {"both": ("zero", "masked"), "zero": ("zero",), "masked": ("masked",)}.get(unsent)
@@ -109,7 +109,15 @@ def paper(
         asked = TableSettings(chosen, cells_by, tau, "scene" if scenes else "frame", ways=ways)  # type: ignore[arg-type]
         cores = workers or os.cpu_count() or 1
         job = making.PaperSettings(
-            named_weights(weights), asked, frames, seed, cores, _command(context), live, fusion_params
+            named_weights(weights),
+            asked,
+            frames,
+            seed,
+            cores,
+            _command(context),
+            live,
+            fusion_params,
+            measuring_device(device),
         )
         if frame is not None:
             _open_frame(
@@ -235,6 +243,7 @@ def _command(context: typer.Context) -> str:
                 "tau",
                 "scenes",
                 "live",
+                "device",
             )
             and value != parameter.default
         ):

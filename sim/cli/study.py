@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from sortie.sim.cli.console import out, stages
+from sortie.sim.cli.options import DeviceOption, WorkersOption
 from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing, writing_durably
 from sortie.sim.user_errors import user_errors
 
@@ -52,20 +53,21 @@ def study_run(
     work: WorkOption = Path("runs/study"),
     bench_dir: BenchOption = Path("runs/bench"),
     frames: Annotated[int, typer.Option(help="Use this many frames of the test split, from the first.", min=2)] = 80,
-    workers: Annotated[
-        int | None, typer.Option(help="Number of frames evaluated in parallel; default: one per core.", min=1)
-    ] = None,
+    workers: WorkersOption = None,
+    device: DeviceOption = None,
 ) -> None:
     """Measure every network that has weights, and write the rows."""
+    from sortie.perception.network.devices import measuring_device
     from sortie.perception.study.measure import StudyRow, to_table
     from sortie.perception.study.plan import read_plan
     from sortie.perception.study.run import SHIPPED, measure
 
     plan, rows = read_plan(), list[StudyRow]()
     with user_errors(), stages() as progress:
+        where = measuring_device(device)
         cores = workers or os.cpu_count() or 1
         for job, some in measure(
-            plan, work, bench_dir, shipped=SHIPPED, frames=frames, workers=cores, progress=progress
+            plan, work, bench_dir, shipped=SHIPPED, frames=frames, workers=cores, device=where, progress=progress
         ):
             rows += some
             out.print(f"[bold]{job}[/bold] measured")
@@ -125,12 +127,12 @@ def study_doses(
             help="Benchmark seed, first and last frame of its test split: 7:0-239. Can be given several times. Default: the plan's."
         ),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Number of frames evaluated in parallel; default: one per core.", min=1)
-    ] = None,
+    workers: WorkersOption = None,
+    device: DeviceOption = None,
 ) -> None:
     """Measure whether the paper's flip appears when peers that sent nothing get more weight in the fusion."""
     from sortie.perception.evaluation import figures as common
+    from sortie.perception.network.devices import measuring_device
     from sortie.perception.study import dose_figure, doses
     from sortie.perception.study.dose_run import measure
     from sortie.scenarios.report_text import interval, signed
@@ -139,10 +141,11 @@ def study_doses(
     budgets = [f"two − four, {budget:g}" for budget in (0.0, *plan.budgets)]
     heads = ("network", "dose", "weight on zeros", f"starved, {plan.starved:g}", *budgets)
     with user_errors():
+        where = measuring_device(device)
         ranges = None if frames is None else [doses.FrameRange.parse(text) for text in frames]
         with stages() as progress:
             cores = workers or os.cpu_count() or 1
-            for row in measure(plan, work, bench_dir, frames=ranges, workers=cores, progress=progress):
+            for row in measure(plan, work, bench_dir, frames=ranges, workers=cores, device=where, progress=progress):
                 rows.append(row)
     table = Table(*heads, title=f"{rows[0].frames} frames; AP points with 95 % intervals over frames")
     for row in rows:

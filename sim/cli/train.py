@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from sortie.sim.cli.console import out, stages
-from sortie.sim.cli.options import ImagePx, ImagePxOption
+from sortie.sim.cli.options import DeviceOption, ImagePx, ImagePxOption
 from sortie.sim.folders import ensure_files
 from sortie.sim.user_errors import user_errors
 
@@ -95,7 +95,7 @@ def train(
         ),
     ] = None,
     minutes: Annotated[float | None, typer.Option(help="Stop after this many minutes.", min=0.1)] = None,
-    device: Annotated[str | None, typer.Option(help="cpu, cuda, or auto: cuda where available; default: auto.")] = None,
+    device: DeviceOption = None,
     resume: Annotated[bool, typer.Option(help="Continue from the last checkpoint.")] = True,
 ) -> None:
     """Train the detector on the benchmark's train split. An interrupted run continues.
@@ -105,10 +105,10 @@ def train(
     from sortie.perception.benchmark.dataset import Benchmark  # here: torch takes a second to import
     from sortie.perception.geometry import Geometry
     from sortie.perception.network.detector import named_weights, shipped
+    from sortie.perception.network.devices import device_named
     from sortie.perception.network.fusion.registry import FUSIONS
     from sortie.perception.network.model import ModelConfig
     from sortie.perception.training.recipe import Recipe
-    from sortie.perception.training.train import device_named
     from sortie.perception.training.train import train as train_detector
     from sortie.scenarios.plugins.reference import resolve
     from sortie.sim.cli import tables

@@ -8,23 +8,22 @@ from pathlib import Path
 from stored import Cell, Column, Table
 
 from sortie.perception.evaluation.figures import save
+from sortie.perception.network.devices import gpu_name, measuring_device
 from sortie.perception.study.dose_figure import draw
 from sortie.perception.study.dose_run import measure
-from sortie.perception.study.doses import DosePlan, DoseRow, Effect, FrameRange, read_plan, verdicts
-
-MEASURED = (FrameRange(0, 80, 168),)
-"""The plan's frames as far as they have been measured: its first, in its order."""
+from sortie.perception.study.doses import DosePlan, DoseRow, Effect, read_plan, verdicts
 
 
 def tables(work: Path, root: Path, picture: Path, workers: int = 2) -> dict[str, Table | str]:
-    """Measures what is missing under `work`, and draws the picture."""
-    plan = read_plan()
-    rows = list(measure(plan, work, root, frames=MEASURED, workers=workers))
+    """Measures what is missing under `work`, by a GPU where there is one, and draws the picture."""
+    plan, device = read_plan(), measuring_device("auto")
+    rows = list(measure(plan, work, root, workers=workers, device=device))
     save(draw(plan, rows), picture)
-    return {"doses": dose_table(plan, rows), "dose_verdicts": verdict_table(plan, rows)}
+    by = gpu_name(device)
+    return {"doses": dose_table(plan, rows, by), "dose_verdicts": verdict_table(plan, rows, by)}
 
 
-def dose_table(plan: DosePlan, rows: Sequence[DoseRow]) -> Table:
+def dose_table(plan: DosePlan, rows: Sequence[DoseRow], gpu: str = "") -> Table:
     """A row for each network and dose, in the plan's order."""
     contrasts = [f"two − four, {budget:g}" for budget in plan.budgets]
     effects = [Column(name, "+.1f") for name in (f"starved, {plan.starved:g}", "two silent − four silent", *contrasts)]
@@ -32,10 +31,12 @@ def dose_table(plan: DosePlan, rows: Sequence[DoseRow]) -> Table:
     found = [
         [r.network, r.dose.label, r.weight_on_zeros, *map(_cell, (r.starved, r.silent, *r.contrasts))] for r in rows
     ]
-    return Table(columns, found, f"{_frames(plan, rows)} Five egos a frame; AP points with 95 % intervals over frames.")
+    return Table(
+        columns, found, f"{_frames(plan, rows, gpu)} Five egos a frame; AP points with 95 % intervals over frames."
+    )
 
 
-def verdict_table(plan: DosePlan, rows: Sequence[DoseRow]) -> Table:
+def verdict_table(plan: DosePlan, rows: Sequence[DoseRow], gpu: str = "") -> Table:
     """A row for each hypothesis: in which networks it holds by the plan's rule."""
     found = verdicts(rows)
     out: list[list[Cell]] = []
@@ -44,16 +45,16 @@ def verdict_table(plan: DosePlan, rows: Sequence[DoseRow]) -> Table:
         holds = [several[k] for several in found.values()]
         out.append([name, says, *("held" if h else "not held" for h in holds), f"{sum(holds)} of {len(holds)}"])
     return Table(
-        [Column("hypothesis"), Column("it says"), *map(Column, found), Column("held in")], out, _frames(plan, rows)
+        [Column("hypothesis"), Column("it says"), *map(Column, found), Column("held in")], out, _frames(plan, rows, gpu)
     )
 
 
-def _frames(plan: DosePlan, rows: Sequence[DoseRow]) -> str:
-    """A sentence: how much of the plan all this stands on."""
-    of = sum(r.last - r.first + 1 for r in plan.frames)
+def _frames(plan: DosePlan, rows: Sequence[DoseRow], gpu: str) -> str:
+    """A sentence: how much of the plan all this stands on, and which GPU computed it."""
+    of, by = sum(r.last - r.first + 1 for r in plan.frames), f", on an {gpu}" if gpu else ""
     if (count := rows[0].frames) == of:
-        return f"All {of} frames of the plan."
-    return f"The first {count} of the plan's {of} frames, in the plan's order."
+        return f"All {of} frames of the plan{by}."
+    return f"The first {count} of the plan's {of} frames, in the plan's order{by}."
 
 
 def _cell(e: Effect) -> Cell:

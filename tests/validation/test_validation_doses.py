@@ -31,6 +31,8 @@ def rows(plan: DosePlan, frames: int) -> list[DoseRow]:
 def test_a_table_says_which_part_of_the_plan_it_stands_on() -> None:
     assert doses.dose_table(PLAN, rows(PLAN, 50)).about.startswith("The first 50 of the plan's 400 frames, in")
     assert doses.dose_table(PLAN, rows(PLAN, 400)).about.startswith("All 400 frames of the plan. Five egos")
+    by_gpu = doses.verdict_table(PLAN, rows(PLAN, 400), "NVIDIA H200").about
+    assert by_gpu == "All 400 frames of the plan, on an NVIDIA H200."
 
 
 def test_every_dose_of_every_network_has_its_row() -> None:
@@ -46,12 +48,6 @@ def test_a_hypothesis_is_shown_with_the_networks_in_which_it_held() -> None:
     assert [row[0] for row in table.rows] == ["Rises", "Flips", "Falls", "Masked", "Silence"]
     assert [row[2:] for row in table.rows][2] == ["held", "not held", "1 of 2"]
     assert [row[-1] for row in table.rows] == ["2 of 2", "2 of 2", "1 of 2", "2 of 2", "2 of 2"]
-
-
-def test_the_frames_that_were_measured_are_the_plans_first() -> None:
-    whole = [(r.bench_seed, f) for r in PLAN.frames for f in range(r.first, r.last + 1)]
-    measured = [(r.bench_seed, f) for r in doses.MEASURED for f in range(r.first, r.last + 1)]
-    assert measured == whole[: len(measured)]
 
 
 def test_the_picture_has_a_panel_for_each_difference_and_names_every_mark() -> None:

@@ -160,7 +160,7 @@ def test_a_network_is_measured_at_each_density_and_its_threshold_is_found_on_sce
 
     stand_ins: dict[str, Any] = {
         "make_split": make_split, "load_frames": lambda paths: paths, "evaluate": lambda *_, **__: Found(),
-        "optimal_f1": lambda *_: "f1", "rows_of": lambda *a: [(a[3], a[5])], "CarNetInstrument": lambda net: net,
+        "optimal_f1": lambda *_: "f1", "rows_of": lambda *a: [(a[3], a[5])], "CarNetInstrument": lambda net, device: net,
         "load_weights": lambda path: path, "weights_of": lambda job, *_: Path(job),
     }  # fmt: skip
     for name, made in stand_ins.items():

@@ -381,16 +381,3 @@ def test_batches_are_drawn_ahead_and_come_in_order() -> None:
             assert max(drawn) <= wanted + 2
         with pytest.raises(Killed):
             next(steps)
-
-
-def test_a_device_is_chosen_by_name_or_left_to_what_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert {str(training.device_named(name)) for name in (None, "auto", "cpu")} == {"cpu"}
-    with pytest.raises(ValueError, match="device is 'cuda', must be one of auto, cpu here"):
-        training.device_named("cuda")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    assert [str(training.device_named(name)) for name in (None, "auto", "cuda:1")] == ["cuda", "cuda", "cuda:1"]
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Some Card")
-    assert training._called(torch.device("cuda")) == "Some Card"
-    assert training._called(torch.device("cpu")) == "2 cores"

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from cli_examples import command
 from sim_examples import BASE
 
@@ -98,7 +99,7 @@ def test_train(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in(monkeypatch, "sortie.perception.network.fusion.registry", FUSIONS={"none": 1, "late": 2, "disconet": 3})
     stand_in(monkeypatch, "sortie.perception.network.model", ModelConfig=tuple_of)
     stand_in(monkeypatch, "sortie.perception.training.recipe", Recipe=dict)
-    stand_in(monkeypatch, "sortie.perception.training.train", train=seen, device_named=lambda name: name)
+    stand_in(monkeypatch, "sortie.perception.training.train", train=seen)
     monkeypatch.setitem(sys.modules, "sortie.sim.playback.training", None)  # type: ignore[arg-type]  # Rerun is missing
     for name in ("late.own", "w"):
         (here / name).touch()
@@ -313,9 +314,12 @@ def test_study(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
         *((((f"own-{k}"), Path("runs/study"), Path("runs/bench")), Path("shipped")) for k in (1, 2)),
     ]
     assert "dropout-1 AP@0.5 alone 0.250, all five 0.500" in capsys.readouterr().out
-    assert command("study", "run", "--work", "w", "--bench", "b", "--frames", "9", "--workers", "3") == 0
+    assert (
+        command("study", "run", "--work", "w", "--bench", "b", "--frames", "9", "--workers", "3", "--device", "cpu")
+        == 0
+    )
     assert (measured.args, measured.kwargs) == (
-        (plan, Path("w"), Path("b")), {"shipped": Path("shipped"), "frames": 9, "workers": 3},
+        (plan, Path("w"), Path("b")), {"shipped": Path("shipped"), "frames": 9, "workers": 3, "device": torch.device("cpu")},
     )  # fmt: skip
     assert tabled.args == ([1, 2, 3],), "the rows of every network"
     assert written == [("table", Path("w/study.parquet"))]
@@ -340,9 +344,14 @@ def test_the_doses_of_the_study(
     monkeypatch.setattr(doses, "read_plan", lambda: plan)
     monkeypatch.setattr(doses, "verdicts", lambda rows: {"net": (True, False), "other": (True, True)})
     monkeypatch.setattr("sortie.perception.evaluation.figures.available", lambda: False)
-    assert command("study", "doses", "--work", "w", "--bench", "b", "--frames", "7:0-239", "--workers", "2") == 0
+    assert (
+        command(
+            "study", "doses", "--work", "w", "--bench", "b", "--frames", "7:0-239", "--workers", "2", "--device", "cpu"
+        )
+        == 0
+    )
     assert (measured.args, measured.kwargs) == (
-        (plan, Path("w"), Path("b")), {"frames": [doses.FrameRange(7, 0, 239)], "workers": 2},
+        (plan, Path("w"), Path("b")), {"frames": [doses.FrameRange(7, 0, 239)], "workers": 2, "device": torch.device("cpu")},
     )  # fmt: skip
     told = capsys.readouterr().out
     (printed,) = [cells for cells in table_rows(told) if cells[0] == "net"]
@@ -605,23 +614,23 @@ def test_paper(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = (
         "--frames", "9", "--seed", "3", "--weights", "w/own", "--unsent", "masked", "--cells-by", "norm", "--absent", "zeros",
         "--serve", "region_first", "--temperature", "2", "--silent-weight", "0.5", "--tau", "0.25", "--by-scene",
-        "--workers", "4", "--live", "l/live.json",
+        "--workers", "4", "--live", "l/live.json", "--device", "cpu",
     )  # fmt: skip
     assert command("paper", *options, "--work", "k") == 2
     job, work, _ = seen["make"].args
-    weights, asked, frames, seed, workers, told, live, fusion = job
+    weights, asked, frames, seed, workers, told, live, fusion, device = job
     assert (weights, frames, seed, workers, live, work) == (Path("w/own"), 9, 3, 4, Path("l/live.json"), Path("k"))
     assert (asked.unsent, asked.cells_by, asked.tau, asked.by) == (("masked",), "norm", 0.25, "scene")
     assert (asked.ways.absent, asked.ways.serve) == ("zeros", "region_first")
-    assert fusion == {"temperature": 2.0, "silent_weight": 0.5}
+    assert (fusion, device) == ({"temperature": 2.0, "silent_weight": 0.5}, torch.device("cpu"))
     for words in (
         "--frames 9", "--seed 3", "--weights own", "--unsent masked", "--cells-by norm", "--absent zeros", "--serve region_first",
-        "--temperature 2.0", "--silent-weight 0.5", "--tau 0.25", "--by-scene", "--live live.json",
+        "--temperature 2.0", "--silent-weight 0.5", "--tau 0.25", "--by-scene", "--live live.json", "--device cpu",
     ):  # fmt: skip
         assert f" {words}" in told
     assert "workers" not in told
     command("paper", "--workers", "1")
-    weights, asked, frames, seed, _, told, live, fusion = seen["make"].args[0]
+    weights, asked, frames, seed, _, told, live, fusion, _ = seen["make"].args[0]
     assert (weights, frames, seed, told, live, fusion) == (Path("shipped/net"), None, 0, "sortie paper", None, {})
     assert (asked.unsent, asked.by) == (("zero", "masked"), "frame")
     command("paper", "--frame", "5", "--ego", "2", "--seed", "3", "--work", "k")

@@ -322,7 +322,9 @@ def test_a_frame_is_drawn_by_the_instrument_that_was_asked_for(monkeypatch: pyte
     drawn: list[Geometry] = []
     monkeypatch.setattr(paper, "bench_frames", lambda seed, count, root, geometry: drawn.append(geometry))
     monkeypatch.setattr(paper, "camera_views", lambda seed, frame, geometry: drawn.append(geometry))
-    monkeypatch.setattr(paper.CarNetInstrument, "load", lambda path, fusion_params: seen.append(fusion_params) or sharp)
+    monkeypatch.setattr(
+        paper.CarNetInstrument, "load", lambda path, device, fusion_params: seen.append(fusion_params) or sharp
+    )
     monkeypatch.setattr(paper, "picture", lambda instrument, frames, f, **options: seen.append(options))
     settings = TableSettings(("zero",), "norm", 0.3, ways=Ways("zeros", "region_first"))
     job = paper.PaperSettings(tmp_path / "w", settings, fusion_params={"temperature": math.inf})
