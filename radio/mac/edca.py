@@ -58,9 +58,9 @@ STATION_COLUMNS = 52
 # columns of a job
 (
     KIND, STATION, FLOW, FOLLOWING, COUNT, FULL_BYTES, LAST_BYTES, DROPPED, IS_LIVE, JOB_ACCESS, READY_AT, IS_TOLD, VAIN_TRIES,
-    LOW, HIGH, ARRIVED, AIR_NS, HEAD_AT,
-) = range(18)  # fmt: skip
-JOB_COLUMNS = 18
+    ANSWERS, LOW, HIGH, ARRIVED, AIR_NS, HEAD_AT,
+) = range(19)  # fmt: skip
+JOB_COLUMNS = 19
 
 # columns of a flow
 FLOW_TO, FLOW_MCS, FLOW_FRAMES, FLOW_DEAD = range(4)
@@ -542,9 +542,12 @@ def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, re
     a, what, job = S[s, ACCESS], S[s, AWAITS], S[s, TX_JOB]
     fail_window(s, a, S, C)
     if job >= 0:
-        if LI[J[job, FLOW], FLOW_DEAD] > 0 or J[job, KIND] == BLOCK_REQUEST:
+        is_dead, is_request = LI[J[job, FLOW], FLOW_DEAD] > 0, J[job, KIND] == BLOCK_REQUEST
+        if is_dead or is_request:
             J[job, VAIN_TRIES] += 1
-            if J[job, VAIN_TRIES] > C[C_RETRIES]:
+            in_vain = J[job, VAIN_TRIES] > C[C_RETRIES] if is_dead else J[job, ANSWERS] == 1 and not has_more(job, J)
+            J[job, ANSWERS] = 1
+            if in_vain:
                 OUT[told, 0], OUT[told, 1] = T_DEAD, job
                 told += 1
                 remove(job, t, S, J)
@@ -558,6 +561,15 @@ def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, re
     draw_backoff(s, a, S, keys)
     release(s, t, S, P, W, C, F, begin, receiver)
     return told
+
+
+@part
+def has_more(job, J):
+    """Whether another job of the same link waits behind a job."""
+    other = J[job, FOLLOWING]
+    while other >= 0 and J[other, FLOW] != J[job, FLOW]:
+        other = J[other, FOLLOWING]
+    return other >= 0
 
 
 @part
@@ -800,7 +812,9 @@ def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, re
     job = S[s, TX_JOB]
     S[s, WINDOW + a], S[s, FAILS + a] = C[C_WINDOW + a], 0
     if job >= 0 and J[job, KIND] == BLOCK_REQUEST:
-        remove(job, t, S, J)
+        J[job, ANSWERS] -= 1
+        if J[job, ANSWERS] == 0:
+            remove(job, t, S, J)
     elif job >= 0:
         if what == DATA and C[C_LEARNS] == 1:
             flow = J[job, FLOW]
@@ -985,7 +999,9 @@ def cancel(job, t, S, J, requests):
     """Take a job out, wherever it is; a frame of it that is on the air goes on to its end.
 
     With `requests`, one whose fragments are unanswered leaves a block-ack request at the head: the receiver must not wait
-    for them any longer.
+    for them any longer. If the sender was about to ask for them anyway, it takes two answers, as in ns-3: the first one says
+    that they have not arrived, and only then the sender gives them up and says so. A last request that is not answered is
+    repeated while there is more for that receiver.
     """
     s = J[job, STATION]
     before, at = -1, S[s, COMING]
@@ -999,6 +1015,7 @@ def cancel(job, t, S, J, requests):
         else:
             J[before, FOLLOWING] = J[job, FOLLOWING]
     elif requests and S[s, HEAD + J[job, JOB_ACCESS]] == job and J[job, LOW] < J[job, HIGH]:
+        J[job, ANSWERS] = 2 if S[s, REQUEST] == 1 and not is_engaged(s, S) else 1
         J[job, KIND], S[s, REQUEST] = BLOCK_REQUEST, 1
         if S[s, TX_JOB] == job:
             S[s, TX_JOB] = -1

@@ -88,7 +88,8 @@ def test_a_bad_pair_hears_no_descriptor_and_gets_no_sample() -> None:
     assert (heard == ~bad[: len(heard)]).all()
     assert (came == ~bad[: len(came)]).all()
     missed = {(r.status, r.reason) for r in flight.rows if r.status is not Status.DELIVERED}
-    assert missed == {(Status.EXPIRED, "deadline_in_service")}  # tried until then
+    # tried until then, or behind the block-ack requests of the one before
+    assert missed == {(Status.EXPIRED, "deadline_in_service"), (Status.EXPIRED, "deadline_queued")}
 
 
 def test_retries_pay_for_a_loss_at_each_try() -> None:

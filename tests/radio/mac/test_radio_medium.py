@@ -386,10 +386,38 @@ def test_a_sample_cut_short_by_its_deadline_leaves_a_block_ack_request_before_th
     assert b.log[1][0] > without_s + 2 * 32e-6 + SIFS_S + AIFS_S["best_effort"]
 
 
-def test_a_block_ack_request_that_nobody_answers_ends_with_the_retry_limit() -> None:
+def test_a_sample_that_is_cut_short_while_its_request_waits_takes_two_answers() -> None:
+    """The first answer says that nothing has arrived; the second one, that the receiver no longer waits for it."""
+    power = np.full((3, 3), -50.0)
+    power[0, 1] = power[1, 0] = FAINT_DBM
+    b = Bench(power)
+    no_answer_s = SIFS_S + 9e-6 + 20e-6
+    b.submit(0, 64, deadline_s=AIFS_S["best_effort"] + exchange_s(64) + no_answer_s + 10e-6, to=1)
+    b.submit(0, 1, to=2)
+    b.run()
+    assert [(k, how) for _, k, how in b.log] == [(0, End.DEADLINE_IN_SERVICE), (1, End.ARRIVED)]
+    assert b.medium.transmit_s[0] == pytest.approx(exchange_s(64) + 2 * 32e-6 + exchange_s(1), abs=1e-8)
+    assert b.medium.transmit_s[1] == pytest.approx(2 * 32e-6, abs=1e-8)
+
+
+def test_a_block_ack_request_that_nobody_answers_is_sent_once() -> None:
     b = _cut_short(DEAF_DBM)
     b.run()
-    assert b.medium.transmit_s[0] == pytest.approx(exchange_s(64) + 8 * 32e-6, abs=1e-8)
+    assert b.medium.transmit_s[0] == pytest.approx(exchange_s(64) + 32e-6, abs=1e-8)
+
+
+def test_it_is_repeated_while_there_is_more_for_that_receiver_and_delays_what_others_get() -> None:
+    b = _cut_short(DEAF_DBM)
+    b.submit(0, 1, to=2)
+    b.submit(0, 1, deadline_s=0.3, to=1)
+    b.run()
+    assert [(k, how) for _, k, how in b.log] == [
+        (0, End.DEADLINE_IN_SERVICE), (2, End.DEADLINE_QUEUED), (1, End.ARRIVED),
+    ]  # fmt: skip
+    assert b.log[2][0] > 0.3
+    requests = (b.medium.transmit_s[0] - exchange_s(64) - exchange_s(1)) / 32e-6
+    assert requests == pytest.approx(round(requests), abs=1e-3)
+    assert requests > 16, "no limit of tries"
 
 
 def test_a_replaced_sample_leaves_a_block_ack_request_and_a_withdrawn_or_waiting_one_leaves_none() -> None:
