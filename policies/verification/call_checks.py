@@ -17,24 +17,29 @@ from collections.abc import Callable
 from enum import Enum, EnumType
 from typing import Any
 
-from sortie.policies.contract import FleetView, looks_from
+from sortie.policies.contract import looks_from
+from sortie.policies.registry import POLICIES
 from sortie.policies.verification.outside import Outside, Unknown
 from sortie.policies.verification.pure import (
     IMPURE,
+    MADE,
     NAMED,
+    OF_SORTIES,
     ONLY_TYPES,
     PURE_MODULES,
+    TABLES,
     calls_others,
     cannot_call,
     home_of,
-    is_own_cache,
-    is_trusted,
+    is_of_policies,
     may_read,
     reads_stored_text,
+    runs_sorties_code,
+    shown_class,
     takes_ranges,
 )
 from sortie.policies.verification.stand_ins import SORTS, InAnyOrder
-from sortie.policies.verification.symbols import Ranged, Text
+from sortie.policies.verification.symbols import Ranged
 from sortie.policies.verification.value_checks import (
     VALUE_CHECKS,
     are_plain,
@@ -45,7 +50,7 @@ from sortie.policies.verification.value_checks import (
     text_of,
     with_texts,
 )
-from sortie.policies.verification.watch import WATCH, WATCHED, ordered_for, plain_set, reach, stop, unordered
+from sortie.policies.verification.watch import WATCH, ordered_for, plain_set, reach, stop, unordered
 from sortie.scenarios.plugins.user_code import is_users
 
 
@@ -90,7 +95,7 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
         return found
     found = function(*args, **kwargs)
-    return checked(with_texts(found) if _is_sorties(function) else found)
+    return checked(with_texts(found) if runs_sorties_code(function) else found)
 
 
 def _refuse_to_hand_on(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
@@ -101,10 +106,10 @@ def _refuse_to_hand_on(function: Any, args: tuple[Any, ...], kwargs: dict[str, A
         if not callable(value) or function is isinstance:
             continue
         _refuse_others(value)
-        is_known = value in (isinstance, type, sum) or calls_others(value) or is_own_cache(value)
+        is_known = value in (isinstance, type, sum) or calls_others(value)
         makes = function in (collections.defaultdict, dataclasses.field) or (function is map and len(args) == 2)
         reads = reads_stored_text(value) and not (value is int and makes)
-        others = _is_sorties(value) and not isinstance(value, types.MethodType)
+        others = runs_sorties_code(value) and not is_stand_in(getattr(value, "__self__", None))
         if is_known or reads or others or _decorates(value):
             stop(f"hands on {getattr(value, '__qualname__', value)}")
 
@@ -118,8 +123,10 @@ def _refuse_arguments(function: Any, args: tuple[Any, ...], kwargs: dict[str, An
         stop(f"reads what {name} is given")
     if function is int and any(type(value) is str and len(value) > _LONGEST_TEXT for value in given):
         stop("reads a number in a long text")
-    if _is_sorties(function) and not all(map(_is_for_sortie, given)):
-        stop(f"gives an object of its own to {name}")
+    if runs_sorties_code(function) and not all(map(_is_for_sortie, given)):
+        stop(f"gives more than numbers, texts, lists, tuples and Sortie's objects to {name}")
+    if function in POLICIES.values() and not are_plain(kwargs.values()):
+        stop(f"gives {name} a parameter that is no plain number")  # it may use its text
     if function is isinstance and len(args) == 2 and (why := cannot_ask(args[1])):
         stop(why)
     if _decorates(function):
@@ -141,19 +148,12 @@ def _is_lazy(value: Any) -> bool:
     return not isinstance(value, str | bytes) and hasattr(type(value), "__iter__") and type(value) not in (list, tuple)
 
 
-def _is_sorties(function: Any) -> bool:
-    """Whether this is a function, a method or a class of Sortie's, whose code has no checks."""
-    while isinstance(function, types.MethodType | functools.partial):
-        function = function.__func__ if isinstance(function, types.MethodType) else function.func
-    home = home_of(function) if isinstance(function, type) else str(getattr(function, "__module__", ""))
-    return isinstance(function, type | types.FunctionType) and is_trusted(home) and not _decorates(function)
-
-
 def _is_for_sortie(value: Any) -> bool:
     """Whether Sortie's functions may be given this: they go through it, and write it, as they like."""
-    if type(value) in (list, tuple):
+    kind = type(value)
+    if kind in (list, tuple, *MADE):
         return all(map(_is_for_sortie, value))
-    return are_plain([value]) or (home_of(type(value)).startswith("sortie.") and not isinstance(value, InAnyOrder))
+    return are_plain([value]) or kind in OF_SORTIES or (is_stand_in(value) and kind is not InAnyOrder)
 
 
 def _str(*args: Any) -> Any:
@@ -197,7 +197,6 @@ def _own(owner: Any, name: str) -> Any:
     return owner
 
 
-_OF_TUPLES = frozenset({"_replace", "_asdict", "_make", "_fields"})
 _LASTS_UNCHANGED = (int, float, str, bytes, Enum)
 
 
@@ -205,35 +204,27 @@ def attribute(owner: Any, name: str) -> Any:
     """An attribute that the policy reads, if that of a stand-in is like that of the real object."""
     kind = type(owner)
     if isinstance(owner, Outside):
-        return Outside(f"{owner._path}.{name}")
+        return type(owner)(f"{owner._path}.{name}")
     if kind is super:
         return _of_base(owner, name)
     if kind is types.ModuleType:
         return getattr(owner, name) if is_users(owner.__name__) else _of_module(owner, name)
-    real: type = owner.__class__  # of which a stand-in may have more
+    real = shown_class(owner)
     if is_stand_in(owner) and not hasattr(real, name):
         raise AttributeError(f"'{real.__name__}' object has no attribute '{name}'")
-    if not _may_read(owner, kind, name) and hasattr(owner, name):
+    if not _may_read(owner, name) and hasattr(owner, name):
         is_format = kind is str and name[:6] == "format"
         stop("writes text with str.format" if is_format else f"reads {name} of a {real.__name__}")
     return getattr(owner, name)
 
 
-def _may_read(owner: Any, kind: type, name: str) -> bool:
+def _may_read(owner: Any, name: str) -> bool:
     if isinstance(owner, type):
         if owner is dict or home_of(owner) == "itertools":
             return name in ("fromkeys", "from_iterable")
         own = any(name in vars(base) for base in owner.__mro__ if is_users(home_of(base)))
-        members = vars(owner).get("_member_map_", ())
-        makes = name in _OF_TUPLES and issubclass(owner, tuple) and owner is not FleetView
-        return own or name in members or makes
-    home = home_of(kind)
-    if is_users(home):
-        return True
-    if home.startswith("sortie."):
-        makes = name in _OF_TUPLES and isinstance(owner, tuple) and not isinstance(owner, FleetView)
-        return name[0] != "_" or makes
-    return may_read(owner, name)
+        return own or name in vars(owner).get("_member_map_", ())
+    return is_users(home_of(type(owner))) or may_read(owner, name)
 
 
 def _of_base(owner: Any, name: str) -> Any:
@@ -252,17 +243,20 @@ def _of_module(module: types.ModuleType, name: str) -> Any:
     if name in NAMED.get(home, ()):
         return found
     if isinstance(found, types.ModuleType):
-        known = found.__name__ == path and (path in NAMED or path in ONLY_TYPES or is_trusted(path))
+        known = found.__name__ == path and (path in NAMED or path in ONLY_TYPES or is_of_policies(path))
         return found if known else Outside(found.__name__)
     if name[0] == "_":
         return Unknown(f"reads {path}")
     if home in ONLY_TYPES:
         is_type = isinstance(found, type | bool) or home_of(type(found)) == "typing"
         return guarded(found) if is_type else Unknown(f"reads {path}")
-    if is_trusted(home):
-        if not isinstance(found, _LASTS_UNCHANGED) and not callable(found):
-            WATCH.sees(path, found)
-        return guarded(found)
+    if is_of_policies(home):
+        if isinstance(found, _LASTS_UNCHANGED) or callable(found):
+            return guarded(found)
+        if name not in TABLES:
+            return Unknown(f"reads {path}")
+        WATCH.sees(path, found)
+        return found
     if home in NAMED and isinstance(found, _LASTS_UNCHANGED):
         return found
     return Unknown(f"calls {path}") if home in PURE_MODULES and path not in IMPURE else Outside(path)
@@ -307,10 +301,7 @@ def _type_of(*args: Any, **kwargs: Any) -> Any:
         stop("makes a class by type(…)")
     if callable(args[0]) and not isinstance(args[0], type):
         stop("asks what kind of function something is")  # Python functions stand for compiled ones
-    if isinstance(args[0], Text):
-        return str
-    shows = is_stand_in(args[0]) or type(args[0]) in WATCHED  # `type` does, `__class__` does not
-    return args[0].__class__ if shows else type(args[0])
+    return shown_class(args[0])
 
 
 def _float(*args: Any) -> Any:
