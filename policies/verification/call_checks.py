@@ -17,7 +17,7 @@ from collections.abc import Callable
 from enum import Enum, EnumType
 from typing import Any
 
-from sortie.policies.contract import looks_from
+from sortie.policies.contract import boxes_across_networks, looks_from
 from sortie.policies.registry import POLICIES
 from sortie.policies.verification.outside import Outside, Unknown
 from sortie.policies.verification.pure import (
@@ -91,7 +91,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     if _is_of_text(function) or not takes_ranges(function):  # what is lazy is asked here, not there
         args = tuple([list(value) if _is_lazy(value) else value for value in args])
     _refuse_arguments(function, args, kwargs)
-    special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
+    is_plain = isinstance(function, type | types.BuiltinFunctionType | types.FunctionType)
+    special = _SPECIAL.get(function) if is_plain else None
     if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
         return found
     found = function(*args, **kwargs)
@@ -103,7 +104,7 @@ def _refuse_to_hand_on(function: Any, args: tuple[Any, ...], kwargs: dict[str, A
     for value in (*args, *kwargs.values()):
         if isinstance(value, Outside):
             value._used()
-        if not callable(value) or function is isinstance:
+        if not callable(value) or function is isinstance or _decorates(function):  # see `_refuse_foreign`
             continue
         _refuse_others(value)
         is_known = value in (isinstance, type, sum) or calls_others(value)
@@ -161,7 +162,7 @@ def _str(*args: Any) -> Any:
     return on_behalf_of_the_policy(str, args, {})
 
 
-_DECORATORS = (dataclasses.dataclass, functools.wraps, abstractmethod, looks_from)
+_DECORATORS = (dataclasses.dataclass, functools.wraps, abstractmethod, looks_from, boxes_across_networks)
 _MADE_BY_THEM = {dataclasses.dataclass().__code__, looks_from(lambda _: None).__code__}
 
 
@@ -180,12 +181,20 @@ def _makes_decorator(function: Any, args: tuple[Any, ...]) -> bool:
 def _refuse_foreign(decorate: Any, given: tuple[Any, ...]) -> None:
     """A decorator may change nothing but the policy's own: that would last until the next decision."""
     for value in given:
-        own = value.__globals__.get("__name__") if type(value) is types.FunctionType else None
+        own = _home_of_function(value) if type(value) is types.FunctionType else None
         is_class = isinstance(value, type) and (
             decorate is dataclasses.dataclass or type(decorate) is types.FunctionType
         )
         if not is_users(home_of(value) if is_class else own):
             stop(f"gives something that is not its own to {getattr(decorate, '__name__', 'a decorator')}")
+
+
+def _home_of_function(function: Any) -> Any:
+    """The module of a function; of one that `_across_networks` made that of the policy's function in it."""
+    inner = getattr(function, "__wrapped__", None)
+    if type(inner) is types.FunctionType and inner.__globals__ is globals():
+        return _home_of_function(inner.__wrapped__)  # type: ignore[attr-defined]
+    return function.__globals__.get("__name__")
 
 
 def _own(owner: Any, name: str) -> Any:
@@ -331,6 +340,19 @@ def _sorted_ids(mapping: Any) -> Any:
     return sorted(mapping)
 
 
+def _across_networks(policy: Any) -> Any:
+    """The decorator, around a function of the policy's that gives Sortie's code nothing but what is listed."""
+
+    @functools.wraps(policy)
+    def decide(*args: Any, **kwargs: Any) -> Any:
+        found = policy(*args, **kwargs)
+        if not _is_for_sortie(found):
+            stop("returns more than directives to boxes_across_networks")
+        return found
+
+    return boxes_across_networks(decide)
+
+
 def _finite(answer: bool) -> Callable[..., Any]:
     return lambda *args: answer if len(args) == 1 and isinstance(args[0], Ranged) else NotImplemented
 
@@ -340,6 +362,7 @@ _SPECIAL: dict[Any, Callable[..., Any]] = {
     type: _type_of, float: _float, int: _rounding("int"), round: _rounding("round"), math.floor: _rounding("floor"),
     math.ceil: _rounding("ceil"), math.trunc: _rounding("int"), math.sqrt: _rounding("sqrt"), sum: _sum,
     sorted: _plain_sorted, math.isfinite: _finite(True), math.isnan: _finite(False), math.isinf: _finite(False), str: text_of,
+    boxes_across_networks: _across_networks,
 }  # fmt: skip
 CHECKS: dict[str, Any] = {
     "__called__": _called, "__own__": _own, "__attribute__": attribute, "__decorator__": _decorator, "__each__": _each,

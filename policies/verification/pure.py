@@ -68,7 +68,7 @@ _KNOWN = {id(getattr(module, name)) for module, names in _FUNCTIONS.items() for 
         RuntimeError,
     )
 }
-_KNOWN |= {id(AssertionError), id(NotImplementedError), id(contract.looks_from)}
+_KNOWN |= {id(AssertionError), id(NotImplementedError), id(contract.looks_from), id(contract.boxes_across_networks)}
 _KNOWN -= {id(kind) for kind in (enum.Enum, enum.IntEnum, abc.ABC, typing.Protocol)}  # classes may derive from these
 _ENUMS = (Representation, contract.TaskPhase, contract.Coverage, link_state.LinkState)
 MADE = (Directive, Disc, Reposition)

@@ -201,6 +201,8 @@ UNLISTED = (
     ("f = functools.partial(Directive(0, 1)._replace, rho=0.5)\nbad = f().rho > 1", "hands on Directive._replace"),
     ("from sortie.policies.catalogue.worked import worked\nbad = len(worked(view, rho=soc)) > 9", "gives worked a parameter that is no plain number"),
     ("import typing\nfrom sortie.scenarios.plain_sum import plain_sum\nclass N(typing.NamedTuple):\n    x: float\n    total = plain_sum\nbad = N(1.0).total() > 9", "makes a method of plain_sum"),
+    (f"{_IMPORT} boxes_across_networks\n@boxes_across_networks\ndef f(v): return []\nbad = len(f(view)) > 9", "calls sortie.policies.contract.f"),
+    (f"{_IMPORT} boxes_across_networks\ndef f(v): return []\nboxes_across_networks(f)", "decorates by a call"),
     ("import typing\nclass N(typing.NamedTuple):\n    x: float\n    total = statistics.mean\nbad = N(1.0).total() > 9", "makes a method of mean"),
 )  # fmt: skip
 """What a policy may not use of Sortie's, and the verdict's words for it."""

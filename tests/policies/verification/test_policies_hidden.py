@@ -77,6 +77,16 @@ def test_what_is_not_listed_of_sorties_is_drawn_and_named(tmp_path: Path, body: 
     assert found.what.startswith(f"Cannot analyse: it {words}")
 
 
+def test_sorties_decorator_gets_nothing_but_directives(tmp_path: Path) -> None:
+    """It would go through a generator by ascending id, and in flight by the order of the view."""
+    head = "from sortie import Directive, boxes_across_networks\n@boxes_across_networks\n"
+    lists = "def decide(view):\n    return [Directive(view.ego, p) for p in sorted(view.age_s) if p != view.ego]\n"
+    assert outcome(tmp_path, head + lists) == "proved"
+    found = verdict(tmp_path, head + lists.replace("[", "(").replace("]", ")"))
+    assert found.outcome != "proved"
+    assert "returns more than directives to boxes_across_networks" in found.what
+
+
 @pytest.mark.parametrize("name", POLICIES)
 def test_policies_may_call_every_registered_one(tmp_path: Path, name: str) -> None:
     home, function = POLICIES[name].__module__, POLICIES[name].__name__
