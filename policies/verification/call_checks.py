@@ -51,6 +51,7 @@ from sortie.policies.verification.value_checks import (
     with_texts,
 )
 from sortie.policies.verification.watch import WATCH, ordered_for, plain_set, reach, stop, unordered
+from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.plugins.user_code import is_users
 
 
@@ -90,6 +91,8 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
         return join(function, list(args[0]))
     if _is_of_text(function) or not takes_ranges(function):  # what is lazy is asked here, not there
         args = tuple([list(value) if _is_lazy(value) else value for value in args])
+    if function is plain_sum:
+        args = tuple([list(value) if type(value) is types.GeneratorType else value for value in args])
     _refuse_arguments(function, args, kwargs)
     is_plain = isinstance(function, type | types.BuiltinFunctionType | types.FunctionType)
     special = _SPECIAL.get(function) if is_plain else None
@@ -318,12 +321,17 @@ def _float(*args: Any) -> Any:
     return x if isinstance(x, Ranged) and isinstance(x, float) else NotImplemented
 
 
+COMPENSATES = sys.version_info >= (3, 12)
+"""Whether `sum` compensates the rounding of floats in this Python."""
+
+
 def _sum(items: Any, /, start: Any = 0) -> Any:
     listed = list(_each(items))
     found = sum(listed, start)
     floats = len(listed) + (type(start) is not int or start != 0)
-    # Two floats have the same sum either way, and the solver follows combined inputs without rounding.
-    if sys.version_info >= (3, 12) and floats > 2 and any(map(is_stand_in, (*listed, found))):
+    over_reals = isinstance(found, Ranged) and not found._path.exact  # without rounding, as the verdict says
+    # Two floats have the same sum either way.
+    if COMPENSATES and floats > 2 and not over_reals and any(map(is_stand_in, (*listed, found))):
         stop("adds up floats with sum(…), which compensates rounding")
     return found
 
