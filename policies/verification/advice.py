@@ -22,6 +22,7 @@ _ADVICE = (
     ("remembers", "decide from the view alone; damping keeps what was decided before"),
     ("changes the global", "decide from the view alone, and keep functions that change globals in another file"),
     ("identity", "compare values with =="),
+    ("with sum(…)", "use sortie.scenarios.plain_sum.plain_sum, which rounds alike in every Python"),
     ("keeps results", "leave the cache away"),
     ("for more than arithmetic", "use comparisons, + - * / with constants, min, max, int, floor, ceil or sqrt"),
     ("not in its view", "decide from the view alone"),

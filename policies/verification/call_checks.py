@@ -17,24 +17,29 @@ from collections.abc import Callable
 from enum import Enum, EnumType
 from typing import Any
 
-from sortie.policies.contract import FleetView, looks_from
+from sortie.policies.contract import boxes_across_networks, looks_from
+from sortie.policies.registry import POLICIES
 from sortie.policies.verification.outside import Outside, Unknown
 from sortie.policies.verification.pure import (
     IMPURE,
+    MADE,
     NAMED,
+    OF_SORTIES,
     ONLY_TYPES,
     PURE_MODULES,
+    TABLES,
     calls_others,
     cannot_call,
     home_of,
-    is_own_cache,
-    is_trusted,
+    is_of_policies,
     may_read,
     reads_stored_text,
+    runs_sorties_code,
+    shown_class,
     takes_ranges,
 )
 from sortie.policies.verification.stand_ins import SORTS, InAnyOrder
-from sortie.policies.verification.symbols import Ranged, Text
+from sortie.policies.verification.symbols import Ranged
 from sortie.policies.verification.value_checks import (
     VALUE_CHECKS,
     are_plain,
@@ -45,7 +50,8 @@ from sortie.policies.verification.value_checks import (
     text_of,
     with_texts,
 )
-from sortie.policies.verification.watch import WATCH, WATCHED, ordered_for, plain_set, reach, stop, unordered
+from sortie.policies.verification.watch import WATCH, ordered_for, plain_set, reach, stop, unordered
+from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.plugins.user_code import is_users
 
 
@@ -85,12 +91,15 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
         return join(function, list(args[0]))
     if _is_of_text(function) or not takes_ranges(function):  # what is lazy is asked here, not there
         args = tuple([list(value) if _is_lazy(value) else value for value in args])
+    if function is plain_sum:
+        args = tuple([list(value) if type(value) is types.GeneratorType else value for value in args])
     _refuse_arguments(function, args, kwargs)
-    special = _SPECIAL.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None
+    is_plain = isinstance(function, type | types.BuiltinFunctionType | types.FunctionType)
+    special = _SPECIAL.get(function) if is_plain else None
     if special is not None and (found := special(*args, **kwargs)) is not NotImplemented:
         return found
     found = function(*args, **kwargs)
-    return checked(with_texts(found) if _is_sorties(function) else found)
+    return checked(with_texts(found) if runs_sorties_code(function) else found)
 
 
 def _refuse_to_hand_on(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
@@ -98,13 +107,13 @@ def _refuse_to_hand_on(function: Any, args: tuple[Any, ...], kwargs: dict[str, A
     for value in (*args, *kwargs.values()):
         if isinstance(value, Outside):
             value._used()
-        if not callable(value) or function is isinstance:
+        if not callable(value) or function is isinstance or _decorates(function):  # see `_refuse_foreign`
             continue
         _refuse_others(value)
-        is_known = value in (isinstance, type, sum) or calls_others(value) or is_own_cache(value)
+        is_known = value in (isinstance, type, sum) or calls_others(value)
         makes = function in (collections.defaultdict, dataclasses.field) or (function is map and len(args) == 2)
         reads = reads_stored_text(value) and not (value is int and makes)
-        others = _is_sorties(value) and not isinstance(value, types.MethodType)
+        others = runs_sorties_code(value) and not is_stand_in(getattr(value, "__self__", None))
         if is_known or reads or others or _decorates(value):
             stop(f"hands on {getattr(value, '__qualname__', value)}")
 
@@ -118,8 +127,10 @@ def _refuse_arguments(function: Any, args: tuple[Any, ...], kwargs: dict[str, An
         stop(f"reads what {name} is given")
     if function is int and any(type(value) is str and len(value) > _LONGEST_TEXT for value in given):
         stop("reads a number in a long text")
-    if _is_sorties(function) and not all(map(_is_for_sortie, given)):
-        stop(f"gives an object of its own to {name}")
+    if runs_sorties_code(function) and not all(map(_is_for_sortie, given)):
+        stop(f"gives more than numbers, texts, lists, tuples and Sortie's objects to {name}")
+    if function in POLICIES.values() and not are_plain(kwargs.values()):
+        stop(f"gives {name} a parameter that is no plain number")  # it may use its text
     if function is isinstance and len(args) == 2 and (why := cannot_ask(args[1])):
         stop(why)
     if _decorates(function):
@@ -141,19 +152,12 @@ def _is_lazy(value: Any) -> bool:
     return not isinstance(value, str | bytes) and hasattr(type(value), "__iter__") and type(value) not in (list, tuple)
 
 
-def _is_sorties(function: Any) -> bool:
-    """Whether this is a function, a method or a class of Sortie's, whose code has no checks."""
-    while isinstance(function, types.MethodType | functools.partial):
-        function = function.__func__ if isinstance(function, types.MethodType) else function.func
-    home = home_of(function) if isinstance(function, type) else str(getattr(function, "__module__", ""))
-    return isinstance(function, type | types.FunctionType) and is_trusted(home) and not _decorates(function)
-
-
 def _is_for_sortie(value: Any) -> bool:
     """Whether Sortie's functions may be given this: they go through it, and write it, as they like."""
-    if type(value) in (list, tuple):
+    kind = type(value)
+    if kind in (list, tuple, *MADE):
         return all(map(_is_for_sortie, value))
-    return are_plain([value]) or (home_of(type(value)).startswith("sortie.") and not isinstance(value, InAnyOrder))
+    return are_plain([value]) or kind in OF_SORTIES or (is_stand_in(value) and kind is not InAnyOrder)
 
 
 def _str(*args: Any) -> Any:
@@ -161,7 +165,7 @@ def _str(*args: Any) -> Any:
     return on_behalf_of_the_policy(str, args, {})
 
 
-_DECORATORS = (dataclasses.dataclass, functools.wraps, abstractmethod, looks_from)
+_DECORATORS = (dataclasses.dataclass, functools.wraps, abstractmethod, looks_from, boxes_across_networks)
 _MADE_BY_THEM = {dataclasses.dataclass().__code__, looks_from(lambda _: None).__code__}
 
 
@@ -180,12 +184,20 @@ def _makes_decorator(function: Any, args: tuple[Any, ...]) -> bool:
 def _refuse_foreign(decorate: Any, given: tuple[Any, ...]) -> None:
     """A decorator may change nothing but the policy's own: that would last until the next decision."""
     for value in given:
-        own = value.__globals__.get("__name__") if type(value) is types.FunctionType else None
+        own = _home_of_function(value) if type(value) is types.FunctionType else None
         is_class = isinstance(value, type) and (
             decorate is dataclasses.dataclass or type(decorate) is types.FunctionType
         )
         if not is_users(home_of(value) if is_class else own):
             stop(f"gives something that is not its own to {getattr(decorate, '__name__', 'a decorator')}")
+
+
+def _home_of_function(function: Any) -> Any:
+    """The module of a function; of one that `_across_networks` made that of the policy's function in it."""
+    inner = getattr(function, "__wrapped__", None)
+    if type(inner) is types.FunctionType and inner.__globals__ is globals():
+        return _home_of_function(inner.__wrapped__)  # type: ignore[attr-defined]
+    return function.__globals__.get("__name__")
 
 
 def _own(owner: Any, name: str) -> Any:
@@ -197,7 +209,6 @@ def _own(owner: Any, name: str) -> Any:
     return owner
 
 
-_OF_TUPLES = frozenset({"_replace", "_asdict", "_make", "_fields"})
 _LASTS_UNCHANGED = (int, float, str, bytes, Enum)
 
 
@@ -205,35 +216,27 @@ def attribute(owner: Any, name: str) -> Any:
     """An attribute that the policy reads, if that of a stand-in is like that of the real object."""
     kind = type(owner)
     if isinstance(owner, Outside):
-        return Outside(f"{owner._path}.{name}")
+        return type(owner)(f"{owner._path}.{name}")
     if kind is super:
         return _of_base(owner, name)
     if kind is types.ModuleType:
         return getattr(owner, name) if is_users(owner.__name__) else _of_module(owner, name)
-    real: type = owner.__class__  # of which a stand-in may have more
+    real = shown_class(owner)
     if is_stand_in(owner) and not hasattr(real, name):
         raise AttributeError(f"'{real.__name__}' object has no attribute '{name}'")
-    if not _may_read(owner, kind, name) and hasattr(owner, name):
+    if not _may_read(owner, name) and hasattr(owner, name):
         is_format = kind is str and name[:6] == "format"
         stop("writes text with str.format" if is_format else f"reads {name} of a {real.__name__}")
     return getattr(owner, name)
 
 
-def _may_read(owner: Any, kind: type, name: str) -> bool:
+def _may_read(owner: Any, name: str) -> bool:
     if isinstance(owner, type):
         if owner is dict or home_of(owner) == "itertools":
             return name in ("fromkeys", "from_iterable")
         own = any(name in vars(base) for base in owner.__mro__ if is_users(home_of(base)))
-        members = vars(owner).get("_member_map_", ())
-        makes = name in _OF_TUPLES and issubclass(owner, tuple) and owner is not FleetView
-        return own or name in members or makes
-    home = home_of(kind)
-    if is_users(home):
-        return True
-    if home.startswith("sortie."):
-        makes = name in _OF_TUPLES and isinstance(owner, tuple) and not isinstance(owner, FleetView)
-        return name[0] != "_" or makes
-    return may_read(owner, name)
+        return own or name in vars(owner).get("_member_map_", ())
+    return is_users(home_of(type(owner))) or may_read(owner, name)
 
 
 def _of_base(owner: Any, name: str) -> Any:
@@ -252,17 +255,20 @@ def _of_module(module: types.ModuleType, name: str) -> Any:
     if name in NAMED.get(home, ()):
         return found
     if isinstance(found, types.ModuleType):
-        known = found.__name__ == path and (path in NAMED or path in ONLY_TYPES or is_trusted(path))
+        known = found.__name__ == path and (path in NAMED or path in ONLY_TYPES or is_of_policies(path))
         return found if known else Outside(found.__name__)
     if name[0] == "_":
         return Unknown(f"reads {path}")
     if home in ONLY_TYPES:
         is_type = isinstance(found, type | bool) or home_of(type(found)) == "typing"
         return guarded(found) if is_type else Unknown(f"reads {path}")
-    if is_trusted(home):
-        if not isinstance(found, _LASTS_UNCHANGED) and not callable(found):
-            WATCH.sees(path, found)
-        return guarded(found)
+    if is_of_policies(home):
+        if isinstance(found, _LASTS_UNCHANGED) or callable(found):
+            return guarded(found)
+        if name not in TABLES:
+            return Unknown(f"reads {path}")
+        WATCH.sees(path, found)
+        return found
     if home in NAMED and isinstance(found, _LASTS_UNCHANGED):
         return found
     return Unknown(f"calls {path}") if home in PURE_MODULES and path not in IMPURE else Outside(path)
@@ -307,10 +313,7 @@ def _type_of(*args: Any, **kwargs: Any) -> Any:
         stop("makes a class by type(…)")
     if callable(args[0]) and not isinstance(args[0], type):
         stop("asks what kind of function something is")  # Python functions stand for compiled ones
-    if isinstance(args[0], Text):
-        return str
-    shows = is_stand_in(args[0]) or type(args[0]) in WATCHED  # `type` does, `__class__` does not
-    return args[0].__class__ if shows else type(args[0])
+    return shown_class(args[0])
 
 
 def _float(*args: Any) -> Any:
@@ -318,12 +321,17 @@ def _float(*args: Any) -> Any:
     return x if isinstance(x, Ranged) and isinstance(x, float) else NotImplemented
 
 
+COMPENSATES = sys.version_info >= (3, 12)
+"""Whether `sum` compensates the rounding of floats in this Python."""
+
+
 def _sum(items: Any, /, start: Any = 0) -> Any:
     listed = list(_each(items))
     found = sum(listed, start)
     floats = len(listed) + (type(start) is not int or start != 0)
-    # Two floats have the same sum either way, and the solver follows combined inputs without rounding.
-    if sys.version_info >= (3, 12) and floats > 2 and any(map(is_stand_in, (*listed, found))):
+    over_reals = isinstance(found, Ranged) and not found._path.exact  # without rounding, as the verdict says
+    # Two floats have the same sum either way.
+    if COMPENSATES and floats > 2 and not over_reals and any(map(is_stand_in, (*listed, found))):
         stop("adds up floats with sum(…), which compensates rounding")
     return found
 
@@ -340,6 +348,19 @@ def _sorted_ids(mapping: Any) -> Any:
     return sorted(mapping)
 
 
+def _across_networks(policy: Any) -> Any:
+    """The decorator, around a function of the policy's that gives Sortie's code nothing but what is listed."""
+
+    @functools.wraps(policy)
+    def decide(*args: Any, **kwargs: Any) -> Any:
+        found = policy(*args, **kwargs)
+        if not _is_for_sortie(found):
+            stop("returns more than directives to boxes_across_networks")
+        return found
+
+    return boxes_across_networks(decide)
+
+
 def _finite(answer: bool) -> Callable[..., Any]:
     return lambda *args: answer if len(args) == 1 and isinstance(args[0], Ranged) else NotImplemented
 
@@ -349,6 +370,7 @@ _SPECIAL: dict[Any, Callable[..., Any]] = {
     type: _type_of, float: _float, int: _rounding("int"), round: _rounding("round"), math.floor: _rounding("floor"),
     math.ceil: _rounding("ceil"), math.trunc: _rounding("int"), math.sqrt: _rounding("sqrt"), sum: _sum,
     sorted: _plain_sorted, math.isfinite: _finite(True), math.isnan: _finite(False), math.isinf: _finite(False), str: text_of,
+    boxes_across_networks: _across_networks,
 }  # fmt: skip
 CHECKS: dict[str, Any] = {
     "__called__": _called, "__own__": _own, "__attribute__": attribute, "__decorator__": _decorator, "__each__": _each,

@@ -17,7 +17,7 @@ from sortie.policies.verification.call_checks import CHECKS, attribute, guarded
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import Kept, kept_by
 from sortie.policies.verification.outside import Outside
-from sortie.policies.verification.pure import PURE_MODULES, is_trusted
+from sortie.policies.verification.pure import PURE_MODULES, is_of_policies
 from sortie.policies.verification.source_checks import compiled
 from sortie.policies.verification.symbols import Refused
 from sortie.policies.verification.watch import WATCH, stop
@@ -96,7 +96,7 @@ def _builtins(find: Callable[..., Any]) -> dict[str, Any]:
             if module.__file__ and not module.__file__.endswith(".py"):
                 stop(f"imports compiled code ({File(module.__file__).name})")
             return module
-        if is_trusted(home) or home.partition(".")[0] in PURE_MODULES:
+        if is_of_policies(home) or home.partition(".")[0] in PURE_MODULES:
             return _Names(module, wanted) if wanted else module
         return Outside(home)
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Any, NamedTuple
 
-from sortie.policies.verification.pure import home_of, is_own_cache
+from sortie.policies.verification.pure import home_of
 from sortie.policies.verification.symbols import Refused
 from sortie.scenarios.plugins.user_code import is_users, modules_with
 
@@ -149,11 +149,7 @@ def _parts(value: Any) -> list[Any]:
         return [value.fget, value.fset, value.fdel]
     if kind is operator.itemgetter:
         return [value.__reduce__()]
-    if (
-        kind in (types.GenericAlias, types.UnionType, enum.property)
-        or home_of(kind) in _UNCHANGING
-        or is_own_cache(value)
-    ):
+    if kind in (types.GenericAlias, types.UnionType, enum.property) or home_of(kind) in _UNCHANGING:
         return []
     raise Refused(f"keeps a {kind.__name__} from one decision to the next")
 

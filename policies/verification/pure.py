@@ -19,11 +19,19 @@ import sys
 import types
 import typing
 import zlib
-from enum import Enum
 from typing import Any
 
-from sortie.policies.contract import FleetView
+from sortie.policies import contract
+from sortie.policies.catalogue.prior.full import full_sharing
+from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Reposition, Roster
+from sortie.policies.geometry import footprint_overlap, peers_by_overlap
+from sortie.policies.registry import POLICIES
+from sortie.policies.verification.symbols import Text
+from sortie.scenarios import link_state
+from sortie.scenarios.disc import disc_overlap
+from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.plugins.user_code import PREFIX, is_users
+from sortie.scenarios.representation import Representation
 
 _FUNCTIONS: dict[types.ModuleType, str] = {
     builtins: "abs all any bool bytes chr dict divmod enumerate filter float frozenset int isinstance iter len list map max "
@@ -60,8 +68,22 @@ _KNOWN = {id(getattr(module, name)) for module, names in _FUNCTIONS.items() for 
         RuntimeError,
     )
 }
-_KNOWN |= {id(AssertionError), id(NotImplementedError)}
+_KNOWN |= {id(AssertionError), id(NotImplementedError), id(contract.looks_from), id(contract.boxes_across_networks)}
 _KNOWN -= {id(kind) for kind in (enum.Enum, enum.IntEnum, abc.ABC, typing.Protocol)}  # classes may derive from these
+_ENUMS = (Representation, contract.TaskPhase, contract.Coverage, link_state.LinkState)
+MADE = (Directive, Disc, Reposition)
+"""Sortie's named tuples that a policy may make."""
+_SORTIES = {
+    id(function)
+    for function in (
+        *MADE, *_ENUMS, contract.nothing, contract.nothing_to_all, full_sharing, footprint_overlap, peers_by_overlap,
+        disc_overlap, plain_sum, link_state.state_of, link_state.is_tried, link_state.probed_mbps, link_state.heard_share,
+        *POLICIES.values(),
+    )
+}  # fmt: skip
+"""Sortie's functions and classes that a policy may call."""
+TABLES = frozenset({"BOXES", "CELLS", "MAPS", "NAME_OF", "PHASE_NAMES", "PHASE_OF", "REPRESENTATION_OF"})
+"""Sortie's tables that a policy may read. Of its other names a policy may read numbers, texts and enums."""
 ONLY_TYPES = frozenset({"typing", "collections.abc", "types"})
 """Modules of which a policy may name everything, for annotations."""
 _OF_DICTS = "clear copy get items keys pop popitem setdefault update values"
@@ -94,8 +116,24 @@ METHODS: dict[type, frozenset[str]] = {
     }.items()
 }
 """What a policy may read of objects of Python's own classes."""
+_OF_VIEWS = "attached full_sharing_maps human_in_region me members peers roster shares_codes_with shares_features_with"
+OF_SORTIES: dict[type, frozenset[str]] = {
+    **{kind: frozenset({"_replace", *kind._fields}) for kind in MADE},
+    **{
+        kind: frozenset({*kind._fields, *others.split()})
+        for kind, others in (
+            (FleetView, _OF_VIEWS),
+            (Descriptor, "counts coverage_corner goodput_by_id goodput_to link_state"),
+            (Roster, "slot"),
+        )
+    },
+    **dict.fromkeys(_ENUMS, frozenset({"name", "value"})),
+    Representation: frozenset({"level", "name", "value"}),
+}
+"""What a policy may read of objects of Sortie's classes."""
+METHODS |= OF_SORTIES
 _OF_HASHES = frozenset({"digest", "hexdigest", "update"})
-_TRUSTED = (
+_OF_POLICIES = (
     "sortie.policies.contract", "sortie.policies.geometry", "sortie.policies.catalogue", "sortie.scenarios.disc",
     "sortie.scenarios.link_state", "sortie.scenarios.plain_sum", "sortie.scenarios.representation",
 )  # fmt: skip
@@ -127,8 +165,23 @@ def home_of(kind: type) -> str:
 
 
 def is_known(function: Any) -> bool:
-    """Whether this is a function or a class of Python's that a policy may call."""
-    return id(function) in _KNOWN
+    """Whether this is a function or a class of Python's or Sortie's that a policy may call."""
+    return id(function) in _KNOWN or id(function) in _SORTIES
+
+
+def runs_sorties_code(function: Any) -> bool:
+    """Whether a call of what a policy may call runs a function, a method or a class of Sortie's, which has no checks."""
+    return id(function) in _SORTIES or (
+        type(function) is types.MethodType and shown_class(function.__self__) in OF_SORTIES
+    )
+
+
+def shown_class(value: object) -> type:
+    """The class of an object; of a stand-in that of the real object."""
+    kind = type(value)
+    if kind is Text:
+        return str
+    return value.__class__ if home_of(kind).startswith("sortie.policies.verification.") else kind
 
 
 def is_hash(value: object) -> bool:
@@ -136,8 +189,8 @@ def is_hash(value: object) -> bool:
 
 
 def may_read(value: object, name: str) -> bool:
-    """Whether a policy may read an attribute of an object of Python's own classes."""
-    return name in METHODS.get(type(value), ()) or (name in _OF_HASHES and is_hash(value))
+    """Whether a policy may read an attribute of an object of Python's or Sortie's classes."""
+    return name in METHODS.get(shown_class(value), ()) or (name in _OF_HASHES and is_hash(value))
 
 
 def reads_stored_text(function: Any) -> bool:
@@ -157,29 +210,9 @@ def calls_others(function: Any) -> bool:
     return function in CALL_OTHERS or (isinstance(function, type) and home_of(function) == "itertools")
 
 
-def is_trusted(home: str) -> bool:
-    """Whether a module is one of Sortie's that policies are made of."""
-    return home in ("sortie", "sortie.policies") or home.startswith(_TRUSTED)
-
-
-def is_own_cache(value: Any) -> bool:
-    """Whether this is a function of Sortie's own that keeps results (`functools.cache`)."""
-    return hasattr(value, "cache_info") and is_trusted(str(value.__module__))
-
-
-def is_cache_key(value: Any) -> bool:
-    """Whether a cache may keep this as an argument: a plain number or text, a stand-in, or a tuple of these.
-
-    No two of them are equal and of different types, so that no argument gets what was kept for another one.
-    """
-    if isinstance(value, tuple | frozenset):
-        members = (frozenset if isinstance(value, frozenset) else tuple).__iter__(value)  # type: ignore[arg-type]
-        return not is_users(home_of(type(value))) and all(map(is_cache_key, members))
-    return type(value) in (int, str, bytes) or (
-        home_of(type(value)).startswith("sortie.")
-        and isinstance(value, int | float | str)
-        and not isinstance(value, Enum)
-    )
+def is_of_policies(home: str) -> bool:
+    """Whether a module is one of Sortie's that policies are made of. It may be imported; what may be used of it is listed."""
+    return home in ("sortie", "sortie.policies") or home.startswith(_OF_POLICIES)
 
 
 def is_seeded(path: str) -> bool:
@@ -204,17 +237,19 @@ def cannot_call(function: Any) -> str | None:
     if kind is types.BuiltinFunctionType:
         return _compiled_function(function)
     if kind is types.MethodType:
-        may = _is_tuple_method(function) or may_read(function.__self__, function.__name__)
-        return None if may else cannot_call(function.__func__)
+        if _is_tuple_method(function) or may_read(function.__self__, function.__name__):
+            return None
+        of_others = is_known(function.__func__)  # which would get the policy's object unseen
+        return f"makes a method of {function.__func__.__name__}" if of_others else cannot_call(function.__func__)
     if isinstance(function, type):
         home = home_of(function)
         if function is FleetView:
             return "makes a view of its own"
-        return None if is_users(home) or is_trusted(home) else _unknown(home, function.__name__)
+        return None if is_users(home) else _unknown(home, function.__name__)
     if kind is functools.partial:
         return cannot_call(function.func)
     if hasattr(function, "cache_info"):
-        return None if is_own_cache(function) else "keeps results (functools.cache)"
+        return "keeps results (functools.cache)"
     home = home_of(kind)
     if is_users(home) or kind is operator.itemgetter or home.startswith("sortie.policies.verification"):
         return None  # a stand-in that is called raises what the real object raises
@@ -222,8 +257,8 @@ def cannot_call(function: Any) -> str | None:
 
 
 def _python_function(function: Any) -> str | None:
-    home = str(function.__module__)
-    if is_users(home) or is_trusted(home) or home.startswith("sortie.policies.verification"):
+    home = str(function.__globals__.get("__name__"))
+    if is_users(home) or home.startswith("sortie.policies.verification"):
         return None  # the last: a method of a stand-in, which refuses what it cannot answer
     path = f"{home}.{function.__name__}"
     if is_seeded(path):
@@ -240,7 +275,7 @@ def _compiled_function(function: Any) -> str | None:
     if may_read(owner, name) or owner is dict or owner is itertools.chain:
         return None
     home = home_of(type(owner))
-    if home.startswith("sortie.") or (is_users(home) and type(owner).__mro__[1] is tuple):
+    if is_users(home) and type(owner).__mro__[1] is tuple:
         return None
     return _unknown(home, f"{type(owner).__name__}.{name}")
 
@@ -249,16 +284,15 @@ def _unknown(home: str, name: str) -> str:
     top = home.partition(".")[0]
     if home == "builtins":
         return f"calls {name}(…)"
-    return f"{'calls ' if top in PURE_MODULES else '!'}{home}.{name}"
+    return f"{'calls ' if top in PURE_MODULES or is_of_policies(home) else '!'}{home}.{name}"
 
 
 def _is_tuple_method(function: Any) -> bool:
-    """Whether this is `_replace`, `_make` or `_asdict` of a named tuple."""
+    """Whether this is `_replace`, `_make` or `_asdict` of a named tuple of the policy's."""
     owner = getattr(function, "__self__", None)
     kind = owner if isinstance(owner, type) else type(owner)
-    return (
-        issubclass(kind, tuple) and hasattr(kind, "_fields") and function.__name__ in ("_replace", "_make", "_asdict")
-    )
+    names = ("_replace", "_make", "_asdict")
+    return issubclass(kind, tuple) and is_users(home_of(kind)) and function.__name__ in names
 
 
 PURE_MODULES = frozenset({

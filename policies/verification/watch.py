@@ -11,7 +11,6 @@ from typing import Any, NoReturn
 
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import fingerprint
-from sortie.policies.verification.pure import is_cache_key, is_own_cache
 from sortie.policies.verification.symbols import Path, Refused
 
 
@@ -154,8 +153,6 @@ def ordered_for(
 
     `text` is what others call in place of `str`.
     """
-    if is_own_cache(function) and not all(map(is_cache_key, (*args, *kwargs.values()))):
-        stop(f"gives {function.__name__} something that it keeps from one decision to the next")
     # Equal keys would show the order, and so do several sets, or a default that is one.
     is_blind = any(function is f for f in _BLIND) and len(args) == 1 and not kwargs.keys() - {"reverse"}
     called_at = _CALLS_AT.get(function) if isinstance(function, type | types.BuiltinFunctionType) else None

@@ -187,6 +187,8 @@ def _syntax(text: str, row: int, first_line: int, error: yaml.MarkedYAMLError) -
     lines = text.splitlines()
     if row < len(lines) and "\t" in lines[row][: len(lines[row]) - len(lines[row].lstrip())]:
         return "a tab indents this line, must be spaces"
+    if "nesting depth" in (error.problem or ""):  # libyaml 0.2.6 on has a limit of its own, far beyond this one
+        return f"{MAX_DEPTH + 1} levels deep, must be at most {MAX_DEPTH}"
     context = f" {error.context}" if error.context else ""
     begun = error.context_mark.line if error.context_mark else row
     since = f" from line {first_line + begun}" if first_line and begun != row else ""

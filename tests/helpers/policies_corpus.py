@@ -771,6 +771,8 @@ CORRECT_FILES = {
     "most common": "from collections import Counter\ndef decide(view):\n    best = Counter(1 if view.me and view.me.goodput_to(p) > 5 else 2 for p in view.peers).most_common(1)\n    return usual(view, float(best[0][0]) if best else 1.0)",
     "numbers of its own": "import statistics\nRATES = (2.0, 4.0)\nMEAN = statistics.mean(RATES)\ndef decide(view):\n    return usual(view, MEAN)",
     "wrapped catalogue": "from sortie.policies.catalogue.worked import worked\ndef decide(view):\n    return [d._replace(rate_hz=min(d.rate_hz, 9.0), reason=f'capped: {d.reason}') for d in worked(view)]",
+    "viewpoint": "from sortie import Reposition, looks_from\ndef near(view):\n    return None if view.me is None or view.me.region is None else Reposition(view.me.region.x_m, view.me.region.y_m)\n@looks_from(near)\ndef decide(view):\n    return usual(view)",
+    "other networks": "from sortie import FleetView, boxes_across_networks, looks_from\n@looks_from(lambda view: None)\n@boxes_across_networks\ndef decide(view: FleetView, *, rho: float = 0.5):\n    return [d._replace(rho=rho, representation=Representation.FEATURES) for d in usual(view)]",
     "table": "TABLE = [(0.6, 10.0), (0.3, 5.0), (0.0, 2.0)]\ndef decide(view):\n    if view.me is None: return []\n    return usual(view, next(rate for limit, rate in TABLE if view.me.battery_soc >= limit))",
 }  # fmt: skip
 

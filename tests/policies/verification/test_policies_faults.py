@@ -24,6 +24,7 @@ from sortie.scenarios.plugins.user_calls import ProgramExitError
 pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # a planted `__del__` is refused
     pytest.mark.filterwarnings("ignore::SyntaxWarning"),
+    pytest.mark.filterwarnings("ignore:Bitwise inversion:DeprecationWarning"),  # from Python 3.12 on
 ]
 FAULTS = {"whole": whole, "sliver": sliver, "stand in": stand_in, "memory": memory, "returned": returned}
 SAMPLE = range(8)

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 from policies_corpus import LINE, source
-from policies_hidden import HARMLESS, KEPT, LATER, ORDERS, TEXTS, UNSEEN, K
+from policies_hidden import HARMLESS, KEPT, LATER, LISTED, ORDERS, TEXTS, UNLISTED, UNSEEN, K
 
 from sortie.policies.contract import PHASE_OF, FleetView
-from sortie.policies.registry import resolve
+from sortie.policies.registry import POLICIES, resolve
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.kept import Kept
 from sortie.policies.verification.own_constants import views_at
-from sortie.policies.verification.proof import prove
+from sortie.policies.verification.proof import ProofVerdict, prove
 from sortie.scenarios.plugins.user_calls import ProgramExitError, watched
 from sortie.scenarios.plugins.user_code import load
 
@@ -22,9 +22,13 @@ pytestmark = pytest.mark.filterwarnings("ignore::SyntaxWarning")
 
 
 def outcome(folder: Path, text: str) -> str:
+    return verdict(folder, text).outcome
+
+
+def verdict(folder: Path, text: str) -> ProofVerdict:
     path = folder / "policy.py"
     path.write_text(text)
-    return prove(resolve(f"{path}:decide"), parse(LINE), max_drones=2, views=0)[-1].outcome
+    return prove(resolve(f"{path}:decide"), parse(LINE), max_drones=2, views=0)[-1]
 
 
 @pytest.mark.parametrize("body", [*TEXTS, *ORDERS, *UNSEEN])
@@ -66,7 +70,31 @@ def test_what_changes_is_noticed_wherever_a_function_keeps_it(tmp_path: Path, ke
     assert kept.changed() == "changes it"
 
 
-@pytest.mark.parametrize("body", HARMLESS)
+@pytest.mark.parametrize(("body", "words"), UNLISTED)
+def test_what_is_not_listed_of_sorties_is_drawn_and_named(tmp_path: Path, body: str, words: str) -> None:
+    found = verdict(tmp_path, source(f"{body}\nbad = bad or soc > 2"))
+    assert found.outcome == "drawn"
+    assert found.what.startswith(f"Cannot analyse: it {words}")
+
+
+def test_sorties_decorator_gets_nothing_but_directives(tmp_path: Path) -> None:
+    """It would go through a generator by ascending id, and in flight by the order of the view."""
+    head = "from sortie import Directive, boxes_across_networks\n@boxes_across_networks\n"
+    lists = "def decide(view):\n    return [Directive(view.ego, p) for p in sorted(view.age_s) if p != view.ego]\n"
+    assert outcome(tmp_path, head + lists) == "proved"
+    found = verdict(tmp_path, head + lists.replace("[", "(").replace("]", ")"))
+    assert found.outcome != "proved"
+    assert "returns more than directives to boxes_across_networks" in found.what
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_policies_may_call_every_registered_one(tmp_path: Path, name: str) -> None:
+    home, function = POLICIES[name].__module__, POLICIES[name].__name__
+    found = verdict(tmp_path, f"from {home} import {function}\ndef decide(view):\n    return {function}(view)\n")
+    assert " calls " not in found.what
+
+
+@pytest.mark.parametrize("body", [*HARMLESS, *LISTED])
 def test_the_same_words_in_correct_policies_stay_proved(tmp_path: Path, body: str) -> None:
     assert outcome(tmp_path, source(body)) == "proved"
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from sortie.policies.registry import resolve
+from sortie.policies.verification import call_checks
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import ProofVerdict, prove
 
@@ -107,3 +108,19 @@ def test_faults_where_inputs_are_combined_are_found(name: str, tmp_path: Path) -
 def test_what_the_reals_do_not_show_is_not_proved_exactly(name: str, tmp_path: Path) -> None:
     body = f"{BEYOND[name]}\nreturn [to(view, p, 20.0 if bad else 2.0) for p in view.peers]"
     assert verdict(tmp_path, body).outcome in ("drawn", "refuted", "proved over the reals")
+
+
+@pytest.mark.parametrize("compensates", [False, True])
+def test_sums_are_proved_where_the_rounding_of_this_python_is_no_part_of_the_proof(
+    compensates: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From Python 3.12 on `sum` compensates the rounding of floats, which a search of single inputs does not follow."""
+    monkeypatch.setattr(call_checks, "COMPENSATES", compensates)
+    assert verdict(tmp_path, NATURAL["mean charge"][1]).outcome == "proved over the reals"
+    fast = "return [to(view, p, 20.0 if {sum}([me.battery_soc, 0.1, 0.2]) > 1.5 else 2.0) for p in view.peers]"
+    one = verdict(tmp_path, fast.format(sum="sum"))
+    assert one.outcome == ("drawn" if compensates else "proved")
+    assert ("use sortie.scenarios.plain_sum" in one.what) == compensates
+    plain = f"from sortie.scenarios.plain_sum import plain_sum\n{fast.format(sum='plain_sum')}"
+    assert verdict(tmp_path, plain).outcome == "proved"
+    assert verdict(tmp_path, plain.replace("[me", "x for x in [me")).outcome == "proved"  # a generator
