@@ -91,6 +91,7 @@ _LEAVES = (
     _TUPLE_FIELD,
     types.MemberDescriptorType,
 )
+_OF_TYPES = (types.GenericAlias, types.UnionType)
 _DICTS = (dict, types.MappingProxyType, collections.OrderedDict, collections.defaultdict, collections.Counter)
 
 
@@ -123,7 +124,9 @@ def _fingerprint(value: Any, met: dict[int, tuple[int, Any]]) -> Any:
         owner = value.__self__
         of = owner.__name__ if isinstance(owner, types.ModuleType) else _fingerprint(owner, met)
         return kind.__name__, value.__name__, of
-    return kind.__name__, id(value), tuple([_fingerprint(v, met) for v in _parts(value)])
+    # an object that is gone may leave its place to one with other code or types
+    itself = value.__code__ if kind is types.FunctionType else value if kind in _OF_TYPES else None
+    return kind.__name__, id(value), itself, tuple([_fingerprint(v, met) for v in _parts(value)])
 
 
 def _parts(value: Any) -> list[Any]:
@@ -149,7 +152,7 @@ def _parts(value: Any) -> list[Any]:
         return [value.fget, value.fset, value.fdel]
     if kind is operator.itemgetter:
         return [value.__reduce__()]
-    if kind in (types.GenericAlias, types.UnionType, enum.property) or home_of(kind) in _UNCHANGING:
+    if kind in (*_OF_TYPES, enum.property) or home_of(kind) in _UNCHANGING:
         return []
     raise Refused(f"keeps a {kind.__name__} from one decision to the next")
 

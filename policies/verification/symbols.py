@@ -266,7 +266,8 @@ class Ranged:
         """The number after one more step, which must be monotone and stay finite."""
         found = Ranged(self._path, self._axis, (*self._steps, (step, c)))
         try:
-            sound = all(math.isfinite(found._at(x)) for x in self._path.ranges[self._axis])
+            ends = [abs(found._at(x)) for x in self._path.ranges[self._axis]]
+            sound = all(map(math.isfinite, ends)) and (step != "whole times" or max(ends) < _WHOLE)
         except (ArithmeticError, ValueError):
             sound = False
         if not sound:
@@ -430,6 +431,8 @@ for _method in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} -
 
 MARK = "\ue000"
 """Stands in a text where Sortie's own code wrote a number with a range."""
+_WHOLE = 2.0**40
+"""Up to here Python's `//` of floats is monotone: it rounds a quotient before it takes its whole part."""
 _EXACT = 2.0**53
 """Up to here every whole number is a float."""
 

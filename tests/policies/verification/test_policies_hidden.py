@@ -111,3 +111,49 @@ def test_a_policy_that_ends_the_process_is_broken(tmp_path: Path, end: str) -> N
 def test_views_at_constants_have_floats_as_in_flight() -> None:
     for view in views_at({0.0, 1.0}, 0, 40):
         assert all(type(d.battery_soc) is float for d in view.descriptors.values())
+
+
+RANKED_TWICE = (
+    "near = 1.2370368 < soc * 3 < 1.2370374\n"
+    "if near and len(peers_by_overlap(view, view.ego)) + len(peers_by_overlap(view, view.peers[0])) > 0:\n    "
+)
+"""In a sliver that no constant names, and in runs of which the search places no plain view to decide again."""
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "rows = []\ndef g():\n    for k in range(3):\n        rows.append(k)\n        yield rows\nbad = len(sum(g(), [])) != 9",
+        "n = []\ndef g():\n    for k in (1, 300, 2):\n        n.append(k)\n        yield k\ntry:\n    bytes(g())\n"
+        "except ValueError:\n    bad = len(n) == 2",
+        "n = []\ndef g():\n    for k in (1.0, -1.0, 2.0):\n        n.append(k)\n        yield k\ntry:\n"
+        "    statistics.geometric_mean(g())\nexcept ValueError:\n    bad = len(n) == 2",
+        "n = []\ndef g(t):\n    for k in (1.0, 3.0):\n        n.append(t)\n        yield k\nstatistics.fmean(g('a'), g('b'))\n"
+        "bad = n[0] == 'b'",
+        "kind = type(iter({1}))\nbad = kind is not type(x for x in ())",
+        "try:\n    statistics.harmonic_mean({5.0: 'x'})\nexcept KeyError:\n    bad = True",
+        "', '.join([f'{soc:.2f}', 7])",
+    ],
+)
+def test_what_compiled_code_asks_in_its_own_order_is_not_proved(tmp_path: Path, body: str) -> None:
+    assert outcome(tmp_path, source(RANKED_TWICE + body.replace("\n", "\n    "))) in ("drawn", "searched", "refuted")
+
+
+def test_a_function_in_the_place_of_another_one_is_memory(tmp_path: Path) -> None:
+    """The new function gets the address that the old one had."""
+    body = (
+        "if soc * 3 > 1.2370377 or soc * 3 < 1.2370365:\n    if KEYS['rank']() > 10.0:\n        del KEYS['rank']\n"
+        "        KEYS['rank'] = lambda: 2.0\n"
+        "elif soc * 3 >= 1.2370371:\n    del KEYS['rank']\n    KEYS['rank'] = lambda: 20.0\nelse:\n    bad = KEYS['rank']() > 10.0"
+    )
+    text = source(body).replace("STATE = ", "KEYS = {'rank': lambda: 2.0}\nSTATE = ", 1)
+    assert outcome(tmp_path, text) in ("drawn", "searched", "refuted")
+
+
+def test_a_large_floor_quotient_is_not_monotone_and_not_proved(tmp_path: Path) -> None:
+    c = -1.6653345369377348e-16
+    assert [0.5049018169110862 // c, 0.5049018169110863 // c, 0.5049018169110864 // c] == [
+        -3031834179332607.0, -3031834179332606.0, -3031834179332607.0,
+    ]  # fmt: skip
+    assert outcome(tmp_path, source(f"bad = soc // {c!r} > 0")) == "drawn"
+    assert outcome(tmp_path, source("bad = soc // 0.25 > 4")) == "proved"
