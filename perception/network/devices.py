@@ -6,7 +6,7 @@ import torch
 
 
 def device_named(name: str | None) -> torch.device:
-    """ "cpu", "cuda", or one of several as in "cuda:1"; "auto" or left out, cuda where there is one.
+    """The device of a name: "cpu", "cuda", or one of several GPUs as in "cuda:1". With "auto" or None, a GPU where there is one.
 
     Raises:
         ValueError: there is none of that name here.
@@ -20,7 +20,7 @@ def device_named(name: str | None) -> torch.device:
 
 
 def measuring_device(name: str | None) -> torch.device:
-    """As `device_named`; a GPU then computes in whole float32, and in the same order each time, in this process."""
+    """As `device_named`. In this process a GPU then computes in whole float32, and in the same order each time."""
     device = device_named(name)
     if device.type == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # 10 bits of mantissa would move boxes by centimetres
@@ -29,5 +29,5 @@ def measuring_device(name: str | None) -> torch.device:
 
 
 def gpu_name(device: torch.device) -> str:
-    """What the maker calls a GPU; empty for a processor."""
+    """What the maker calls a GPU; empty for a CPU."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else ""

@@ -157,7 +157,7 @@ def _crowded(control: str, senders: int) -> list[Transmission]:
 def test_collisions_cost_some_rate_and_nothing_else() -> None:
     """What collided counts as lost, at whatever rate: the control sinks below the ideal, but not to the bottom.
 
-    Over twelve seeds the mean is 9.7 with two drones and 9.6 with twelve; a seed's own lies within 1.5 of that.
+    Two drones collide often enough for it; with twelve the mean is no further from the ideal than chance moves it.
     """
     late = {n: [r for r in _crowded("minstrel", n) if r.t_sent_s > 3.0] for n in (2, 12)}
     mean = {n: np.mean([r.mcs for r in rows]) for n, rows in late.items()}
