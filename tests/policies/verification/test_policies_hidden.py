@@ -139,6 +139,16 @@ def test_what_compiled_code_asks_in_its_own_order_is_not_proved(tmp_path: Path, 
     assert outcome(tmp_path, source(RANKED_TWICE + body.replace("\n", "\n    "))) in ("drawn", "searched", "refuted")
 
 
+def test_an_own_enum_of_whole_numbers_is_plain(tmp_path: Path) -> None:
+    text = source("bad = (Level.HIGH if soc > 0.5 else Level.LOW) > 8 or soc * Level.LOW > 2")
+    assert (
+        outcome(
+            tmp_path, text.replace("STATE = ", "class Level(enum.IntEnum):\n    LOW = 2\n    HIGH = 8\nSTATE = ", 1)
+        )
+        == "proved"
+    )
+
+
 def test_a_function_in_the_place_of_another_one_is_memory(tmp_path: Path) -> None:
     """The new function gets the address that the old one had."""
     body = (
