@@ -291,11 +291,15 @@ def guarded(found: Any) -> Any:
     return Outside(why[1:]) if why[0] == "!" else Unknown(why)
 
 
-def _decorator(found: Any) -> Any:
-    """A decorator where it stands: what it is given has just been made."""
+def _decorator(found: Any, is_first: bool) -> Any:
+    """A decorator where it stands. The first one is given what has just been made; another one may be given something older."""
 
     def decorate(made: Any) -> Any:
-        return on_behalf_of_the_policy(found, (made,), {}) if _decorates(found) else _called(found, made)
+        if not _decorates(found):
+            return _called(found, made)
+        if not (is_first or WATCH.is_loading):
+            stop("decorates what another decorator returns")
+        return on_behalf_of_the_policy(found, (made,), {})
 
     return decorate
 

@@ -96,12 +96,12 @@ class Checks(ast.NodeTransformer):
         returns, node.returns = node.returns, None
         self.generic_visit(node)
         node.returns = returns
-        node.decorator_list = [_call("__decorator__", d) for d in node.decorator_list]
+        node.decorator_list = _decorators(node)
         return node
 
     def visit_ClassDef(self, node: ast.ClassDef) -> Any:
         self.generic_visit(node)
-        node.decorator_list = [*(_call("__decorator__", d) for d in node.decorator_list), _name("__made__")]
+        node.decorator_list = [*_decorators(node), _name("__made__")]
         return node
 
     def visit_ExceptHandler(self, node: ast.ExceptHandler) -> ast.AST:
@@ -157,6 +157,11 @@ class Checks(ast.NodeTransformer):
 
     def visit_arg(self, node: ast.arg) -> Any:
         return node  # with its annotation, which is made of types alone
+
+
+def _decorators(node: ast.FunctionDef | ast.ClassDef) -> list[ast.expr]:
+    """The decorators, each with whether it gets what stands below it, and not what another decorator made of that."""
+    return [_call("__decorator__", d, ast.Constant(d is node.decorator_list[-1])) for d in node.decorator_list]
 
 
 def _unpacks(target: ast.expr) -> bool:

@@ -149,6 +149,23 @@ def test_an_own_enum_of_whole_numbers_is_plain(tmp_path: Path) -> None:
     )
 
 
+def test_a_decorator_that_changes_an_older_class_is_not_proved(tmp_path: Path) -> None:
+    """`replace` takes a field from then on, which it refused before. Nothing else shows the change."""
+    head = (
+        "@dataclasses.dataclass(init=False, eq=False, repr=False)\nclass Old:\n"
+        "    x: int = dataclasses.field(init=False, default=0)\n    def __init__(self, x=0):\n        pass\n"
+        "def give(kind):\n    return Old\n"
+    )
+    body = (
+        "if view.ego == 1:\n    if soc * 3 < 1.2370371:\n        try:\n            dataclasses.replace(Old(), x=1)\n"
+        "            bad = soc * 3 > 1.2370365\n        except ValueError:\n            pass\n    elif soc * 3 < 1.2370377:\n"
+        "        @dataclasses.dataclass(init=False, eq=False, repr=False)\n        @give\n        class New:\n            pass"
+    )
+    found = verdict(tmp_path, source(body).replace("STATE = ", f"{head}STATE = ", 1))
+    assert found.outcome == "drawn"
+    assert "decorates what another decorator returns" in found.what
+
+
 def test_a_function_in_the_place_of_another_one_is_memory(tmp_path: Path) -> None:
     """The new function gets the address that the old one had."""
     body = (
