@@ -6,18 +6,19 @@ import ast
 import types
 from typing import Any
 
+from sortie.policies.verification.notes import NOTED, Notes
 from sortie.policies.verification.plain import refuse_other_python
 
 
 def compiled(source: bytes, path: str) -> types.CodeType:
-    """The code of a policy's source, with the checks.
+    """The code of a policy's source, with the checks and with notes.
 
     Raises:
         SyntaxError: it is not plain Python (`plain`).
     """
     tree = ast.parse(source, path)
     refuse_other_python(tree)
-    checked = ast.fix_missing_locations(Checks().visit(tree))
+    checked = ast.fix_missing_locations(Checks().visit(Notes().visit(tree)))
     code: types.CodeType = compile(checked, path, "exec", dont_inherit=True)
     return code
 
@@ -33,7 +34,7 @@ class Checks(ast.NodeTransformer):
 
     def visit_Call(self, node: ast.Call) -> Any:
         self.generic_visit(node)
-        if isinstance(node.func, ast.Name) and node.func.id == "super":
+        if isinstance(node.func, ast.Name) and node.func.id in ("super", NOTED):
             return node
         return _placed(_call("__called__", node.func, *node.args, keywords=node.keywords), node)
 

@@ -113,13 +113,19 @@ def test_views_at_constants_have_floats_as_in_flight() -> None:
         assert all(type(d.battery_soc) is float for d in view.descriptors.values())
 
 
-RANKED_TWICE = (
-    "near = 1.2370368 < soc * 3 < 1.2370374\n"
-    "if near and len(peers_by_overlap(view, view.ego)) + len(peers_by_overlap(view, view.peers[0])) > 0:\n    "
-)
-"""In a sliver that no constant names, and in runs of which the search places no plain view to decide again."""
+SEEN_IN_FEW_VIEWS = {
+    "alone": "{body}",
+    "where peers are ranked twice": (
+        "near = 1.2370368 < soc * 3 < 1.2370374\n"
+        "if near and len(peers_by_overlap(view, view.ego)) + len(peers_by_overlap(view, view.peers[0])) > 0:\n    {body}"
+    ),
+    "where inputs are combined": "if me.cpu_headroom + me.gpu_headroom >= 1.2370368:\n    {body}",
+    "used later": "{body}\nbad = bad and 1.2370368 < soc * 3 < 1.2370374",
+}
+"""Where real objects show the difference, in the words of the search: in all cells, in some, or in none of its examples."""
 
 
+@pytest.mark.parametrize("where", SEEN_IN_FEW_VIEWS)
 @pytest.mark.parametrize(
     "body",
     [
@@ -133,10 +139,37 @@ RANKED_TWICE = (
         "kind = type(iter({1}))\nbad = kind is not type(x for x in ())",
         "try:\n    statistics.harmonic_mean({5.0: 'x'})\nexcept KeyError:\n    bad = True",
         "', '.join([f'{soc:.2f}', 7])",
+        "n, k = [], 0\ndef g(t):\n    for k in (1.0, 3.0):\n        n.append(t)\n        yield k\n"
+        "statistics.fmean(g('a'), g('b'))\nfor t in n[:2]:\n    k = 3 * k + (t == 'b')\nbad = min(8 * k, soc * 20) > 7",
     ],
 )
-def test_what_compiled_code_asks_in_its_own_order_is_not_proved(tmp_path: Path, body: str) -> None:
-    assert outcome(tmp_path, source(RANKED_TWICE + body.replace("\n", "\n    "))) in ("drawn", "searched", "refuted")
+def test_what_compiled_code_asks_in_its_own_order_is_not_proved(tmp_path: Path, body: str, where: str) -> None:
+    text = SEEN_IN_FEW_VIEWS[where]
+    indent = " " * (len(text.rpartition("\n")[2]) - len(text.rpartition("\n")[2].lstrip()))
+    assert outcome(tmp_path, source(text.format(body=body.replace("\n", "\n" + indent)))) in (
+        "drawn",
+        "searched",
+        "refuted",
+    )
+
+
+RANKED_TWICE = "bad = peers_by_overlap(view)[0] == peers_by_overlap(view, view.peers[0])[0] == 9"
+SUMMED = "bad = soc + me.cpu_headroom == 0.7 and soc * 3 > 3"
+
+
+@pytest.mark.parametrize("body", [RANKED_TWICE, SUMMED])
+def test_a_replay_finds_a_view_of_each_cell_of_a_correct_policy(tmp_path: Path, body: str) -> None:
+    path = tmp_path / "policy.py"
+    path.write_text(source(body))
+    found = prove(resolve(f"{path}:decide"), parse(LINE), max_drones=3, views=0)[-1]
+    assert found.outcome == ("proved over the reals" if body == SUMMED else "proved")
+
+
+def test_a_cell_without_an_example_in_floats_is_not_proved(tmp_path: Path) -> None:
+    """Of the reals one is a third of this number, of the floats none."""
+    found = verdict(tmp_path, source("bad = (soc + me.cpu_headroom) * 3 == 1.7000000000000004 and soc > 2"))
+    assert found.outcome == "drawn"
+    assert "compares sums or products so closely" in found.what
 
 
 def test_an_own_enum_of_whole_numbers_is_plain(tmp_path: Path) -> None:
