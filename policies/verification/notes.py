@@ -39,7 +39,7 @@ class Notes(ast.NodeTransformer):
         match node:
             case ast.Call(func=func):
                 node.func = _without(func)
-                return node if isinstance(func, ast.Name) and func.id == "super" else _noted(node)
+                return _noted(node)
             case ast.BoolOp(values=values):
                 node.values = list(map(_noted, values))
             case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) | ast.Assert(test=test):
@@ -56,8 +56,8 @@ class Notes(ast.NodeTransformer):
 
 
 _SKIPPED: dict[type[ast.AST], tuple[str, ...]] = {
-    ast.FunctionDef: ("decorator_list", "returns"), ast.ClassDef: ("decorator_list", "bases"), ast.arg: ("annotation",),
-    ast.AnnAssign: ("annotation",), ast.ExceptHandler: ("type",), ast.match_case: ("pattern",),
+    ast.FunctionDef: ("returns",), ast.arg: ("annotation",), ast.AnnAssign: ("annotation",), ast.ExceptHandler: ("type",),
+    ast.match_case: ("pattern",),
 }  # fmt: skip
 """Parts of a source that must stay as they are."""
 

@@ -153,6 +153,24 @@ def test_what_compiled_code_asks_in_its_own_order_is_not_proved(tmp_path: Path, 
     )
 
 
+@pytest.mark.parametrize(
+    "use",
+    [
+        "@hold(len(sum(g(), [])) != 9 and 1.2370368 < soc * 3 < 1.2370374)\ndef bad():\n    pass",
+        "class One:\n    pass\nclass Two(One):\n    pass\nclass Three(Two if len(sum(g(), [])) != 9 and 1.2370368 < soc * 3 < 1.2370374 else One):\n"
+        "    pass\nbad = isinstance(Three(), Two)",
+        "match (soc,)[0]:\n    case x if len(sum(g(), [])) != 9 and 1.2370368 < x * 3 < 1.2370374:\n        bad = True",
+        "one = lambda x=len(sum(g(), [])) != 9 and 1.2370368 < soc * 3 < 1.2370374: x\nbad = one()",
+        "bad = {'a': [len(sum(g(), [])) != 9 and 1.2370368 < soc * 3 < 1.2370374][:1]}['a'][0]",
+    ],
+)
+def test_a_difference_is_noted_wherever_an_expression_stands(tmp_path: Path, use: str) -> None:
+    head = "rows = []\ndef g():\n    for k in range(3):\n        rows.append(k)\n        yield rows\ndef hold(x):\n    return lambda f: x\n"
+    assert outcome(tmp_path, source(head + use)) == "drawn"
+    assert outcome(tmp_path, source(head + use.replace("!= 9", "> 99"))) == "drawn"  # it is noted whatever comes of it
+    assert outcome(tmp_path, source(head + use.replace("len(sum(g(), [])) != 9", "soc > 2"))) == "proved"
+
+
 RANKED_TWICE = "bad = peers_by_overlap(view)[0] == peers_by_overlap(view, view.peers[0])[0] == 9"
 SUMMED = "bad = soc + me.cpu_headroom == 0.7 and soc * 3 > 3"
 
