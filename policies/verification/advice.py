@@ -21,6 +21,8 @@ _ADVICE = (
     ("is not a policy of Sortie", "verify it as file.py:function"),
     ("remembers", "decide from the view alone; damping keeps what was decided before"),
     ("changes the global", "decide from the view alone, and keep functions that change globals in another file"),
+    ("so closely", "compare sums and products with < or >, not with =="),
+    ("what another decorator", "use this decorator alone, or at the top of the file"),
     ("identity", "compare values with =="),
     ("with sum(…)", "use sortie.scenarios.plain_sum.plain_sum, which rounds alike in every Python"),
     ("keeps results", "leave the cache away"),

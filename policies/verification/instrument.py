@@ -16,6 +16,7 @@ from typing import Any
 from sortie.policies.verification.call_checks import CHECKS, attribute, guarded
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import Kept, kept_by
+from sortie.policies.verification.notes import NOTED, noted
 from sortie.policies.verification.outside import Outside
 from sortie.policies.verification.pure import PURE_MODULES, is_of_policies
 from sortie.policies.verification.source_checks import compiled
@@ -100,7 +101,7 @@ def _builtins(find: Callable[..., Any]) -> dict[str, Any]:
             return _Names(module, wanted) if wanted else module
         return Outside(home)
 
-    return vars(builtins) | BUILTINS | CHECKS | {"__import__": importing}
+    return vars(builtins) | BUILTINS | CHECKS | {NOTED: noted, "__import__": importing}
 
 
 class _Names(types.ModuleType):

@@ -90,6 +90,7 @@ _LEAVES = (
     type(NotImplemented),
     _TUPLE_FIELD,
     types.MemberDescriptorType,
+    types.WrapperDescriptorType,
 )
 _OF_TYPES = (types.GenericAlias, types.UnionType)
 _DICTS = (dict, types.MappingProxyType, collections.OrderedDict, collections.defaultdict, collections.Counter)

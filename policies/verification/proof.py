@@ -57,7 +57,7 @@ from sortie.policies.verification.search import (
     search_size,
 )
 from sortie.policies.verification.solver import solver_paths
-from sortie.policies.verification.subject import searchable
+from sortie.policies.verification.subject import searchable, with_notes
 from sortie.policies.verification.symbols import Combined, Refused
 from sortie.policies.verification.views import LARGEST, MAX_DRONES, draw_view, shrink
 from sortie.scenarios.plugins.user_calls import text_of
@@ -276,12 +276,13 @@ def _search(
     make = None
     try:
         follows, coverage.unsound = searchable(policy)
+        plain = with_notes(policy)
         for drones in range(1, max_drones + 1):
             try:
-                exact = search_size(follows, policy, looked_for, confirm, drones, period_s, budget, make)
+                exact = search_size(follows, plain, looked_for, confirm, drones, period_s, budget, make)
             except Combined as combined:
                 make = solver_paths(str(combined))
-                exact = search_size(follows, policy, looked_for, confirm, drones, period_s, budget, make)
+                exact = search_size(follows, plain, looked_for, confirm, drones, period_s, budget, make)
             coverage.exact = coverage.exact and exact
             coverage.drones = drones
     except Stopped:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, NoReturn
 
+import numpy as np
+
+from sortie.policies import geometry
 from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, LinkState, TaskPhase
 from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.verification.stand_ins import (
@@ -27,7 +31,7 @@ from sortie.policies.verification.stand_ins import (
 from sortie.policies.verification.symbols import Path, Ranged
 from sortie.policies.verification.views import LONGEST_S, OTHER_CODEBOOK
 from sortie.policies.verification.watch import WATCH
-from sortie.scenarios.disc import disc_overlap
+from sortie.scenarios.disc import AGENT_IDS, disc_overlap
 from sortie.scenarios.link_state import state_of
 
 Choose = Callable[[str, float, float], float]
@@ -79,10 +83,31 @@ class FleetOfRanges:
             ages[i] = self.path.raised(f"age_s of drone {i}", f"raised age_s of drone {i}", _SEARCHED_UP_TO["age"])
         return self._view(ages)
 
+    @contextmanager
+    def ranked(self) -> Iterator[None]:
+        """Within it, `peers_by_overlap` ranks plain views as this run ranked its own.
+
+        A run may rank the peers of several drones. The positions of its example show the first of these orders.
+        """
+        picks, usual, placed = self.path.picks, geometry.places_loop, self._placed
+
+        def places(me: int, ids: Any, position_m: Any, radius_m: Any) -> Any:
+            label = _order_of(ids[me])
+            if label == placed or label not in picks:
+                return usual()(me, ids, position_m, radius_m)
+            order = [p for p in picks[label] if p in ids]
+            return np.array([(p - ids[me]) % AGENT_IDS - AGENT_IDS * (len(order) - k) for k, p in enumerate(order)])
+
+        geometry.places_loop = lambda: places  # type: ignore[assignment]
+        try:
+            yield
+        finally:
+            geometry.places_loop = usual
+
     @property
-    def has_example(self) -> bool:
-        """Whether a plain view of the cell can be placed: the run ranked the peers of one drone at most."""
-        return sum(1 for label in self.path.picks if label.startswith(_ORDER)) <= 1
+    def _placed(self) -> str:
+        """The order that the positions of an example show."""
+        return next((label for label in self.path.picks if label.startswith(_ORDER)), _order_of(self.ego))
 
     def example(self, choose: Choose | None = None) -> FleetView:
         """A plain view of the cell, with usual values if they lie in it, otherwise with round ones.
@@ -98,7 +123,7 @@ class FleetOfRanges:
                 return choose(axis, low, high)
             return usual if low <= usual <= high else _round_within(low, high)
 
-        ranked = next((label for label in path.picks if label.startswith(_ORDER)), _order_of(self.ego))
+        ranked = self._placed
         receiver = int(ranked.rpartition(" ")[2])
         order = path.picks.get(ranked, tuple(i for i in self.heard if i != receiver))
         places = _places(receiver, order)

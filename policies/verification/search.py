@@ -2,7 +2,7 @@
 
 For each roster, ego and subset of drones heard, the policy runs once in each cell into which its own comparisons divide
 the inputs. Each property then divides that cell further. A plain view of every cell goes to the plain policy, which must
-decide the same; otherwise the policy tells stand-ins from real objects, and nothing is proved.
+compute the same, step by step; otherwise the policy tells stand-ins from real objects, and nothing is proved.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from time import monotonic  # before a user's file may replace it in its module
 from typing import Any, NamedTuple
 
 from sortie.policies.contract import Directive, Disc, FleetView, Policy
+from sortie.policies.verification.notes import are_alike, taking_notes
 from sortie.policies.verification.ranges import FleetOfRanges
 from sortie.policies.verification.symbols import Path, Ranged, Refused, explore
 from sortie.scenarios.plugins.user_calls import TookTooLongError
@@ -173,8 +174,10 @@ class Run:
         self._fresh: Any = None
         self.answer: Any = None
         self.error: Exception | None = None
+        self.notes: list[Any] = []
         try:
-            self.answer = policy(self._view)
+            with taking_notes() as self.notes:
+                self.answer = policy(self._view)
         except TookTooLongError as error:
             system.path.refuse(f"takes too long: {error}")
         except Exception as error:  # the policy's fault or the stand-ins': the plain view decides
@@ -203,34 +206,36 @@ class Run:
     def compare(self, plain: Policy) -> None:
         """Let the plain policy decide on a plain view of the cell, at its corners as often as inside.
 
-        Where the run was not exact, the view may lie in the next cell once it is rounded: it must not raise there.
+        Args:
+            plain: the policy on real objects, with notes of what it computes (`notes`).
 
         Raises:
-            Refused: it decides otherwise.
+            Refused: it decides or computes otherwise.
         """
-        if not self.system.has_example:
-            return
         values: dict[str, float] = {}
         draw = random.Random(f"{len(self.system.path.taken)} {self.system.path.taken}")  # noqa: S311
 
         def choose(axis: str, low: float, high: float) -> float:
-            options = (low, high) if isinstance(low, int) else (low, high, low / 2 + high / 2)
-            values[axis] = draw.choice(options)
+            has_middle = low < high and not isinstance(low, int)
+            values[axis] = draw.choice((low, high, low / 2 + high / 2) if has_middle else (low, high))
             return values[axis]
 
         view = self.system.path.corner(self.system, choose)
         if view is None:
-            return
+            self.system.path.refuse("compares sums or products so closely that floats show no example")
         try:
-            real = plain(view)
+            with self.system.ranked(), taking_notes() as notes:
+                real = plain(view)
         except Exception as error:
             if self.error is None or type(error) is not type(self.error):
                 self.system.path.refuse(f"raises {type(error).__name__} on real objects alone")
             return
         if self.error is not None:
             self.system.path.refuse(f"raises {type(self.error).__name__} on stand-ins alone")
-        if self.system.path.exact and _plain(self.answer, values) != _plain(real, values):
+        if _plain(self.answer, values) != _plain(real, values):
             self.system.path.refuse("decides otherwise on real objects than on the stand-ins of the search")
+        if not are_alike(self.notes, notes, values):
+            self.system.path.refuse("computes otherwise on real objects than on the stand-ins of the search")
 
 
 def _plain(answer: Any, values: Mapping[str, float]) -> Any:

@@ -2,13 +2,16 @@
 
 A `Solved` number has a term of z3 over the inputs of its path. A comparison asks the solver which results are possible.
 If both are, the run forks, as with ranges. Sums and products are followed over the reals, without the rounding of floats:
-a search with them is not exact. Comparisons of plain inputs are. z3 is an optional dependency, the extra `verify`.
+a search with them is not exact. Comparisons of plain inputs are. Every number also keeps how the policy computes it, so that
+an example of the run can be computed in floats. z3 is an optional dependency, the extra `verify`.
 """
 
 from __future__ import annotations
 
 import importlib
 import math
+import operator
+import random
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -16,6 +19,14 @@ from sortie.policies.verification.symbols import MARK, Path, Ranged, Refused, Te
 
 STEP_MS = 2000
 """The longest time for one question to the solver."""
+_EXAMPLES = 60
+"""How many examples of a run are tried before none is found that floats do not round out of it."""
+_LEAST_MARGIN = 1e-13
+"""Numbers that are closer in all examples cannot be kept apart."""
+
+
+_Compared = tuple[Callable[[Any, Any], Any], Any, Any, bool]
+"""A comparison: of which kind, of which numbers, with which result."""
 
 
 def solver_paths(why: str = "combines inputs") -> Callable[[Sequence[int]], Path]:
@@ -48,10 +59,14 @@ class SolvedPath(Path):
         self._terms: dict[str, Any] = {}
         self._model: Any = None
         """Values that satisfy all facts so far, which answer one side of most questions."""
+        self._computed: list[tuple[Callable[..., Any], Sequence[Any]]] = []
+        """Of each number that is no plain input: how the policy computes it, and from what."""
+        self._compared: list[_Compared] = []
+        """The comparisons of the run."""
 
     def number(self, axis: str, low: float, high: float) -> Any:
         """The number of an axis within its bounds."""
-        return Solved(self, axis, self._term(axis, low, high), is_plain=True)
+        return Solved(self, axis, self._term(axis, low, high))
 
     def _term(self, axis: str, low: float, high: float) -> Any:
         if axis not in self._terms or axis not in self.ranges:
@@ -87,7 +102,18 @@ class SolvedPath(Path):
             self._model = model
         return model is not None
 
-    def holds(self, fact: Any) -> bool:
+    def compares(self, make: Callable[[Any, Any], Any], one: Solved, other: Any, term: Any) -> bool:
+        """The result of a comparison with another number, of which `term` is the term."""
+        found = self._holds(make(one._term, term))
+        self._compared.append((make, one, other, found))
+        return found
+
+    def computes(self, act: Callable[..., Any], given: Sequence[Any]) -> int:
+        """Keep how a number is computed, and return its place among such numbers."""
+        self._computed.append((act, given))
+        return len(self._computed) - 1
+
+    def _holds(self, fact: Any) -> bool:
         """Whether a fact holds. If both are possible, the run takes a side."""
         not_so = self.z3.Not(fact)
         if not self._possible(fact):
@@ -136,48 +162,99 @@ class SolvedPath(Path):
         return value.numerator_as_long() / value.denominator_as_long()
 
     def corner(self, system: Any, choose: Callable[[str, float, float], float]) -> Any:
-        """A plain view of the cell that the floats still satisfy; None where rounding leaves none at hand."""
-        if not self.exact:
-            return system.example()
-        values: dict[str, float] = {}
+        """A plain view on which floats give the policy's comparisons the same results; None if no such view was found."""
+        draw = random.Random(str(self.taken))  # noqa: S311
+        close: list[_Compared] = []
+        margin = 1e-3
+        for _ in range(_EXAMPLES):
+            found = {axis: self.bounds(axis, 0.0)[0] for axis in self.ranges}
+            if margin < _LEAST_MARGIN:
+                found = {axis: self._moved(axis, x, draw) for axis, x in found.items()}
+            values = {axis: choose(axis, x, x) for axis, x in found.items()}
+            others = self._others_in_floats(values)
+            if not others:
+                return system.example(lambda axis, low, _, values=values: values.get(axis, low))
+            close += others
+            while margin >= _LEAST_MARGIN and not self._keeps_apart(close, margin):
+                margin /= 1e3
+        return None
 
-        def kept(axis: str, low: float, high: float) -> float:
-            values[axis] = choose(axis, low, high)
-            return values[axis]
+    def _keeps_apart(self, close: Sequence[_Compared], margin: float) -> bool:
+        """Whether the run has an example in which these comparisons have a margin. It becomes the present one."""
+        least = self.constant(margin)
+        self._solver.push()
+        for act, a, b, result in close:
+            one, other = self._term_of(a), self._term_of(b)
+            sides = ((one, other, act(0, 1)), (other, one, act(1, 0)))
+            self._solver.add(self.z3.Or(*[low + least <= high for low, high, holds in sides if holds == result]))
+        is_possible: bool = self._solver.check() == self.z3.sat
+        if is_possible:
+            self._model = self._solver.model()
+        self._solver.pop()
+        return is_possible
 
-        view = system.example(kept)
-        pairs = [(self._terms[axis], self.constant(x)) for axis, x in values.items()]
-        still = all(self.z3.is_true(self.z3.simplify(self.z3.substitute(fact, *pairs))) for fact in self.facts)
-        return view if still else None
+    def _term_of(self, number: Any) -> Any:
+        return number._term if isinstance(number, Solved) else self.constant(number)
+
+    def _moved(self, axis: str, value: float, draw: random.Random) -> float:
+        """A number of an axis near another one, be it by a few floats; every second time the same."""
+        low, high = self.ranges[axis]
+        if isinstance(low, int) or draw.random() < 0.5:
+            return value
+        moved = value + max(abs(value), 1e-3) * draw.choice((-1, 1)) * 10 ** draw.uniform(-17.0, 0.0)
+        return min(max(draw.choice((moved, round(moved * 1024) / 1024)), low), high)
+
+    def _others_in_floats(self, values: Mapping[str, float]) -> list[_Compared]:
+        """The comparisons that have another result in floats.
+
+        All numbers of the run are computed from its inputs, rounded as the policy rounds.
+        """
+        self._floats = []
+        for act, given in self._computed:
+            try:
+                self._floats.append(act(*[self.value_of(x, values) for x in given]))
+            except (ArithmeticError, ValueError):  # a divisor that is zero, which another comparison excludes
+                self._floats.append(math.nan)
+        return [
+            (act, a, b, result)
+            for act, a, b, result in self._compared
+            if act(self.value_of(a, values), self.value_of(b, values)) != result
+        ]
+
+    def value_of(self, number: Any, values: Mapping[str, float]) -> float:
+        """A number where the inputs have the values of the last example."""
+        if not isinstance(number, Solved):
+            return number  # type: ignore[no-any-return]
+        return values[number._axis] if number._place is None else self._floats[number._place]
 
 
 class Solved(Ranged):
     """A number with a term over the inputs of its path."""
 
-    __slots__ = ("_is_plain", "_term")
+    __slots__ = ("_place", "_term")
 
-    def __init__(self, path: SolvedPath, axis: str, term: Any, is_plain: bool = False) -> None:
+    def __init__(self, path: SolvedPath, axis: str, term: Any, place: int | None = None) -> None:
         super().__init__(path, axis)
-        self._term, self._is_plain = term, is_plain
+        self._term, self._place = term, place
 
-    def _other(self, other: object) -> Any:
-        """The other operand as a term; None if it is not a number."""
+    def _other(self, other: object) -> tuple[Any, Any]:
+        """The other operand and its term; None if it is not a number."""
         path: Any = self._path
         if isinstance(other, Solved):
-            return other._term
+            return other, other._term
         c = self._constant(other)
         if c is None:
-            return None
+            return None, None
         if not math.isfinite(c):
             path.refuse(f"computes with {c} and {self._axis}")
-        return path.constant(c)
+        return c, path.constant(c)
 
     def _compare(self, other: object, make: Callable[[Any, Any], Any], infinite: Callable[[float, float], bool]) -> Any:
         if type(other) is float and not math.isfinite(other):
             return infinite(0.0, other)
-        term = self._other(other)
+        number, term = self._other(other)
         path: Any = self._path
-        return NotImplemented if term is None else path.holds(make(self._term, term))
+        return NotImplemented if term is None else path.compares(make, self, number, term)
 
     def __lt__(self, other: object) -> Any:
         return self._compare(other, lambda a, b: a < b, lambda a, b: a < b)
@@ -200,48 +277,55 @@ class Solved(Ranged):
 
     __hash__ = Ranged.__hash__  # type: ignore[assignment]
 
-    def _combined(self, other: object, make: Callable[[Any, Any], Any]) -> Any:
-        term = self._other(other)
+    def _combined(self, other: object, make: Callable[[Any, Any], Any], act: Callable[[Any, Any], Any]) -> Any:
+        number, term = self._other(other)
         if term is None:
             return NotImplemented
         self._path.exact = False
-        return Solved(self._path, self._axis, make(self._term, term))  # type: ignore[arg-type]
+        return self._made(make(self._term, term), act, (self, number))
+
+    def _made(self, term: Any, act: Callable[..., Any], given: Sequence[Any]) -> Solved:
+        """A number that the policy computes by `act`."""
+        path: Any = self._path
+        return Solved(path, self._axis, term, path.computes(act, given))
 
     def __add__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: a + b)
+        return self._combined(other, lambda a, b: a + b, operator.add)
 
     __radd__ = __add__
 
     def __sub__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: a - b)
+        return self._combined(other, lambda a, b: a - b, operator.sub)
 
     def __rsub__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: b - a)
+        return self._combined(other, lambda a, b: b - a, lambda a, b: b - a)
 
     def __mul__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: a * b)
+        return self._combined(other, lambda a, b: a * b, operator.mul)
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: object) -> Any:
         if other == 0:
             return 1.0 / 0  # the error of a plain number
-        return self._combined(other, self._quotient)
+        return self._combined(other, self._quotient, operator.truediv)
 
     def __rtruediv__(self, other: object) -> Any:  # type: ignore[override]
         if self == 0:
             return 1.0 / 0
-        return self._combined(other, lambda a, b: self._quotient(b, a))
+        return self._combined(other, lambda a, b: self._quotient(b, a), lambda a, b: b / a)
 
     def _quotient(self, a: Any, b: Any) -> Any:
         path: Any = self._path
         return path.z3.ToReal(a) / b if path.z3.is_int(a) else a / b
 
     def __pow__(self, other: object) -> Any:  # type: ignore[override]
-        return self * self if other == 2 and type(other) is int else self._cannot()
+        if other != 2 or type(other) is not int:
+            self._cannot()
+        return self._combined(self, lambda a, b: a * b, lambda a, _: a**2)
 
     def __neg__(self) -> Any:
-        return Solved(self._path, self._axis, -self._term)  # type: ignore[arg-type]  # exact for floats too
+        return self._made(-self._term, operator.neg, (self,))  # exact for floats too
 
     def __floordiv__(self, other: object) -> Any:
         return self._cannot()
@@ -258,8 +342,7 @@ class Solved(Ranged):
 
     def _value_in(self, values: Mapping[str, float]) -> float:
         path: Any = self._path
-        pairs = [(path._terms[axis], path.constant(x)) for axis, x in values.items() if axis in path._terms]
-        value: float = path._float(path.z3.simplify(path.z3.substitute(self._term, *pairs)))
+        value: float = path.value_of(self, values)
         return value
 
     @property  # type: ignore[misc]

@@ -6,18 +6,19 @@ import ast
 import types
 from typing import Any
 
+from sortie.policies.verification.notes import NOTED, Notes
 from sortie.policies.verification.plain import refuse_other_python
 
 
 def compiled(source: bytes, path: str) -> types.CodeType:
-    """The code of a policy's source, with the checks.
+    """The code of a policy's source, with the checks and with notes.
 
     Raises:
         SyntaxError: it is not plain Python (`plain`).
     """
     tree = ast.parse(source, path)
     refuse_other_python(tree)
-    checked = ast.fix_missing_locations(Checks().visit(tree))
+    checked = ast.fix_missing_locations(Checks().visit(Notes().visit(tree)))
     code: types.CodeType = compile(checked, path, "exec", dont_inherit=True)
     return code
 
@@ -33,7 +34,7 @@ class Checks(ast.NodeTransformer):
 
     def visit_Call(self, node: ast.Call) -> Any:
         self.generic_visit(node)
-        if isinstance(node.func, ast.Name) and node.func.id == "super":
+        if isinstance(node.func, ast.Name) and node.func.id in ("super", NOTED):
             return node
         return _placed(_call("__called__", node.func, *node.args, keywords=node.keywords), node)
 
@@ -96,12 +97,12 @@ class Checks(ast.NodeTransformer):
         returns, node.returns = node.returns, None
         self.generic_visit(node)
         node.returns = returns
-        node.decorator_list = [_call("__decorator__", d) for d in node.decorator_list]
+        node.decorator_list = _decorators(node)
         return node
 
     def visit_ClassDef(self, node: ast.ClassDef) -> Any:
         self.generic_visit(node)
-        node.decorator_list = [*(_call("__decorator__", d) for d in node.decorator_list), _name("__made__")]
+        node.decorator_list = [*_decorators(node), _name("__made__")]
         return node
 
     def visit_ExceptHandler(self, node: ast.ExceptHandler) -> ast.AST:
@@ -157,6 +158,11 @@ class Checks(ast.NodeTransformer):
 
     def visit_arg(self, node: ast.arg) -> Any:
         return node  # with its annotation, which is made of types alone
+
+
+def _decorators(node: ast.FunctionDef | ast.ClassDef) -> list[ast.expr]:
+    """The decorators, each with whether it gets what stands below it, and not what another decorator made of that."""
+    return [_call("__decorator__", d, ast.Constant(d is node.decorator_list[-1])) for d in node.decorator_list]
 
 
 def _unpacks(target: ast.expr) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 
 from sortie.policies.contract import Policy, PolicyError
 from sortie.policies.verification.instrument import instrumented
+from sortie.policies.verification.notes import load_with_notes
 from sortie.policies.verification.shield import Shielded
 from sortie.scenarios.plugins.reference import describe_error
 from sortie.scenarios.plugins.user_calls import Guarded, Source, guarded
@@ -34,6 +35,22 @@ def searchable(policy: Policy) -> tuple[Policy, str]:
         inner, why = searchable(found.policy)
         return Shielded(inner, found.rules), why
     return policy, "" if _is_sorties(found) else NO_FILE
+
+
+def with_notes(policy: Policy) -> Policy:
+    """The policy as it is, with notes of what the code in its file computes.
+
+    Raises:
+        Exception: what its file raises.
+    """
+    found: Any = policy
+    if isinstance(found, functools.partial):
+        return functools.partial(with_notes(found.func), *found.args, **found.keywords)
+    if isinstance(found, Shielded):
+        return Shielded(with_notes(found.policy), found.rules)
+    if isinstance(found, Guarded) and found.source is not None:
+        return Guarded(getattr(load_with_notes(found.source.file), found.source.name), found.source)
+    return policy
 
 
 def _with_checks(source: Source) -> Policy:

@@ -28,7 +28,7 @@ from sortie.policies.verification.invariants import Invariant, LinksTerm, Recent
 from sortie.policies.verification.past import ROUNDING_S
 from sortie.policies.verification.ranges import FleetOfRanges, region_axes
 from sortie.policies.verification.search import Budget, Run, rosters
-from sortie.policies.verification.subject import searchable
+from sortie.policies.verification.subject import searchable, with_notes
 from sortie.policies.verification.symbols import Path, Ranged, Refused, explore
 from sortie.policies.verification.words import DWELL, Span
 from sortie.sim.check.closed_loop import PlaneTimes
@@ -129,6 +129,7 @@ def _letters(
 ) -> tuple[dict[int, set[Letter]], tuple[Directive, ...]]:
     """By ego, all letters; and all directives that a link may enforce, without their ends."""
     follows, unsound = searchable(policy)
+    plain = with_notes(policy)
     if unsound:
         raise NotFinite(f"it {unsound}")
     known: dict[Directive, None] = {_bare(nothing(0, 0, "")): None}
@@ -142,7 +143,7 @@ def _letters(
                 return Run(follows, FleetOfRanges(path, size, ego, heard, times.period_s))
 
             for path, decided in explore(run):
-                decided.compare(policy)
+                decided.compare(plain)
                 found.update(_letters_of(path, decided, rule, times, alone, known))
                 if budget.is_spent:
                     raise NotFinite(f"the time of {budget.budget_s:g} s ended")

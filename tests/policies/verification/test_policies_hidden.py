@@ -113,13 +113,19 @@ def test_views_at_constants_have_floats_as_in_flight() -> None:
         assert all(type(d.battery_soc) is float for d in view.descriptors.values())
 
 
-RANKED_TWICE = (
-    "near = 1.2370368 < soc * 3 < 1.2370374\n"
-    "if near and len(peers_by_overlap(view, view.ego)) + len(peers_by_overlap(view, view.peers[0])) > 0:\n    "
-)
-"""In a sliver that no constant names, and in runs of which the search places no plain view to decide again."""
+SEEN_IN_FEW_VIEWS = {
+    "alone": "{body}",
+    "where peers are ranked twice": (
+        "near = 1.2370368 < soc * 3 < 1.2370374\n"
+        "if near and len(peers_by_overlap(view, view.ego)) + len(peers_by_overlap(view, view.peers[0])) > 0:\n    {body}"
+    ),
+    "where inputs are combined": "if me.cpu_headroom + me.gpu_headroom >= 1.2370368:\n    {body}",
+    "used later": "{body}\nbad = bad and 1.2370368 < soc * 3 < 1.2370374",
+}
+"""Where real objects show the difference, in the words of the search: in all cells, in some, or in none of its examples."""
 
 
+@pytest.mark.parametrize("where", SEEN_IN_FEW_VIEWS)
 @pytest.mark.parametrize(
     "body",
     [
@@ -133,10 +139,82 @@ RANKED_TWICE = (
         "kind = type(iter({1}))\nbad = kind is not type(x for x in ())",
         "try:\n    statistics.harmonic_mean({5.0: 'x'})\nexcept KeyError:\n    bad = True",
         "', '.join([f'{soc:.2f}', 7])",
+        "n, k = [], 0\ndef g(t):\n    for k in (1.0, 3.0):\n        n.append(t)\n        yield k\n"
+        "statistics.fmean(g('a'), g('b'))\nfor t in n[:2]:\n    k = 3 * k + (t == 'b')\nbad = min(8 * k, soc * 20) > 7",
     ],
 )
-def test_what_compiled_code_asks_in_its_own_order_is_not_proved(tmp_path: Path, body: str) -> None:
-    assert outcome(tmp_path, source(RANKED_TWICE + body.replace("\n", "\n    "))) in ("drawn", "searched", "refuted")
+def test_what_compiled_code_asks_in_its_own_order_is_not_proved(tmp_path: Path, body: str, where: str) -> None:
+    text = SEEN_IN_FEW_VIEWS[where]
+    indent = " " * (len(text.rpartition("\n")[2]) - len(text.rpartition("\n")[2].lstrip()))
+    assert outcome(tmp_path, source(text.format(body=body.replace("\n", "\n" + indent)))) in (
+        "drawn",
+        "searched",
+        "refuted",
+    )
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        "@hold(len(sum(g(), [])) != 9 and 1.2370368 < soc * 3 < 1.2370374)\ndef bad():\n    pass",
+        "class One:\n    pass\nclass Two(One):\n    pass\nclass Three(Two if len(sum(g(), [])) != 9 and 1.2370368 < soc * 3 < 1.2370374 else One):\n"
+        "    pass\nbad = isinstance(Three(), Two)",
+        "match (soc,)[0]:\n    case x if len(sum(g(), [])) != 9 and 1.2370368 < x * 3 < 1.2370374:\n        bad = True",
+        "one = lambda x=len(sum(g(), [])) != 9 and 1.2370368 < soc * 3 < 1.2370374: x\nbad = one()",
+        "bad = {'a': [len(sum(g(), [])) != 9 and 1.2370368 < soc * 3 < 1.2370374][:1]}['a'][0]",
+    ],
+)
+def test_a_difference_is_noted_wherever_an_expression_stands(tmp_path: Path, use: str) -> None:
+    head = "rows = []\ndef g():\n    for k in range(3):\n        rows.append(k)\n        yield rows\ndef hold(x):\n    return lambda f: x\n"
+    assert outcome(tmp_path, source(head + use)) == "drawn"
+    assert outcome(tmp_path, source(head + use.replace("!= 9", "> 99"))) == "drawn"  # it is noted whatever comes of it
+    assert outcome(tmp_path, source(head + use.replace("len(sum(g(), [])) != 9", "soc > 2"))) == "proved"
+
+
+RANKED_TWICE = "bad = peers_by_overlap(view)[0] == peers_by_overlap(view, view.peers[0])[0] == 9"
+SUMMED = "bad = soc + me.cpu_headroom == 0.7 and soc * 3 > 3"
+
+
+@pytest.mark.parametrize("body", [RANKED_TWICE, SUMMED])
+def test_a_replay_finds_a_view_of_each_cell_of_a_correct_policy(tmp_path: Path, body: str) -> None:
+    path = tmp_path / "policy.py"
+    path.write_text(source(body))
+    found = prove(resolve(f"{path}:decide"), parse(LINE), max_drones=3, views=0)[-1]
+    assert found.outcome == ("proved over the reals" if body == SUMMED else "proved")
+
+
+def test_a_cell_without_an_example_in_floats_is_not_proved(tmp_path: Path) -> None:
+    """Of the reals one is a third of this number, of the floats none."""
+    found = verdict(tmp_path, source("bad = (soc + me.cpu_headroom) * 3 == 1.7000000000000004 and soc > 2"))
+    assert found.outcome == "drawn"
+    assert "compares sums or products so closely" in found.what
+
+
+def test_an_own_enum_of_whole_numbers_is_plain(tmp_path: Path) -> None:
+    text = source("bad = (Level.HIGH if soc > 0.5 else Level.LOW) > 8 or soc * Level.LOW > 2")
+    assert (
+        outcome(
+            tmp_path, text.replace("STATE = ", "class Level(enum.IntEnum):\n    LOW = 2\n    HIGH = 8\nSTATE = ", 1)
+        )
+        == "proved"
+    )
+
+
+def test_a_decorator_that_changes_an_older_class_is_not_proved(tmp_path: Path) -> None:
+    """`replace` takes a field from then on, which it refused before. Nothing else shows the change."""
+    head = (
+        "@dataclasses.dataclass(init=False, eq=False, repr=False)\nclass Old:\n"
+        "    x: int = dataclasses.field(init=False, default=0)\n    def __init__(self, x=0):\n        pass\n"
+        "def give(kind):\n    return Old\n"
+    )
+    body = (
+        "if view.ego == 1:\n    if soc * 3 < 1.2370371:\n        try:\n            dataclasses.replace(Old(), x=1)\n"
+        "            bad = soc * 3 > 1.2370365\n        except ValueError:\n            pass\n    elif soc * 3 < 1.2370377:\n"
+        "        @dataclasses.dataclass(init=False, eq=False, repr=False)\n        @give\n        class New:\n            pass"
+    )
+    found = verdict(tmp_path, source(body).replace("STATE = ", f"{head}STATE = ", 1))
+    assert found.outcome == "drawn"
+    assert "decorates what another decorator returns" in found.what
 
 
 def test_a_function_in_the_place_of_another_one_is_memory(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import PERSON_FLAG, Directive, Disc, PolicyError, Representation, Roster, TaskPhase
+from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.registry import resolve
 from sortie.policies.verification import pure
 from sortie.policies.verification.age_rule import older_views, raised_part, without_detached
@@ -35,6 +36,7 @@ from sortie.policies.verification.axes import decisions_of, observe
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.invariants import WORDS, Scope
 from sortie.policies.verification.kept import fingerprint
+from sortie.policies.verification.notes import are_alike, load_with_notes, noted, taking_notes
 from sortie.policies.verification.outside import Outside
 from sortie.policies.verification.proof import PLANE, RepeatableView, check_property, prove
 from sortie.policies.verification.ranges import FleetOfRanges
@@ -42,11 +44,12 @@ from sortie.policies.verification.search import Run as OneRun
 from sortie.policies.verification.search import rosters
 from sortie.policies.verification.shield import Shielded, shield
 from sortie.policies.verification.solver import solver_paths
-from sortie.policies.verification.subject import own_invariants, searchable
+from sortie.policies.verification.subject import own_invariants, searchable, with_notes
 from sortie.policies.verification.symbols import Path as Run
 from sortie.policies.verification.symbols import Ranged, Refused, Text, explore
 from sortie.policies.verification.views import from_json, to_json
 from sortie.policies.verification.watch import Watch, ordered_for
+from sortie.scenarios.plugins.user_code import load
 
 DECIDERS: list[Callable[[Any], Any]] = [
     lambda x: x < 0.25,
@@ -413,6 +416,9 @@ def test_a_policy_with_its_parameters_is_searched_with_them(tmp_path: Path) -> N
     follows, why = searchable(policy)
     assert why == ""
     assert [d.rate_hz for d in follows(VIEW.frozen)] == [6.0, 6.0]
+    with taking_notes() as notes:
+        assert [d.rate_hz for d in with_notes(policy)(VIEW.frozen)] == [6.0, 6.0]
+        assert notes
     assert own_invariants(policy) == "rate_hz <= 9"
     assert own_invariants(resolve("worked", {"rho": 0.5})) == ""
     rules = shield(policy, ()).rules  # type: ignore[attr-defined]
@@ -420,6 +426,9 @@ def test_a_policy_with_its_parameters_is_searched_with_them(tmp_path: Path) -> N
     assert isinstance(shielded, Shielded)
     assert (shielded.rules, why) == (rules, "")
     assert [d.rate_hz for d in shielded(VIEW)] == [6.0, 6.0]
+    noting: Any = with_notes(Shielded(policy, rules))
+    assert (noting.rules, [d.rate_hz for d in noting(VIEW)]) == (rules, [6.0, 6.0])
+    assert with_notes(_stranger) is _stranger
     assert "is not a policy of Sortie's" in searchable(Shielded(_stranger, ()))[1]
     assert "is not a policy of Sortie's" in searchable(partial(_stranger))[1]
 
@@ -501,6 +510,96 @@ def test_a_plain_policy_that_decides_otherwise_than_on_stand_ins_is_refused() ->
         compared(_raising(ValueError), _raising(KeyError))
     with pytest.raises(Refused):
         compared(_one(roi=Disc(1, 2, 4)), _one(roi=Disc(1, 2, 3)))
+
+
+def test_a_replay_computes_in_floats_what_the_solver_follows_over_the_reals() -> None:
+    """Its example may be any, so the two sums below would differ in most of them if one were not rounded."""
+
+    def run(again: float, plain: Callable[[Any], Any]) -> None:
+        def decide(view: Any) -> list[Directive]:
+            share = 0.3 * view.me.battery_soc + 0.1 * (1 / (view.me.cpu_headroom + 0.7)) - view.me.gpu_headroom**2 / 3
+            return _one(rho=share + again if share > 0.1 else -share)(view)
+
+        for path, found in explore(lambda p: OneRun(decide, _fleet(p)), solver_paths()):
+            assert not path.exact
+            found.compare(plain or decide)
+
+    run(0.0, None)  # type: ignore[arg-type]
+    with pytest.raises(Refused, match="decides otherwise"):
+        run(0.0, _one(rho=0.25))
+
+
+def test_a_run_that_ranks_the_peers_of_several_drones_is_replayed_with_all_its_orders() -> None:
+    asked = list[tuple[list[int], ...]]()
+
+    def decide(view: Any) -> list[Directive]:
+        asked.append(tuple(peers_by_overlap(view, i) for i in range(3)))
+        return _one()(view)
+
+    count = 0
+    for _, found in explore(lambda p: OneRun(decide, _fleet(p))):
+        found.compare(decide)
+        count += 1
+    assert count == 2**3
+    assert asked[::2] == asked[1::2]
+    assert len(set(map(str, asked))) == count
+    assert peers_by_overlap(VIEW, 0) == peers_by_overlap(VIEW.frozen, 0)
+
+
+def test_notes_are_alike_if_all_that_is_compared_is_equal() -> None:
+    number = Run([]).number("x", 0.0, 1.0)
+
+    def notes(*values: Any) -> list[Any]:
+        with taking_notes() as found:
+            for value in values:
+                assert noted(value) is value
+        return found
+
+    def alike(a: Any, b: Any) -> bool:
+        return are_alike(notes(a), notes(b), {"x": 0.5})
+
+    assert noted(3) == 3  # outside it notes nothing
+    equal = [
+        (3, 3),
+        (math.nan, math.nan),
+        (number, 0.5),
+        (number + 1, 1.5),
+        (TaskPhase.TRACK, TaskPhase.TRACK),
+        ([1], [2]),
+        (_one, len),
+    ]
+    assert all(alike(a, b) for a, b in equal)
+    other = [
+        (3, 3.0), (1, True), (number, 0.6), (number, TaskPhase.TRACK), (TaskPhase.TRACK, TaskPhase.SEARCH), ([1], [1, 2]), ([1], (1,)),
+        (None, 0), ("a", "b"), ({1}, {1, 2}),
+    ]  # fmt: skip
+    assert not any(alike(a, b) for a, b in other)
+    assert not are_alike(notes(1, 2), notes(1), {})
+    assert not are_alike(notes(1), notes(1, 2), {})
+
+
+def test_a_source_with_notes_runs_as_without(tmp_path: Path) -> None:
+    """Every kind of expression and statement that plain Python has keeps its meaning, and its values are noted."""
+    text = (
+        "from __future__ import annotations\nimport dataclasses\nfrom typing import NamedTuple\n"
+        "@dataclasses.dataclass(frozen=True)\nclass Base:\n    low: float = 0.5\n    def at(self, x):\n        return self.low + x\n"
+        "class More(Base):\n    def at(self, x):\n        return super().at(x) * 2\n"
+        "class Row(NamedTuple):\n    a: int\n    b: list[int] = []\n"
+        "def numbers(n, *rest, k=2, **named):\n    i = 0\n    while i < n:\n        yield i * k\n        i += 1\n    yield from rest\n"
+        "def use(x):\n    found, row = [], Row(1)\n    first, *others = numbers(3, 7, 8)\n    found += [first, others[-1], *others[:2]]\n"
+        "    for a, b in zip(others, others[1:]):\n        if a < b <= 9 and not a == 2 or x is None:\n            found.append(a)\n"
+        "    try:\n        found.append({1: 2}[x])\n    except (KeyError, ValueError):\n        found.append(-1)\n"
+        "    match x:\n        case 3 | 4 if row.a:\n            found.append('few')\n        case None:\n            found.append('none')\n"
+        "        case other:\n            found.append(other)\n"
+        "    assert found, 'none'\n    pick = {k: v for k, v in enumerate(found) if k not in (1, 2)}\n    del pick[0]\n"
+        "    return f'{More().at(1):.2f} {x!r}', pick, (lambda y=4: y if x else -y)(), (z := len({*found}))\n"
+    )
+    (tmp_path / "plain.py").write_text(text)
+    plain, module = load(tmp_path / "plain.py"), load_with_notes(tmp_path / "plain.py")
+    for x in (1, 3, None, 5.5):
+        with taking_notes() as notes:
+            assert module.use(x) == plain.use(x)
+        assert {3.0, True, 7, "few" if x == 3 else 8} <= set(notes)
 
 
 def test_raised_ages_begin_at_the_lowest_of_the_cell() -> None:
