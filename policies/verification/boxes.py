@@ -36,11 +36,10 @@ class Box:
 
     __slots__ = ("_bounded", "_checks", "_others", "brackets", "known", "parts", "room", "rules", "shared")
 
-    def __init__(self, rules: Sequence[Rule], sides: Iterable[float], ceiling: Ceiling = ()) -> None:
+    def __init__(self, rules: Sequence[Rule], sides: Sequence[float], ceiling: Ceiling = ()) -> None:
         self.rules = rules
         limits: dict[int, tuple[Limit, ...]] = {at: (limit,) for at, limit in ceiling}
         self._checks: list[tuple[int, Compare, float, int]] = []
-        sides = tuple(sides)
         values = iter(sides)
         parts = []
         for number, rule in enumerate(rules):

@@ -113,7 +113,7 @@ def nearest(
             if not queue:
                 return None, by_count
             this = heapq.heappop(queue)
-            if queue and _fewest(queue[0]) == _fewest(this):
+            if by_count and queue and _fewest(queue[0]) == _fewest(this):
                 by_count = False
     return None, by_count
 

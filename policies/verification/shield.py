@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import heapq
 import math
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from itertools import repeat
+from itertools import compress, repeat
 from typing import Any, NamedTuple
 
 from sortie.policies.checks import check_directives
@@ -177,12 +178,12 @@ def _correction(context: Context, link: Link, box: Box, known: Known) -> tuple[s
     if found is None:
         if len(known) >= _MOST_KNOWN:
             known.clear()
-        kind = key if box.brackets is None else box.brackets.of(context, link)
-        found = known.get(kind)
+        brackets = key if box.brackets is None else box.brackets.of(context, link)
+        found = known.get(brackets)
         if found is None:
             found, by_count = _searched(context, link, box)
             if by_count:
-                known[kind] = found
+                known[brackets] = found
         known[key] = found
     return found
 
@@ -193,11 +194,15 @@ def _searched(context: Context, link: Link, box: Box) -> tuple[tuple[str, Change
     if not broken:
         return ("", ()), True
     after, by_count = nearest(link, box, (), context)
-    texts = "; ".join([box.rules[n].invariant.text for n in sorted(set(broken))])
+    texts = _texts(box, broken)
     if after is None:
         return (texts, None), by_count
-    pairs = enumerate(zip(link, after, strict=True))
-    return (texts, tuple([(at, now) for at, (was, now) in pairs if now is not was])), by_count
+    return (texts, tuple(compress(enumerate(after), map(operator.is_not, after, link)))), by_count
+
+
+@lru_cache(maxsize=1024)
+def _texts(box: Box, broken: tuple[int, ...]) -> str:
+    return "; ".join([box.rules[n].invariant.text for n in sorted(set(broken))])
 
 
 class _Boxes:
