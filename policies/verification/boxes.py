@@ -12,15 +12,17 @@ from itertools import pairwise
 from typing import Any
 
 from sortie.policies.contract import Representation
+from sortie.policies.verification.brackets import Brackets
 from sortie.policies.verification.compiled import Context, Rule, Ways
 from sortie.policies.verification.links import AT, DUTY, HIGHEST, LEVEL, ROI, Ceiling, Compare, Limit, Link
 from sortie.scenarios.representation import AT_LEVEL
 
 _FIRST_LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0)
 _PLAIN = frozenset({float, int, Representation})
-Known = dict[Any, tuple[Link, tuple[int, ...], "dict[Box, Link | None]"]]
-"""By a link's fields: the first link that had them, the lines that it breaks, and the nearest link, by the box within which
-it is to be."""
+Changes = tuple[tuple[int, float], ...]
+"""New values of a link's fields, by their places."""
+Known = dict[Any, tuple[str, Changes | None]]
+"""By a link's fields, or by its brackets: the lines that it breaks, and its changes; None for those if nothing keeps the lines."""
 
 
 class Box:
@@ -32,9 +34,9 @@ class Box:
         ceiling: beside the bounds of the lines.
     """
 
-    __slots__ = ("_bounded", "_checks", "_others", "known", "parts", "room", "rules", "shared")
+    __slots__ = ("_bounded", "_checks", "_others", "brackets", "known", "parts", "room", "rules", "shared")
 
-    def __init__(self, rules: Sequence[Rule], sides: Iterable[float], ceiling: Ceiling = ()) -> None:
+    def __init__(self, rules: Sequence[Rule], sides: Sequence[float], ceiling: Ceiling = ()) -> None:
         self.rules = rules
         limits: dict[int, tuple[Limit, ...]] = {at: (limit,) for at, limit in ceiling}
         self._checks: list[tuple[int, Compare, float, int]] = []
@@ -59,6 +61,7 @@ class Box:
         self.known: tuple[Known, Known] | None = ({}, {}) if lasts else None
         """Where corrections depend on nothing but a link's fields, and on whether its sender has a region: those found so
         far, of senders without and with one. Policies mostly decide what they decided before."""
+        self.brackets = Brackets(limits, self.parts) if lasts and _are_plain(sides) else None
 
     def clipped(self, link: Link) -> dict[int, float | None]:
         """The nearest values of the fields that must change for the bounds; None for a field without an allowed value."""
@@ -78,7 +81,7 @@ class Box:
         return tuple(found)
 
     def key(self, link: Link) -> tuple[float, ...] | None:
-        """What links have in common that are corrected alike; None if nothing can be said."""
+        """What links have in common that are corrected to the same link; None if nothing can be said."""
         return link[:-1] if self.shared and _are_plain(link[:-2]) else None
 
 

@@ -46,8 +46,11 @@ def nearest(
     box: Box,
     also: tuple[Part, ...],
     context: Context,
-) -> Link | None:
-    """The nearest link in the box that keeps the parts `also`; None if none was found.
+) -> tuple[Link | None, bool]:
+    """The nearest link in the box that keeps the parts `also`, None if none was found; and whether counts decided.
+
+    Counts decided if two boxes to be tried never changed equally many fields, so that amounts were not compared. Then all
+    links in the same brackets change alike.
 
     Args:
         before: the link.
@@ -57,14 +60,14 @@ def nearest(
     """
     named: Any = box.clipped(before)
     if None in named.values():
-        return None
-    parts, region, number = box.parts + also, context.me.region, 0
+        return None, True
+    parts, region, number, by_count = box.parts + also, context.me.region, 0, True
     queue: list[_Try] = []
     this: _Try = (0, _HERE, 0, box.room, named, before, named, None)
     for _ in range(MOST):
         exempted, far, _, room, named, base, changes, exempts = this
         if room is None:
-            return base
+            return base, by_count
         after = changed(base, changes, region)
         ways: Sequence[_Way] = ()
         if after is None:
@@ -84,7 +87,7 @@ def nearest(
                     break
             else:
                 if not queue or (queue[0][:2] >= this[:2] and not _follows(before, named, after)):
-                    return after
+                    return after, by_count
                 number += 1
                 found = distance(before, after)
                 heapq.heappush(queue, (exempted, found, number, None, named, after, _NO_CHANGE, None))
@@ -108,9 +111,17 @@ def nearest(
                 heapq.heappush(queue, this)
         if not only:
             if not queue:
-                return None
+                return None, by_count
             this = heapq.heappop(queue)
-    return None
+            if by_count and queue and _fewest(queue[0]) == _fewest(this):
+                by_count = False
+    return None, by_count
+
+
+def _fewest(a_try: _Try) -> tuple[int, int]:
+    """How many conditions it makes false, and how many fields change."""
+    exempted, far = a_try[:2]
+    return exempted, 0 if far is None else far[0]
 
 
 _HERE: Far = 0, 0.0

@@ -15,14 +15,15 @@ from __future__ import annotations
 
 import heapq
 import math
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from itertools import repeat
+from itertools import compress, repeat
 from typing import Any, NamedTuple
 
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, Disc, FleetView, Policy
-from sortie.policies.verification.boxes import Box, Known, box_of
+from sortie.policies.verification.boxes import Box, Changes, Known, box_of
 from sortie.policies.verification.compiled import Context, Rule, compiled
 from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, Recent, just_heard
 from sortie.policies.verification.links import Ceiling, Far, Link, as_directive, as_link, distance
@@ -155,35 +156,48 @@ def _keep_alone(
     seen: dict[Box, Known] = {}
     for k, link in enumerate(context.links):
         box = boxes.of[k]
-        of_box = seen.setdefault(box, {}) if box.known is None else box.known[region is not None]
-        key = box.key(link)
-        known = of_box.get(key) if key is not None else None
-        if known is None:
-            known = link, box.broken(context, link), {}
-            if key is not None:
-                if len(of_box) == _MOST_KNOWN:
-                    of_box.clear()
-                of_box[key] = known
-        first, broken, nearest_to = known
-        if broken:
-            within = boxes.within(k)
-            if within not in nearest_to:
-                nearest_to[within] = nearest(first, within, (), context)
-            after = nearest_to[within]
-            if after is None:
-                all_kept = False
-                continue
-            if first is not link:
-                after = _alike(first, after, link)
-            directives[k] = _replaced(decided[k], link, after, region, _texts(box, broken))
-            links[k] = after
+        known = seen.setdefault(box, {}) if box.known is None else box.known[region is not None]
+        texts, changes = _correction(context, link, box, known)
+        if changes is None:
+            all_kept = False
+        elif texts:
+            fields: list[Any] = list(link)
+            for at, value in changes:
+                fields[at] = value
+            links[k] = after = tuple.__new__(Link, fields)
+            directives[k] = _replaced(decided[k], link, after, region, texts)
     return directives, links, all_kept
 
 
-def _alike(first: Link, after: Link, link: Link) -> Link:
-    """A link with equal fields as the first one, changed as that one was: what stays is its own (5 is not written as 5.0)."""
-    fields = [own if now is was else now for was, now, own in zip(first, after, link, strict=True)]
-    return tuple.__new__(Link, fields)
+def _correction(context: Context, link: Link, box: Box, known: Known) -> tuple[str, Changes | None]:
+    """The lines that a link breaks, and its changes; None for those if nothing keeps the lines."""
+    key = box.key(link)
+    if key is None:
+        return _searched(context, link, box)[0]
+    found = known.get(key)
+    if found is None:
+        if len(known) >= _MOST_KNOWN:
+            known.clear()
+        brackets = key if box.brackets is None else box.brackets.of(context, link)
+        found = known.get(brackets)
+        if found is None:
+            found, by_count = _searched(context, link, box)
+            if by_count:
+                known[brackets] = found
+        known[key] = found
+    return found
+
+
+def _searched(context: Context, link: Link, box: Box) -> tuple[tuple[str, Changes | None], bool]:
+    """The same, and whether counts decided."""
+    broken = box.broken(context, link)
+    if not broken:
+        return ("", ()), True
+    after, by_count = nearest(link, box, (), context)
+    texts = _texts(box, broken)
+    if after is None:
+        return (texts, None), by_count
+    return (texts, tuple(compress(enumerate(after), map(operator.is_not, after, link)))), by_count
 
 
 @lru_cache(maxsize=1024)
@@ -195,30 +209,24 @@ class _Boxes:
     """What the lines about one link each allow each link. Links to which the same lines apply share a box."""
 
     def __init__(self, lines: Sequence[Rule], context: Context, ceilings: Ceilings | None) -> None:
-        self._context, self._ceilings = context, ceilings
         some = context.links[0]
-        self._lines = [r for r in lines if r.when_of_view is None or r.when_of_view(context, some)]
-        self._boxes: dict[Any, Box] = {}
-        asked = [r.when_of_peer for r in self._lines if r.when_of_peer is not None]
+        lines = [r for r in lines if r.when_of_view is None or r.when_of_view(context, some)]
+        asked = [r.when_of_peer for r in lines if r.when_of_peer is not None]
         answers = [map(bool, map(when, repeat(context), context.links)) for when in asked]
-        self._applies = list(zip(*answers, strict=True)) if asked else [()] * len(context.links)
-        of = {applies: self._box(applies, ()) for applies in set(self._applies)}
-        self.of = [of[applies] for applies in self._applies]
+        applies_to = list(zip(*answers, strict=True)) if asked else [()] * len(context.links)
+        own: list[Ceiling] = [() if ceilings is None else ceilings[link.destination] for link in context.links]
 
-    def within(self, k: int) -> Box:
-        """A link's box below its ceiling."""
-        ceiling = () if self._ceilings is None else self._ceilings[self._context.links[k].destination]
-        return self._box(self._applies[k], ceiling) if ceiling else self.of[k]
+        def box(applies: tuple[bool, ...], ceiling: Ceiling) -> Box:
+            yes = iter(applies)
+            rules = tuple([r for r in lines if r.when_of_peer is None or next(yes)])
+            return box_of(rules, tuple([side(context, some) for r in rules for side in r.sides]), ceiling)
 
-    def _box(self, applies: tuple[bool, ...], ceiling: Ceiling) -> Box:
-        key = applies, ceiling
-        if key not in self._boxes:
-            answers = iter(applies)
-            rules = tuple([r for r in self._lines if r.when_of_peer is None or next(answers)])
-            some = self._context.links[0]
-            sides = tuple([side(self._context, some) for r in rules for side in r.sides])
-            self._boxes[key] = box_of(rules, sides, ceiling)
-        return self._boxes[key]
+        keys = list(
+            zip(applies_to, map(id, own), strict=True)
+        )  # most ceilings are few objects, and their hashes are slow
+        boxes = {key: box(key[0], ceiling) for key, ceiling in dict(zip(keys, own, strict=True)).items()}
+        self.of = [boxes[key] for key in keys]
+        """Each link's box, below its ceiling."""
 
 
 _Asked = tuple[int, int | None]
@@ -337,7 +345,7 @@ class _Together:
         found: list[_Change] = []
         for k in links:
             if k not in this.keeps:
-                box = self._boxes.within(k)
+                box = self._boxes.of[k]
                 key = id(box), box.key(self._decided[k]) if self._alike else None
                 if key[1] is None or key not in alike:  # another link would change by as much
                     alike.add(key)
@@ -358,9 +366,9 @@ class _Together:
     def _change(self, this: _Plan, k: int, numbers: tuple[int, ...]) -> list[_Change]:
         """The nearest change by which a link keeps these lines, if there is one."""
         self._count += 1
-        before, now, box = self._decided[k], this.context.links[k], self._boxes.within(k)
+        before, now, box = self._decided[k], this.context.links[k], self._boxes.of[k]
         parts = tuple([part for n in numbers for part in self._lines[n].parts])
-        after = nearest(before, box, parts, this.context)
+        after, _ = nearest(before, box, parts, this.context)
         if after is None or after == now:
             return []
         was, is_now = (0, 0.0) if now is before else distance(before, now), distance(before, after)

@@ -250,6 +250,36 @@ def test_a_decision_does_not_depend_on_what_was_decided_before(seed: int, line: 
         assert repr(enforce(parse(text), *cases[k])) == alone[k], text
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "rate_hz < 5\nrho != 0.5\nfusion_weight >= 0.2 or representation == none",
+        "rate_hz <= 5 or rho <= 0.2\nfusion_weight >= 0.5 or deadline_s <= 0.3",  # how much a field changes decides
+        "rate_hz * deadline_s <= 2\nrho <= fusion_weight\nrate_hz <= 6",
+        "rate_hz * deadline_s <= 2\ndeadline_s >= 0.5\nrho <= 0.4",
+        "rate_hz * deadline_s <= 2\nrate_hz <= 2\ndeadline_s <= 0.5",
+        "representation <= detections\nwhen rate_hz > 3: duty >= 0.805",  # a field follows the representation
+        "representation >= detections\nrate_hz >= 2 or rate_hz == 0\nwhen roi: representation == features",
+        "when rho >= 0.5 and rate_hz > 2: representation == raw\nwhen representation == raw: rho == 0",
+    ],
+)
+def test_a_link_is_corrected_as_if_no_link_with_similar_numbers_had_been_corrected_before(text: str) -> None:
+    draw, view, rules = Random(text), fleet_of(2), parse(text)
+
+    def number(high: float) -> float:
+        return draw.choice([0.0, 0.2, 0.5, 2.0, 5.0, high * draw.random(), high * draw.random()]) % (high + 1e-9)
+
+    def directive() -> Directive:
+        rung, disc = draw.choice(list(Representation)), draw.choice([None, Disc(0.0, 0.0, 5.0)])
+        return Directive(0, 1, rung, number(1), disc, number(8), number(1), number(1), draw.randint(0, 100))
+
+    decided = [directive() for _ in range(400)]
+    remembered = [enforce(rules, view, [d]) for d in decided]
+    for d, after in zip(decided, remembered, strict=True):
+        _plain_box.cache_clear()
+        assert repr(enforce(rules, view, [d])) == repr(after)
+
+
 def test_links_that_share_a_correction_keep_their_own_region_and_reason() -> None:
     view = fleet_of(3)
     discs = {p: Disc(1.0 * p, 0.0, 5.0) for p in view.peers}
