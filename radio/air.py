@@ -447,26 +447,30 @@ class Air:
 
     # --- what senders know -----------------------------------------------------------------------
 
-    def goodput_mbps(self, sender: int) -> tuple[float, ...]:
-        """Goodput to every other drone, ascending by id, as the sender measured it; see `sortie.radio.goodput`.
+    def goodput_mbps(self, sender: int, to: Sequence[int] | None = None) -> tuple[float, ...]:
+        """Goodput to some drones, as the sender measured it; see `sortie.radio.goodput`.
+
+        Args: `to`: the drones; None for every other one, by ascending id.
 
         0 to a drone to which nothing was measured in the last `MEASURED_FOR_S`; at least `SILENT_MBPS` to any other.
         Samples that are still in service or queued lower it already by how little has got through so far. Where a
         payload would go over others, it is the goodput of its hops in sequence.
         """
         known = self._known_mbps(sender)
+        targets = [i for i in range(self._n) if i != sender] if to is None else to
         if self._routes is not None:
-            rows: dict[int, list[float]] = {sender: known.copy()}
-            for target in range(self._n):
-                path = self._routes.path(sender, target) if target != sender else [sender]
+            rows: dict[int, dict[int, float]] = {sender: known.copy()}
+            for target in targets:
+                path = self._routes.path(sender, target)
                 if len(path) > 2:
-                    hops = [rows.setdefault(a, self._known_mbps(a))[b] for a, b in pairwise(path)]
+                    hops = [rows.setdefault(a, self._known_mbps(a)).get(b, 0.0) for a, b in pairwise(path)]
                     known[target] = 1.0 / plain_sum(1.0 / mbps for mbps in hops) if min(hops) > 0.0 else 0.0
-        del known[sender]
-        return tuple(known)
+        if not known:
+            return (0.0,) * len(targets)
+        return tuple([known.get(i, 0.0) for i in targets])
 
-    def _known_mbps(self, sender: int) -> list[float]:
-        """Goodput to every drone over the direct link, 0 to itself."""
+    def _known_mbps(self, sender: int) -> dict[int, float]:
+        """Goodput over the direct link, by receiver, where something was measured lately."""
         known = self._goodput.read(sender, self._env.now)
         head = self.medium.in_service(sender)
         if head is not None:
@@ -477,7 +481,7 @@ class Air:
                     since, bits = s.mark_s, s.mark_bits
                 else:
                     since, bits = s.t_queued_s, drained - s.drained_bits
-                if now - since >= _WINDOW_S:
+                if now - since >= _WINDOW_S and s.receiver in known:
                     least_mbps = SILENT_MBPS if s is head else WAITING_MBPS
                     known[s.receiver] = min(known[s.receiver], max(bits / (now - since) * 1e-6, least_mbps))
         return known

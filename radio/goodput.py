@@ -19,8 +19,6 @@ shadowing, because falling is quicker than rising; a drop shows in the next fram
 
 from __future__ import annotations
 
-from math import inf
-
 from sortie.scenarios.link_state import MEASURED_FOR_S, SILENT_MBPS, WAITING_MBPS
 
 RISE = 0.3
@@ -30,25 +28,27 @@ class Goodput:
     """The estimates of every ordered link, Mb/s; 0 is a link without a measurement of the last `MEASURED_FOR_S`."""
 
     def __init__(self, n_drones: int) -> None:
-        self._mbps = [[0.0] * n_drones for _ in range(n_drones)]
-        self._measured_at_s: list[dict[int, float]] = [{} for _ in range(n_drones)]  # of the links that are not 0
+        self._mbps: list[dict[int, float]] = [
+            {} for _ in range(n_drones)
+        ]  # by sender and receiver, links that are not 0
+        self._measured_at_s: list[dict[int, float]] = [{} for _ in range(n_drones)]  # of the same links
 
     def measured(self, sender: int, receiver: int, mbps: float, now_s: float) -> None:
         """A measurement: down at once, up by `RISE` of the gap; one without another lately is taken as it is."""
         row, measured_at_s = self._mbps[sender], self._measured_at_s[sender]
-        before = row[receiver] if now_s - measured_at_s.get(receiver, -inf) <= MEASURED_FOR_S else 0.0
+        before = row[receiver] if receiver in row and now_s - measured_at_s[receiver] <= MEASURED_FOR_S else 0.0
         measured_at_s[receiver] = now_s
         row[receiver] = before + RISE * (mbps - before) if 0.0 < before < mbps else max(mbps, SILENT_MBPS)
 
     def bounded(self, sender: int, receiver: int, mbps: float) -> None:
         """A link cannot be said to be better than this now; state and age stay, since nothing was tried over it."""
         row = self._mbps[sender]
-        row[receiver] = min(row[receiver], max(mbps, WAITING_MBPS))
+        if receiver in row:
+            row[receiver] = min(row[receiver], max(mbps, WAITING_MBPS))
 
-    def read(self, sender: int, now_s: float) -> list[float]:
-        """The estimates to all drones (0 where nothing was measured lately, and to itself)."""
+    def read(self, sender: int, now_s: float) -> dict[int, float]:
+        """The estimates by receiver, of those to which something was measured lately."""
         measured_at_s = self._measured_at_s[sender]
         for receiver in [i for i, t_s in measured_at_s.items() if now_s - t_s > MEASURED_FOR_S]:
-            del measured_at_s[receiver]
-            self._mbps[sender][receiver] = 0.0
+            del measured_at_s[receiver], self._mbps[sender][receiver]
         return self._mbps[sender].copy()

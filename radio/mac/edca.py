@@ -43,17 +43,20 @@ OVERLAPS = 12
 # what a station sends
 NOTHING, GROUP, DATA, BLOCK_REQUEST, RTS, CTS, ANSWER = range(7)
 
-# columns of a station
+# columns of a station; what each frame on the air asks of everyone who has a link to its sender comes first
 (
-    TX_END, RESPONSE_AT, TIMEOUT_AT, GRANT, GRANT_LOW, ARRIVE_AT, NEXT_AT,
-    IDLE_AT, NAV, EIFS_UNTIL, BEGIN, BEGIN_LOW,
-    TX_KIND, TX_TO, TX_ACCESS, TX_COUNT, TX_MCS, TX_NAV, TX_BEGIN,
+    TX_END, RESPONSE_AT, TIMEOUT_AT, GRANT, GRANT_LOW, ARRIVE_AT, LOCK, DEAF,
+    LOOKED_AT, IS_BUSY, CANDIDATE, CANDIDATE_AT, CANDIDATE_LINK, TOUCHED, EIFS_UNTIL, SEGMENTS,
+    LOCK_AT, LOCK_LINK, NAV, IDLE_AT, BEGIN, BEGIN_LOW,
+    TX_KIND, TX_TO, TX_ACCESS, TX_COUNT, TX_MCS, TX_NAV, TX_BEGIN, TX_JOB,
     RESPONSE_KIND, RESPONSE_TO, RESPONSE_NS, AWAITS, ACCESS,
-    LOCK, LOCK_LINK, LOCK_AT, CANDIDATE, CANDIDATE_LINK, CANDIDATE_AT, SEGMENTS,
-    IS_BUSY, SLOTS, SLOTS_LOW, WINDOW, WINDOW_LOW, FAILS, FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW,
-    REQUEST, SENT, DRAWN, INCIDENT, COMING, TRANSMITTED_NS, TOUCHED, TX_JOB, DEAF, LOOKED_AT,
-) = range(52)  # fmt: skip
-STATION_COLUMNS = 52
+    SLOTS, SLOTS_LOW, WINDOW, WINDOW_LOW, FAILS, FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW,
+    REQUEST, SENT, DRAWN, COMING, TRANSMITTED_NS,
+) = range(50)  # fmt: skip
+STATION_COLUMNS = 56
+"""Whole lines of a processor's cache; the last columns are empty."""
+NEXT_AT, INCIDENT = range(2)
+"""Rows of what all stations are asked at once: when the next thing happens, and how many frames are on the air there."""
 
 # columns of a job
 (
@@ -75,11 +78,13 @@ FLOW_RATE, FLOW_LOSS, FLOW_BURST = range(3)
 # totals
 G_SINCE, G_GROUPS, G_OTHERS, G_GROUP_NS, G_OTHER_NS = range(5)
 
-F_SENSED, F_PREAMBLE, F_LEGACY_NOISE, F_ENERGY = range(4)
-"""Powers over the noise of the whole channel: weakest preamble; SINR of a preamble; noise in 20 MHz; weakest energy."""
+F_SENSED, F_PREAMBLE, F_LEGACY_NOISE, F_ENERGY, F_FAINT = range(5)
+"""Powers over the noise of the whole channel: weakest preamble; SINR of a preamble; noise in 20 MHz; weakest energy; and
+below which a frame is faint: its preamble cannot be detected, however it fades. It is energy, and interference for
+receptions that begin later."""
 
 # why a receiver did not hear a group frame, and that it did
-UNKNOWN, COLLISION_CONTEXT, COLLISION_DATA, HIDDEN, WEAK, HALF_DUPLEX, HEARD = range(7)
+UNKNOWN, COLLISION_CONTEXT, COLLISION_DATA, HIDDEN, WEAK, HALF_DUPLEX, HEARD, FAINT = range(8)
 
 # what the run tells: kind, job
 T_GROUP, T_ARRIVED, T_OVER, T_DEAD = range(4)
@@ -110,12 +115,22 @@ def uniform(bits):
 
 
 @part
-def renew(s, S):
+def renew(s, S, N):
     """When the next thing happens at a station."""
     at = S[s, TX_END]
     for k in range(1, 6):
         at = min(at, S[s, k])
-    S[s, NEXT_AT] = at
+    N[NEXT_AT, s] = at
+
+
+@part
+def mark(s, what, D):
+    """From now on the two states may differ in a station's rows and its jobs', and in its links' if `what` is 2."""
+    flag = (D.shape[0] + 1) // 2 + s
+    if D[flag] == 0:
+        D[0] += 1
+        D[D[0]] = s
+    D[flag] = max(D[flag], what)
 
 
 @part
@@ -208,18 +223,25 @@ def sense(s, S, P, W, F, begin, receiver, C):
 
 
 @part
-def look(s, t, S, P, W, C, F, begin, receiver):
+def crosses(less, more, F):
+    """Whether a change of the power at a station may change what it senses."""
+    return less < F[F_SENSED] <= more or less < F[F_ENERGY] <= more
+
+
+@part
+def look(s, t, S, N, P, W, C, F, begin, receiver):
     """Bring a station's view of the medium up to now."""
     busy = sense(s, S, P, W, F, begin, receiver, C)
     if busy and S[s, IS_BUSY] == 0:
         freeze(s, t, S)
         S[s, IS_BUSY] = 1
+        renew(s, S, N)
     elif not busy and S[s, IS_BUSY] == 1:
         S[s, IS_BUSY] = 0
         S[s, IDLE_AT] = max(t, S[s, NAV], S[s, EIFS_UNTIL])
         if not is_engaged(s, S):
             plan_access(s, S, C)
-    renew(s, S)
+            renew(s, S, N)
 
 
 @part
@@ -285,7 +307,7 @@ def remove(job, t, S, J):
 
 
 @part
-def release(s, t, S, P, W, C, F, begin, receiver):
+def release(s, t, S, N, P, W, C, F, begin, receiver):
     """An exchange of a station's own is over; the medium is watched again."""
     if S[s, DEAF] == 0:
         S[s, LOOKED_AT] = t
@@ -298,7 +320,7 @@ def release(s, t, S, P, W, C, F, begin, receiver):
         S[s, IS_BUSY] = 0
         S[s, IDLE_AT] = max(t, S[s, NAV], S[s, EIFS_UNTIL])
         plan_access(s, S, C)
-    renew(s, S)
+    renew(s, S, N)
 
 
 @part
@@ -338,11 +360,12 @@ def add_segment(j, t, level, S, SEG_AT, SEG):
 
 
 @part
-def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiver, gain, fade, keys, C, F):
+def start(starters, count, t, S, N, D, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiver, gain, fade, keys, C, F):
     """Frames that begin at one instant reach the receivers."""
     touched = 0
     for x in range(count):
         s = starters[x]
+        mark(s, 2, D)
         group = S[s, TX_KIND] == GROUP
         counter = np.uint64(C[C_FRAME] if C[C_BY_FRAME] == 1 else S[s, SENT])
         for k in range(begin[s], begin[s + 1]):
@@ -352,7 +375,14 @@ def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiv
             power = gain[k] * fade[mix((mix(keys[s] + counter) ^ keys[j]) + np.uint64(1)) & _LEVEL]
             W[k] = power
             P[j] += power
-            S[j, INCIDENT] += 1
+            N[INCIDENT, j] += 1
+            if gain[k] < F[F_FAINT]:
+                WHY[k] = FAINT
+                if crosses(P[j] - power, P[j], F):
+                    mark(j, 1, D)
+                    look(j, t, S, N, P, W, C, F, begin, receiver)
+                continue
+            mark(j, 1, D)
             WHY[k] = UNKNOWN
             if S[j, TX_END] != FAR:
                 WHY[k] = HALF_DUPLEX
@@ -365,13 +395,15 @@ def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiv
                 if group:
                     WHY[k] = blame(S[j, LOCK], s, begin, receiver, gain, S, C, F)
                 if S[S[j, LOCK], TX_KIND] == GROUP:
+                    mark(S[j, LOCK], 2, D)
                     WHY[S[j, LOCK_LINK]] = blame(s, S[j, LOCK], begin, receiver, gain, S, C, F)
-                look(j, t, S, P, W, C, F, begin, receiver)
+                look(j, t, S, N, P, W, C, F, begin, receiver)
                 continue
             if S[j, CANDIDATE] < 0 or t - S[j, CANDIDATE_AT] > CCA:
                 S[j, CANDIDATE], S[j, CANDIDATE_LINK], S[j, CANDIDATE_AT] = s, k, t
             else:
                 c, link = S[j, CANDIDATE], S[j, CANDIDATE_LINK]
+                mark(c, 2, D)
                 WHY[link] = blame(s, c, begin, receiver, gain, S, C, F)
                 WHY[k] = blame(c, s, begin, receiver, gain, S, C, F)
                 if power > W[link]:
@@ -394,6 +426,7 @@ def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiv
         else:
             S[j, LOCK] = -1
             if WHY[link] == UNKNOWN:
+                mark(S[j, CANDIDATE], 2, D)
                 WHY[link] = WEAK
                 if power >= F[F_SENSED] and power >= F[F_PREAMBLE] * F[F_LEGACY_NOISE]:
                     c = S[j, CANDIDATE]
@@ -403,12 +436,12 @@ def start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiv
                             if other >= 0 and i != j and W[other] * 4.0 >= others:
                                 WHY[link] = blame(i, c, begin, receiver, gain, S, C, F)
                                 break
-        look(j, t, S, P, W, C, F, begin, receiver)
+        look(j, t, S, N, P, W, C, F, begin, receiver)
     for x in range(count):
         s = starters[x]
         if S[s, IS_BUSY] == 0:
             S[s, IS_BUSY] = 1
-        renew(s, S)
+        renew(s, S, N)
 
 
 @loop
@@ -497,12 +530,12 @@ def send_data(s, t, job, S, J, M, T, LI, LF, RATES, LIMITS, C, G):
 
 
 @part
-def access(s, t, S, J, M, T, LI, LS, LF, RATES, LIMITS, ORDER, C, G, keys):
+def access(s, t, S, N, J, M, T, LI, LS, LF, RATES, LIMITS, ORDER, C, G, keys):
     """A station's turn: the class of higher priority sends, the other one's equal counter is a collision within."""
     a = 0 if S[s, GRANT] <= t and S[s, HEAD] >= 0 else 1
     if S[s, HEAD + a] < 0:
         S[s, GRANT] = S[s, GRANT_LOW] = FAR
-        renew(s, S)
+        renew(s, S, N)
         return False
     if a == 0 and S[s, GRANT_LOW] <= t and S[s, HEAD_LOW] >= 0:
         fail_window(s, 1, S, C)
@@ -537,7 +570,7 @@ def access(s, t, S, J, M, T, LI, LS, LF, RATES, LIMITS, ORDER, C, G, keys):
 
 
 @part
-def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver):
+def miss(s, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver):
     """No answer has come."""
     a, what, job = S[s, ACCESS], S[s, AWAITS], S[s, TX_JOB]
     fail_window(s, a, S, C)
@@ -559,7 +592,7 @@ def miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, re
             else:  # ask what has arrived, for as long as it takes
                 S[s, REQUEST] = 1
     draw_backoff(s, a, S, keys)
-    release(s, t, S, P, W, C, F, begin, receiver)
+    release(s, t, S, N, P, W, C, F, begin, receiver)
     return told
 
 
@@ -674,6 +707,8 @@ def finish(
     s,
     t,
     S,
+    N,
+    D,
     P,
     W,
     WHY,
@@ -707,10 +742,23 @@ def finish(
     seed = mix(mix(keys[s] ^ np.uint64(0x77)) + np.uint64(S[s, SENT]))
     touched = 0
     is_meant, is_answered = False, False
+    mark(s, 2, D)
+    if to >= 0:
+        mark(to, 1, D)
     for k in range(begin[s], begin[s + 1]):
         j = receiver[k]
         if j == s:
             continue
+        if WHY[k] == FAINT:
+            N[INCIDENT, j] -= 1
+            before = P[j]
+            P[j] = before - W[k] if N[INCIDENT, j] > 0 else 0.0
+            if crosses(P[j], before, F):
+                mark(j, 1, D)
+                TOUCH[touched] = j
+                touched += 1
+            continue
+        mark(j, 1, D)
         if S[j, LOCK] == s:
             S[j, LOCK] = -1
             if kind == GROUP:
@@ -752,8 +800,8 @@ def finish(
             WHY[k] = HALF_DUPLEX  # it began to send meanwhile
         if S[j, CANDIDATE] == s:
             S[j, CANDIDATE] = -1
-        S[j, INCIDENT] -= 1
-        P[j] = P[j] - W[k] if S[j, INCIDENT] > 0 else 0.0
+        N[INCIDENT, j] -= 1
+        P[j] = P[j] - W[k] if N[INCIDENT, j] > 0 else 0.0
         if S[j, LOCK] >= 0:
             add_segment(j, t, max(0.0, P[j] - W[S[j, LOCK_LINK]]), S, SEG_AT, SEG)
         TOUCH[touched] = j
@@ -763,7 +811,7 @@ def finish(
     account(t, G)
     G[G_GROUPS if kind == GROUP else G_OTHERS] -= 1
     for x in range(touched):
-        look(TOUCH[x], t, S, P, W, C, F, begin, receiver)
+        look(TOUCH[x], t, S, N, P, W, C, F, begin, receiver)
     if kind == GROUP:
         S[s, WINDOW + a], S[s, FAILS + a] = C[C_WINDOW + a], 0
         if job >= 0:
@@ -771,15 +819,15 @@ def finish(
             told += 1
             remove(job, t, S, J)
         draw_backoff(s, a, S, keys)
-        release(s, t, S, P, W, C, F, begin, receiver)
+        release(s, t, S, N, P, W, C, F, begin, receiver)
     elif kind == ANSWER or kind == CTS:
         # the sender that waits for it
         if S[to, AWAITS] != NOTHING and S[to, TX_TO] == s and S[to, TX_END] == FAR and S[to, RESPONSE_AT] == FAR:
             if is_meant and is_answered:
-                told = conclude(to, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver)
+                told = conclude(to, t, S, N, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver)
             elif S[to, TIMEOUT_AT] == FAR:
-                told = miss(to, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver)
-        release(s, t, S, P, W, C, F, begin, receiver) if S[s, AWAITS] == NOTHING else renew(s, S)
+                told = miss(to, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver)
+        release(s, t, S, N, P, W, C, F, begin, receiver) if S[s, AWAITS] == NOTHING else renew(s, S, N)
     else:
         if job >= 0 and J[job, ARRIVED] == J[job, COUNT] and J[job, IS_TOLD] == 0:
             J[job, IS_TOLD] = 1
@@ -794,20 +842,20 @@ def finish(
             else:
                 S[to, RESPONSE_AT], S[to, RESPONSE_KIND], S[to, RESPONSE_TO] = t + SIFS, ANSWER, s
                 S[to, RESPONSE_NS] = S[s, TX_NAV] - SIFS
-            renew(to, S)
+            renew(to, S, N)
         S[s, IS_BUSY] = 1
-        renew(s, S)
+        renew(s, S, N)
     return told
 
 
 @part
-def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver):
+def conclude(s, t, S, N, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver):
     """The answer has come."""
     a, what = S[s, ACCESS], S[s, AWAITS]
     S[s, TIMEOUT_AT] = FAR
     if what == RTS:  # clear to send
         S[s, RESPONSE_AT], S[s, RESPONSE_KIND] = t + SIFS, DATA
-        renew(s, S)
+        renew(s, S, N)
         return told
     job = S[s, TX_JOB]
     S[s, WINDOW + a], S[s, FAILS + a] = C[C_WINDOW + a], 0
@@ -825,7 +873,7 @@ def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, re
         S[s, REQUEST] = 0
         told = settle(s, t, job, True, what == DATA, S, J, M, T, OUT, told, DROPS, C)
     draw_backoff(s, a, S, keys)
-    release(s, t, S, P, W, C, F, begin, receiver)
+    release(s, t, S, N, P, W, C, F, begin, receiver)
     return told
 
 
@@ -833,6 +881,7 @@ def conclude(s, t, S, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, re
 def run(
     until,
     S,
+    N,
     P,
     W,
     WHY,
@@ -844,6 +893,7 @@ def run(
     SEG,
     LS,
     DROPS,
+    D,
     LI,
     LF,
     OUT,
@@ -871,18 +921,20 @@ def run(
     while True:
         t = FAR
         for s in range(n):
-            t = min(t, S[s, NEXT_AT])
+            t = min(t, N[NEXT_AT, s])
         if t > until:
             return until, 0
         if DROPS[0, 0] > most_drops:
             return t - 1, -1
         told = 0
         for s in range(n):  # frames that end
-            if S[s, TX_END] == t:
+            if N[NEXT_AT, s] <= t and S[s, TX_END] == t:
                 told = finish(
                     s,
                     t,
                     S,
+                    N,
+                    D,
                     P,
                     W,
                     WHY,
@@ -912,8 +964,9 @@ def run(
                 )
         count = 0
         for s in range(n):
-            if S[s, NEXT_AT] > t:
+            if N[NEXT_AT, s] > t:
                 continue
+            mark(s, 1, D)
             while S[s, ARRIVE_AT] <= t:
                 job = S[s, COMING]
                 S[s, COMING] = J[job, FOLLOWING]
@@ -928,7 +981,7 @@ def run(
                 ):
                     S[s, TIMEOUT_AT] = FAR
                 else:
-                    told = miss(s, t, S, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver)
+                    told = miss(s, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver)
             if S[s, RESPONSE_AT] <= t:
                 if S[s, RESPONSE_KIND] == DATA:
                     job = S[s, TX_JOB]
@@ -939,7 +992,7 @@ def run(
                         count += 1
                     else:
                         S[s, RESPONSE_AT] = FAR
-                        release(s, t, S, P, W, C, F, begin, receiver)
+                        release(s, t, S, N, P, W, C, F, begin, receiver)
                 else:
                     duration = CONTROL
                     if S[s, RESPONSE_KIND] == ANSWER:
@@ -957,12 +1010,14 @@ def run(
                     starters[count] = s
                     count += 1
             elif min(S[s, GRANT], S[s, GRANT_LOW]) <= t:
-                if access(s, t, S, J, M, T, LI, LS, LF, RATES, LIMITS, ORDER, C, G, keys):
+                if access(s, t, S, N, J, M, T, LI, LS, LF, RATES, LIMITS, ORDER, C, G, keys):
                     starters[count] = s
                     count += 1
-            renew(s, S)
+            renew(s, S, N)
         if count > 0:
-            start(starters, count, t, S, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiver, gain, fade, keys, C, F)
+            start(
+                starters, count, t, S, N, D, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiver, gain, fade, keys, C, F
+            )
         if told > 0:
             return t, told
 
@@ -980,8 +1035,9 @@ def fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, 
 
 
 @loop
-def submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, J):
+def submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, N, D, J):
     """A job comes to its station at a time that is not yet over."""
+    mark(station, 1, D)
     fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, J)
     before, following = -1, S[station, COMING]
     while following >= 0 and J[following, READY_AT] <= at:
@@ -989,13 +1045,13 @@ def submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes
     J[job, FOLLOWING] = following
     if before < 0:
         S[station, COMING], S[station, ARRIVE_AT] = job, at
-        renew(station, S)
+        renew(station, S, N)
     else:
         J[before, FOLLOWING] = job
 
 
 @loop
-def cancel(job, t, S, J, requests):
+def cancel(job, t, S, N, D, J, requests):
     """Take a job out, wherever it is; a frame of it that is on the air goes on to its end.
 
     With `requests`, one whose fragments are unanswered leaves a block-ack request at the head: the receiver must not wait
@@ -1004,6 +1060,7 @@ def cancel(job, t, S, J, requests):
     repeated while there is more for that receiver.
     """
     s = J[job, STATION]
+    mark(s, 1, D)
     before, at = -1, S[s, COMING]
     while at >= 0 and at != job:
         before, at = at, J[at, FOLLOWING]
@@ -1021,12 +1078,13 @@ def cancel(job, t, S, J, requests):
             S[s, TX_JOB] = -1
     else:
         remove(job, t, S, J)
-    renew(s, S)
+    renew(s, S, N)
 
 
 @loop
-def substitute(old, job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, J):
+def substitute(old, job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, D, J):
     """A job takes the place of one that waits in its station's queue; false if that one does not wait there."""
+    mark(station, 1, D)
     is_first = S[station, COMING] == old
     before = S[station, HEAD + access_class]
     while before >= 0 and J[before, FOLLOWING] != old:
@@ -1062,67 +1120,65 @@ copy_bytes = intrinsic(_copy_bytes)
 
 
 @part
+def copy_station(
+    s, what, S, W, WHY, J, M, T, SEG_AT, SEG, S2, W2, WHY2, J2, M2, T2, SEG_AT2, SEG2, begin
+):  # fmt: skip
+    """Make a station's rows equal in the second state, with its links' and its jobs'; what is not in use is left out."""
+    copy_bytes(S2[s].ctypes.data, S[s].ctypes.data, 8 * STATION_COLUMNS)
+    if what == 2 and S[s, TX_END] != FAR:
+        for k in range(begin[s], begin[s + 1]):
+            W2[k], WHY2[k] = W[k], WHY[k]
+    if S[s, TX_JOB] >= 0 or S[s, HEAD] >= 0 or S[s, HEAD_LOW] >= 0:
+        copy_bytes(M2[s].ctypes.data, M[s].ctypes.data, M.shape[1])
+        copy_bytes(T2[s].ctypes.data, T[s].ctypes.data, 4 * T.shape[1])
+    if S[s, LOCK] >= 0:
+        for k in range(S[s, SEGMENTS]):
+            SEG_AT2[s, k], SEG2[s, k] = SEG_AT[s, k], SEG[s, k]
+    for column in (COMING, HEAD, HEAD_LOW):
+        x = S[s, column]
+        while x >= 0:
+            copy_bytes(J2[x].ctypes.data, J[x].ctypes.data, 8 * JOB_COLUMNS)
+            x = J[x, FOLLOWING]
+
+
+@part
 def copy(
-    S,
-    P,
-    W,
-    WHY,
-    G,
-    J,
-    M,
-    T,
-    SEG_AT,
-    SEG,
-    LS,
-    DROPS,
-    S2,
-    P2,
-    W2,
-    WHY2,
-    G2,
-    J2,
-    M2,
-    T2,
-    SEG_AT2,
-    SEG2,
-    LS2,
-    DROPS2,
-    begin,
-    C,
-):
-    """Make the second state equal to the first; what is not in use is left out."""
-    copy_bytes(S2.ctypes.data, S.ctypes.data, 8 * S.size)
+    S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, S2, N2, P2, W2, WHY2, G2, J2, M2, T2, SEG_AT2, SEG2, LS2,
+    DROPS2, begin, C,
+):  # fmt: skip
+    """Make the second state equal to the first, where they differ: a station that hears nothing costs nothing."""
+    for k in range(1, D[0] + 1):  # first of all, for a row may have become another station's
+        for column in (COMING, HEAD, HEAD_LOW):
+            x = S2[D[k], column]
+            while x >= 0:
+                J2[x, IS_LIVE] = 0
+                x = J2[x, FOLLOWING]
+    for k in range(1, D[0] + 1):
+        s = D[k]
+        flag = (D.shape[0] + 1) // 2 + s
+        copy_station(
+            s, D[flag], S, W, WHY, J, M, T, SEG_AT, SEG, S2, W2, WHY2, J2, M2, T2, SEG_AT2, SEG2, begin
+        )  # fmt: skip
+        D[flag] = 0
+    D[0] = 0
+    copy_bytes(N2.ctypes.data, N.ctypes.data, 8 * N.size)
     copy_bytes(P2.ctypes.data, P.ctypes.data, 8 * P.size)
     copy_bytes(G2.ctypes.data, G.ctypes.data, 8 * G.size)
-    for x in range(J.shape[0]):
-        if J[x, IS_LIVE] == 1:
-            copy_bytes(J2[x].ctypes.data, J[x].ctypes.data, 8 * JOB_COLUMNS)
-        else:
-            J2[x, IS_LIVE] = 0
     if C[C_LEARNS] == 1:
         for x in range(LS.shape[0]):
             for m in range(LS.shape[1]):
                 LS2[x, m, 0], LS2[x, m, 1] = LS[x, m, 0], LS[x, m, 1]
-    for s in range(S.shape[0]):
-        if S[s, TX_END] != FAR:
-            for k in range(begin[s], begin[s + 1]):
-                W2[k], WHY2[k] = W[k], WHY[k]
-        if S[s, TX_JOB] >= 0 or S[s, HEAD] >= 0 or S[s, HEAD_LOW] >= 0:
-            copy_bytes(M2[s].ctypes.data, M[s].ctypes.data, M.shape[1])
-            copy_bytes(T2[s].ctypes.data, T[s].ctypes.data, 4 * T.shape[1])
-        if S[s, LOCK] >= 0:
-            for k in range(S[s, SEGMENTS]):
-                SEG_AT2[s, k], SEG2[s, k] = SEG_AT[s, k], SEG[s, k]
     for x in range(DROPS[0, 0] + 1):
         DROPS2[x, 0], DROPS2[x, 1] = DROPS[x, 0], DROPS[x, 1]
 
 
 @loop
-def relink(S, P, W, WHY, old_begin, old_receiver, old_why, begin, receiver, gain, fade, keys, C):
+def relink(S, N, D, P, W, WHY, old_begin, old_receiver, old_why, begin, receiver, gain, fade, keys, C):
     """The list of links is another one: find the frames on the air in it."""
     for j in range(C[C_STATIONS]):
+        mark(j, 2, D)
         P[j] = 0.0
-        S[j, INCIDENT] = 0
+        N[INCIDENT, j] = 0
         if S[j, LOCK] >= 0:
             S[j, LOCK_LINK] = link_of(S[j, LOCK], j, begin, receiver, C)
             if S[j, LOCK_LINK] < 0:
@@ -1140,7 +1196,7 @@ def relink(S, P, W, WHY, old_begin, old_receiver, old_why, begin, receiver, gain
             WHY[k] = old_why[at] if at < old_begin[s + 1] and old_receiver[at] == j else WEAK
             W[k] = gain[k] * fade[mix((mix(keys[s] + counter) ^ keys[j]) + np.uint64(1)) & _LEVEL]
             P[j] += W[k]
-            S[j, INCIDENT] += 1
+            N[INCIDENT, j] += 1
 
 
 def _pointer(_, address):
@@ -1161,42 +1217,45 @@ def ahead(at, since, until):
     """Bring the first state up to `since`, and run a copy of it ahead; no copy where its drops must be read first.
 
     Arrays come by address, for numba looks at each array that it is handed, which costs more than most runs:
-    `SIZES` sizes, the 12 arrays of the first state, those of its copy, and what they share. An `until` before `since` is no copy.
+    `SIZES` sizes, the 13 arrays of the first state, those of its copy, and what they share. An `until` before `since` is no copy.
 
     Returns: the time that the copy has reached, or the first state where there is none, and as `run`.
     """
     n, links, jobs, window, flows, mcs, drops, extras = at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7]
     S = carray(pointer(at[8]), (n, STATION_COLUMNS), np.int64)
-    P = carray(pointer(at[9]), (n,), np.float64)
-    W = carray(pointer(at[10]), (links,), np.float64)
-    WHY = carray(pointer(at[11]), (links,), np.uint8)
-    G = carray(pointer(at[12]), (5,), np.int64)
-    J = carray(pointer(at[13]), (jobs, JOB_COLUMNS), np.int64)
-    M = carray(pointer(at[14]), (n, window), np.uint8)
-    T = carray(pointer(at[15]), (n, window), np.int32)
-    SEG_AT = carray(pointer(at[16]), (n, OVERLAPS), np.int64)
-    SEG = carray(pointer(at[17]), (n, OVERLAPS), np.float64)
-    LS = carray(pointer(at[18]), (flows, mcs + 1, 2), np.int64)
-    DROPS = carray(pointer(at[19]), (drops, 2), np.int64)
-    LI = carray(pointer(at[32]), (flows, FLOW_COLUMNS), np.int64)
-    LF = carray(pointer(at[33]), (flows, 3), np.float64)
-    OUT = carray(pointer(at[34]), (2 * n + 8, 2), np.int64)
-    TOUCH = carray(pointer(at[35]), (2 * n + 2,), np.int64)
-    begin = carray(pointer(at[36]), (n + 1,), np.int64)
-    receiver = carray(pointer(at[37]), (links,), np.int64)
-    gain = carray(pointer(at[38]), (links,), np.float64)
-    extra = carray(pointer(at[39]), (extras,), np.float64)
-    fade = carray(pointer(at[40]), (1 << 16,), np.float32)
-    keys = carray(pointer(at[41]), (n,), np.uint64)
-    RATES = carray(pointer(at[42]), (mcs,), np.float64)
-    LIMITS = carray(pointer(at[43]), (mcs,), np.int64)
-    ORDER = carray(pointer(at[44]), (flows, mcs), np.int64)
-    C = carray(pointer(at[45]), (17,), np.int64)
-    F = carray(pointer(at[46]), (4,), np.float64)
-    curves = carray(pointer(at[47]), (14, 5), np.float64)
+    N = carray(pointer(at[9]), (2, n), np.int64)
+    P = carray(pointer(at[10]), (n,), np.float64)
+    W = carray(pointer(at[11]), (links,), np.float64)
+    WHY = carray(pointer(at[12]), (links,), np.uint8)
+    G = carray(pointer(at[13]), (5,), np.int64)
+    J = carray(pointer(at[14]), (jobs, JOB_COLUMNS), np.int64)
+    M = carray(pointer(at[15]), (n, window), np.uint8)
+    T = carray(pointer(at[16]), (n, window), np.int32)
+    SEG_AT = carray(pointer(at[17]), (n, OVERLAPS), np.int64)
+    SEG = carray(pointer(at[18]), (n, OVERLAPS), np.float64)
+    LS = carray(pointer(at[19]), (flows, mcs + 1, 2), np.int64)
+    DROPS = carray(pointer(at[20]), (drops, 2), np.int64)
+    D = carray(pointer(at[34]), (2 * n + 1,), np.int64)
+    LI = carray(pointer(at[35]), (flows, FLOW_COLUMNS), np.int64)
+    LF = carray(pointer(at[36]), (flows, 3), np.float64)
+    OUT = carray(pointer(at[37]), (2 * n + 8, 2), np.int64)
+    TOUCH = carray(pointer(at[38]), (2 * n + 2,), np.int64)
+    begin = carray(pointer(at[39]), (n + 1,), np.int64)
+    receiver = carray(pointer(at[40]), (links,), np.int64)
+    gain = carray(pointer(at[41]), (links,), np.float64)
+    extra = carray(pointer(at[42]), (extras,), np.float64)
+    fade = carray(pointer(at[43]), (1 << 16,), np.float32)
+    keys = carray(pointer(at[44]), (n,), np.uint64)
+    RATES = carray(pointer(at[45]), (mcs,), np.float64)
+    LIMITS = carray(pointer(at[46]), (mcs,), np.int64)
+    ORDER = carray(pointer(at[47]), (flows, mcs), np.int64)
+    C = carray(pointer(at[48]), (17,), np.int64)
+    F = carray(pointer(at[49]), (5,), np.float64)
+    curves = carray(pointer(at[50]), (14, 5), np.float64)
     reached, told = run(
         since,
         S,
+        N,
         P,
         W,
         WHY,
@@ -1208,6 +1267,7 @@ def ahead(at, since, until):
         SEG,
         LS,
         DROPS,
+        D,
         LI,
         LF,
         OUT,
@@ -1227,49 +1287,27 @@ def ahead(at, since, until):
     )
     if until < since or told < 0:
         return reached, told
-    S2 = carray(pointer(at[20]), (n, STATION_COLUMNS), np.int64)
-    P2 = carray(pointer(at[21]), (n,), np.float64)
-    W2 = carray(pointer(at[22]), (links,), np.float64)
-    WHY2 = carray(pointer(at[23]), (links,), np.uint8)
-    G2 = carray(pointer(at[24]), (5,), np.int64)
-    J2 = carray(pointer(at[25]), (jobs, JOB_COLUMNS), np.int64)
-    M2 = carray(pointer(at[26]), (n, window), np.uint8)
-    T2 = carray(pointer(at[27]), (n, window), np.int32)
-    SEG_AT2 = carray(pointer(at[28]), (n, OVERLAPS), np.int64)
-    SEG2 = carray(pointer(at[29]), (n, OVERLAPS), np.float64)
-    LS2 = carray(pointer(at[30]), (flows, mcs + 1, 2), np.int64)
-    DROPS2 = carray(pointer(at[31]), (drops, 2), np.int64)
+    S2 = carray(pointer(at[21]), (n, STATION_COLUMNS), np.int64)
+    N2 = carray(pointer(at[22]), (2, n), np.int64)
+    P2 = carray(pointer(at[23]), (n,), np.float64)
+    W2 = carray(pointer(at[24]), (links,), np.float64)
+    WHY2 = carray(pointer(at[25]), (links,), np.uint8)
+    G2 = carray(pointer(at[26]), (5,), np.int64)
+    J2 = carray(pointer(at[27]), (jobs, JOB_COLUMNS), np.int64)
+    M2 = carray(pointer(at[28]), (n, window), np.uint8)
+    T2 = carray(pointer(at[29]), (n, window), np.int32)
+    SEG_AT2 = carray(pointer(at[30]), (n, OVERLAPS), np.int64)
+    SEG2 = carray(pointer(at[31]), (n, OVERLAPS), np.float64)
+    LS2 = carray(pointer(at[32]), (flows, mcs + 1, 2), np.int64)
+    DROPS2 = carray(pointer(at[33]), (drops, 2), np.int64)
     copy(
-        S,
-        P,
-        W,
-        WHY,
-        G,
-        J,
-        M,
-        T,
-        SEG_AT,
-        SEG,
-        LS,
-        DROPS,
-        S2,
-        P2,
-        W2,
-        WHY2,
-        G2,
-        J2,
-        M2,
-        T2,
-        SEG_AT2,
-        SEG2,
-        LS2,
-        DROPS2,
-        begin,
-        C,
-    )
+        S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, S2, N2, P2, W2, WHY2, G2, J2, M2, T2, SEG_AT2, SEG2, LS2,
+        DROPS2, begin, C,
+    )  # fmt: skip
     return run(
         until,
         S2,
+        N2,
         P2,
         W2,
         WHY2,
@@ -1281,6 +1319,7 @@ def ahead(at, since, until):
         SEG2,
         LS2,
         DROPS2,
+        D,
         LI,
         LF,
         OUT,

@@ -39,6 +39,8 @@ PREAMBLE_SINR_DB = 4.0
 """Below this ratio of signal to interference and noise, a preamble is not detected."""
 ENERGY_OVER_PREAMBLE_DB = 20.0
 """A frame of which a station has missed the begin is sensed by its energy, if it is so much above the weakest preamble."""
+FAINT_DB = 3.0
+"""A link is faint if its highest fade stays so far below the weakest preamble."""
 _NS = 1e-9
 _AHEAD_NS = 100_000_000
 """A plan goes no further than this; frames of the flight change the links as often."""
@@ -83,12 +85,12 @@ class _State:
         self.table: IntArray | None = None
         """Sizes and addresses for `edca.ahead`; None when one of the arrays has become another."""
 
-    def blank(self) -> _State:
-        """Another one of the same sizes, for a run to fill."""
-        return _State(tuple(np.zeros(a.shape, a.dtype) for a in self.arrays), self.jobs, self.now_ns)
+    def copy(self) -> _State:
+        """Another one that is equal."""
+        return _State(tuple(a.copy() for a in self.arrays), self.jobs, self.now_ns)
 
 
-_S, _P, _W, _WHY, _G, _J, _M, _T, _SEG_AT, _SEG, _LS, _DROPS = range(12)
+_S, _N, _P, _W, _WHY, _G, _J, _M, _T, _SEG_AT, _SEG, _LS, _DROPS = range(13)
 _JOBS, _FLOWS = 16, 32
 _DROPS_KEPT = 8192
 """Given up fragments that a run keeps before they must be read, at the least."""
@@ -158,7 +160,7 @@ class Medium(Generic[J, F]):
         self._curves = np.column_stack((centre_db, slope, weight, sure, even))
         self._window = window = int(self._ints[e.C_BLOCK])
         stations = np.zeros((n, e.STATION_COLUMNS), np.int64)
-        for column in (e.TX_END, e.RESPONSE_AT, e.TIMEOUT_AT, e.GRANT, e.GRANT_LOW, e.ARRIVE_AT, e.NEXT_AT):
+        for column in (e.TX_END, e.RESPONSE_AT, e.TIMEOUT_AT, e.GRANT, e.GRANT_LOW, e.ARRIVE_AT):
             stations[:, column] = e.FAR
         for column in (e.LOCK, e.CANDIDATE, e.HEAD, e.HEAD_LOW, e.TAIL, e.TAIL_LOW, e.COMING, e.TX_JOB):
             stations[:, column] = -1
@@ -170,7 +172,7 @@ class Medium(Generic[J, F]):
         mcs = len(self._rates)
         self._settled = _State(
             (
-                stations, np.zeros(n), np.zeros(n * n), np.zeros(n * n, np.uint8), np.zeros(5, np.int64),
+                stations, np.vstack([np.full(n, e.FAR), np.zeros(n, np.int64)]), np.zeros(n), np.zeros(0), np.zeros(0, np.uint8), np.zeros(5, np.int64),
                 np.zeros((_JOBS, e.JOB_COLUMNS), np.int64), np.zeros((n, window), np.uint8),
                 np.zeros((n, window), np.int32), np.zeros((n, e.OVERLAPS), np.int64), np.zeros((n, e.OVERLAPS)),
                 np.zeros((_FLOWS, mcs + 1, 2), np.int64), np.zeros((_DROPS_KEPT + n * window, 2), np.int64),
@@ -178,7 +180,8 @@ class Medium(Generic[J, F]):
             _JOBS, self._ns(env.now) - 1,
         )  # fmt: skip
         self._settled.arrays[_G][e.G_SINCE] = self._ns(env.now)
-        self._planned = self._settled.blank()
+        self._planned = self._settled.copy()
+        self._differing = np.zeros(2 * n + 1, np.int64)
         self._flow_ints = np.zeros((_FLOWS, e.FLOW_COLUMNS), np.int64)
         self._flow_floats = np.zeros((_FLOWS, 3))
         self._orders = np.zeros((_FLOWS, mcs), np.int64)
@@ -241,13 +244,13 @@ class Medium(Generic[J, F]):
                 settled = self._settled
             a = settled.arrays
             if len(old[1]):
-                e.relink(a[_S], a[_P], a[_W], a[_WHY], old[0], old[1], old[2].copy(), begin, receiver, gain,
+                e.relink(a[_S], a[_N], self._differing, a[_P], a[_W], a[_WHY], old[0], old[1], old[2].copy(), begin, receiver, gain,
                          self._fade, self._keys, ints)  # fmt: skip
         self.replan()
 
     def _share(self) -> None:
         self._shared = (
-            self._flow_ints, self._flow_floats, self._out, self._touch, self._begin, self._receiver, self._gain, self._extra, self._fade, self._keys,
+            self._differing, self._flow_ints, self._flow_floats, self._out, self._touch, self._begin, self._receiver, self._gain, self._extra, self._fade, self._keys,
             self._rates, self._limits, self._orders, self._ints, self._floats, self._curves,
         )  # fmt: skip
         self._settled.table = self._planned.table = None
@@ -309,7 +312,7 @@ class Medium(Generic[J, F]):
         if len(queue) == 1:
             self._on_begin(job, now_s)
         settled = self._settled.arrays
-        self._e.submit(*entry, settled[_S], settled[_J])
+        self._e.submit(*entry, settled[_S], settled[_N], self._differing, settled[_J])
         self.replan()
 
     def replace(self, old: J, new: J) -> None:
@@ -324,7 +327,7 @@ class Medium(Generic[J, F]):
             self.read(old)
             entry = self._enter(new, now_s)
             a = self._settled.arrays
-            if self._e.substitute(old.row, *entry, a[_S], a[_J]):
+            if self._e.substitute(old.row, *entry, a[_S], self._differing, a[_J]):
                 queue[queue.index(old)] = new
                 self._leave(old, now_s)
                 self.replan()
@@ -372,7 +375,7 @@ class Medium(Generic[J, F]):
     def _take(self, job: J, *, requests: bool) -> None:
         self.read(job)
         a, now_s = self._settled.arrays, self._env.now
-        self._e.cancel(job.row, round(now_s * 1e9), a[_S], a[_J], requests)
+        self._e.cancel(job.row, round(now_s * 1e9), a[_S], a[_N], self._differing, a[_J], requests)
         self._leave(job, now_s)
 
     def _leave(self, job: J, now_s: float) -> None:
@@ -450,10 +453,10 @@ class Medium(Generic[J, F]):
         length, settled = frame.wire_bytes, self._settled.arrays
         at_ns, air_ns = round((self._env.now + in_s) * 1e9), round(frame.airtime_s * 1e9)
         entry = (row, self._e.GROUP, frame.sender, 0, self._group_access, 1, length, length, air_ns, at_ns)
-        self._e.submit(*entry, settled[_S], settled[_J])
+        self._e.submit(*entry, settled[_S], settled[_N], self._differing, settled[_J])
         if self._timer is not None and at_ns > self._planned.now_ns and not self._is_telling:
             planned = self._planned.arrays  # the plan stands: it ends before
-            self._e.submit(*entry, planned[_S], planned[_J])
+            self._e.submit(*entry, planned[_S], planned[_N], self._differing, planned[_J])
         else:
             self.replan()
 
@@ -464,10 +467,10 @@ class Medium(Generic[J, F]):
         rows = a[_J]
         is_request = (rows[:, e.IS_LIVE] == 1) & (rows[:, e.STATION] == sender) & (rows[:, e.KIND] == e.BLOCK_REQUEST)
         for row in np.flatnonzero(is_request).tolist():
-            e.cancel(row, self._ns(self._env.now), a[_S], rows, False)
+            e.cancel(row, self._ns(self._env.now), a[_S], a[_N], self._differing, rows, False)
         for row, frame in list(self._at_row.items()):
             if isinstance(frame, GroupFrame) and frame.sender == sender and a[_S][sender, e.TX_JOB] != row:
-                e.cancel(row, self._ns(self._env.now), a[_S], a[_J], False)
+                e.cancel(row, self._ns(self._env.now), a[_S], a[_N], self._differing, a[_J], False)
                 self._finished.append(row)
                 del self._at_row[row]
         self.replan()
@@ -627,7 +630,8 @@ def _tables(
     legacy_noise = 20.0 / settings.bandwidth_mhz
     over_noise = 10.0 ** ((settings.preamble_detection_dbm - noise_dbm) / 10.0)
     energy = over_noise * 10.0 ** (ENERGY_OVER_PREAMBLE_DB / 10.0)
-    floats = np.array([over_noise, 10.0 ** (PREAMBLE_SINR_DB / 10.0), legacy_noise, energy])
+    faint = over_noise * 10.0 ** (-FAINT_DB / 10.0) / float(fade_table(settings.rician_k_db).max())
+    floats = np.array([over_noise, 10.0 ** (PREAMBLE_SINR_DB / 10.0), legacy_noise, energy, faint])
     tables = ints, floats, np.array(rates) * 1e-3, np.array(limits, np.int64)
     return tables, (used.index(names.index(settings.context_class)), used.index(names.index(settings.payload_class)))
 

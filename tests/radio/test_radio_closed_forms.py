@@ -101,7 +101,7 @@ def test_a_measurement_that_is_too_old_bounds_no_new_one() -> None:
     late.measured(0, 1, 70.0, 1.0)
     late.measured(0, 1, 90.0, 1.0 + MEASURED_FOR_S)
     assert 70.0 < late.read(0, 1.0 + MEASURED_FOR_S)[1] < 90.0
-    assert np.isfinite(late.read(0, 4.0)).all()
+    assert np.isfinite(list(late.read(0, 4.0).values())).all()
 
 
 @pytest.mark.parametrize("payload", [100, 2000, 40 * 1344, 100 * 1344 + 5])

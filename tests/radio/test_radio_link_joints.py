@@ -87,16 +87,16 @@ def test_a_measurement_counts_for_as_long_as_it_says() -> None:
     known.measured(0, 1, 40.0, 1.0)
     assert known.read(0, 1.0 + MEASURED_FOR_S)[1] == 40.0
     known.measured(0, 2, 10.0, 1.0 + MEASURED_FOR_S)
-    assert known.read(0, 1.0 + MEASURED_FOR_S + 1e-6) == [0.0, 0.0, 10.0]
+    assert known.read(0, 1.0 + MEASURED_FOR_S + 1e-6) == {2: 10.0}
     known.measured(0, 2, 60.0, 2.0 + 2 * MEASURED_FOR_S)  # the one before is too old to rise from
     assert known.read(0, 2.0 + 2 * MEASURED_FOR_S)[2] == 60.0
-    assert known.read(1, 1.0) == [0.0] * 3
+    assert known.read(1, 1.0) == {}
 
 
 def test_a_wait_bounds_what_is_known_and_says_nothing_of_what_is_not() -> None:
     known = Goodput(2)
     known.bounded(0, 1, 5.0)
-    assert known.read(0, 0.0)[1] == 0.0
+    assert known.read(0, 0.0) == {}
     known.measured(0, 1, 20.0, 0.0)
     known.bounded(0, 1, 50.0)
     assert known.read(0, 0.0)[1] == 20.0

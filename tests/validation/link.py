@@ -83,7 +83,7 @@ def fades_db(settings: AirSettings, n: int, frames: int, seed: int = 1, per_fram
     found: list[list[np.ndarray]] = [[] for _ in range(n)]
 
     def end(frame: GroupFrame, receivers: np.ndarray, fates: bytes) -> None:
-        power = medium._settled.arrays[2].reshape(n, n)[frame.sender]  # as the kernel has it of the last frame
+        power = medium._settled.arrays[3].reshape(n, n)[frame.sender]  # as the kernel has it of the last frame
         found[frame.sender].append(10.0 * np.log10(np.where(np.arange(n) == frame.sender, np.nan, power / gain)))
 
     medium = Medium[AirJob, GroupFrame](env, settings, n, seed, 0, -88.0, lambda *_: None, lambda *_: None, end)

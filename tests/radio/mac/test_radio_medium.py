@@ -560,7 +560,7 @@ def test_nobody_begins_to_send_on_a_medium_that_it_senses_busy(traffic: list, po
     stations = arrays[0]
     busy_since = np.full(4, 10**18)
     for _ in range(3000):
-        t = int(stations[:, edca.NEXT_AT].min())
+        t = int(arrays[1][edca.NEXT_AT].min())
         if t == edca.FAR:
             break
         before = stations.copy()
@@ -573,7 +573,7 @@ def test_nobody_begins_to_send_on_a_medium_that_it_senses_busy(traffic: list, po
         for s in range(4):
             if stations[s, edca.IS_BUSY] and not before[s, edca.IS_BUSY]:
                 busy_since[s] = t
-        assert ((arrays[1] >= 0.0) & (arrays[1] < 1e9)).all()
+        assert ((arrays[2] >= 0.0) & (arrays[2] < 1e9)).all()
 
 
 def test_it_never_polls() -> None:
