@@ -85,7 +85,7 @@ class Modem(Protocol):
     def broadcast(self, datagram: bytes) -> None: ...
     def send(self, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None: ...
     def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None: ...
-    def goodput_mbps(self) -> tuple[float, ...]: ...
+    def goodput_mbps(self, to: Sequence[int] | None = None, /) -> tuple[float, ...]: ...
 
 
 Ages = Sequence[float] | NDArray[np.float64]
@@ -188,6 +188,8 @@ class Agent:
         self._alert = False  # whether it knows of a person in its region
         self._last_own: Descriptor | None = None  # published or not
         self._roster = Roster(0, (self.drone,))
+        self._listed: NDArray[np.int64] = np.empty(0, np.int64)
+        """Those to whom its descriptor lists goodput."""
         self._chart = Chart()
         self._clock_off_s = 0.0
         self._look: Sensed | None = None
@@ -266,10 +268,7 @@ class Agent:
         grid, novel = self._covered(capture.t_s, here, due)
         soc, cpu_headroom, gpu_headroom = self._senses.platform()
         phase, region, target_ids, person = self._senses.task()
-        roster = self._renew_roster() if self._rules.roster else None
-        measured_mbps = self._modem.goodput_mbps()
-        if roster is not None:  # with room for the probes of drones beyond the scenario's fleet
-            measured_mbps += (0.0,) * (roster.members[-1] - len(measured_mbps))
+        roster = self._renew_roster(capture.est_position_m) if self._rules.roster else None
         descriptor = Descriptor(
             stamp_ns=round((capture.t_s + self.status.clock_skew_s) * 1e9),
             agent_id=self.drone,
@@ -280,17 +279,16 @@ class Agent:
             battery_soc=soc,
             cpu_headroom=cpu_headroom,
             gpu_headroom=gpu_headroom,
-            peer_goodput_mbps=self.memory.probes.fill(self.drone, measured_mbps, self._env.now, self.memory.ids),
+            peer_goodput_mbps=self._goodput_mbps(),
             coverage_grid=grid,
             novelty_flags=NOVEL_FLAG * novel + TARGET_FLAG * bool(target_ids) + PERSON_FLAG * person,
             task_phase=phase,
             region=region,
             priority_target_ids=target_ids,
             feature_space=self.status.feature_space,
+            roster=roster,
             codebook=self.status.codebook,
         )
-        if roster is not None:
-            descriptor = descriptor.with_roster(roster)
         if self._last_own is not None:
             # by the publisher, not by those who hear it: what they read would depend on which packets they lost
             descriptor = apply_hysteresis(self._last_own, descriptor, self._rules.hysteresis)
@@ -307,12 +305,24 @@ class Agent:
         # a drone that lies decides by its true state
         return decode_descriptor(payload if claimed is descriptor else self._encode(descriptor))
 
-    def _renew_roster(self) -> Roster:
+    def _renew_roster(self, here_m: tuple[float, float, float]) -> Roster:
         """The drone's roster by what it has heard up to now; a new epoch where that is another set."""
-        members = self.memory.view(self._env.now).members
+        members = self.memory.members(self._env.now, here_m)
         if members != self._roster.members:
             self._roster = Roster(self._roster.epoch + 1, members)
+            self._listed = np.array([i for i in members if i != self.drone], np.int64)
         return self._roster
+
+    def _goodput_mbps(self) -> tuple[float, ...]:
+        """Goodput to the other members of its roster, to the scenario's whole fleet without one; probes stand where none was measured."""
+        if self._rules.roster:
+            measured_mbps = self._modem.goodput_mbps(self._listed.tolist())
+        else:
+            measured_mbps = self._modem.goodput_mbps()
+            if len(measured_mbps) != len(self._listed):
+                others = [i for i in range(len(measured_mbps) + 1) if i != self.drone]
+                self._listed = np.array(others[: len(measured_mbps)], np.int64)
+        return self.memory.probes.fill(self._listed, measured_mbps, self._env.now)
 
     def _covered(self, now_s: float, here: View, told: bool) -> tuple[bytes, bool]:
         """The coverage grid, by the latest look, and whether it shows what the fleet had not seen; nothing without a look."""

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.scenarios.disc import AGENT_IDS
+from sortie.fleet.peers import FEWEST_COLUMNS
 from sortie.scenarios.schema import Clocks
 from sortie.scenarios.streams import stream
 
@@ -80,8 +80,8 @@ class PeerClocks:
         watched: [ids] gets whether every lag of a peer counts: its clock showed an offset lately.
         """
         self.delay_s = delay_s
-        self._ahead_s = np.zeros(AGENT_IDS) if ahead_s is None else ahead_s
-        self._watched = np.zeros(AGENT_IDS, np.uint8) if watched is None else watched
+        self._ahead_s = np.zeros(FEWEST_COLUMNS) if ahead_s is None else ahead_s
+        self._watched = np.zeros(FEWEST_COLUMNS, np.uint8) if watched is None else watched
         self.offset_s: dict[int, float] = {}
         """By peer; peers without a visible offset are left out. Each is known to ± `delay_s` / 2."""
         self._lags: dict[int, deque[float]] = {}

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from sortie.fleet import tiles
-from sortie.fleet.messages.wire import DIRECTIVE_BYTES
+from sortie.fleet.messages.wire import directive_bytes
 from sortie.perception import budget
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes
@@ -113,7 +113,7 @@ def make_payload(
         NAME_OF[rung], cells=cells, boxes=boxes, classes=classes, code_bytes=code_bytes
     )  # fmt: skip
     return Payload(
-        rung, rho, roi, weight, cells, boxes, index_bytes, HEADER_BYTES + DIRECTIVE_BYTES + content_bytes,
+        rung, rho, roi, weight, cells, boxes, index_bytes, HEADER_BYTES + directive_bytes(directive) + content_bytes,
         tracks=tracks, people=people, code_bytes=code_bytes if rung == _CODES else 0,
     )  # fmt: skip
 

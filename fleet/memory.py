@@ -14,6 +14,7 @@ from sortie.fleet.clock import PeerClocks
 from sortie.fleet.coverage import LOOK_STANDS_S
 from sortie.fleet.gate import Payload
 from sortie.fleet.messages.auth import Dropped, DropReason, Opened
+from sortie.fleet.messages.extensions import MAX_WIDE_MEMBERS, WIDE_FROM
 from sortie.fleet.peers import PeerTable, loops
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.probes import Probes, window_of
@@ -28,7 +29,7 @@ from sortie.fleet.trust import (
     split_arrivals,
 )
 from sortie.perception.types import Capture
-from sortie.policies.contract import Descriptor, FleetView
+from sortie.policies.contract import ROUNDING_PERIODS, Descriptor, FleetView
 from sortie.scenarios.representation import MAPS, Representation
 
 _FEATURES, _CODES = Representation.FEATURES, Representation.CODES  # slow to look up, each time
@@ -168,6 +169,16 @@ class PeerMemory:
             self.drone, self._period_s, MappingProxyType(known), by_peer, self._rules.detached_after_periods
         )
 
+    def members(self, now_s: float, here_m: tuple[float, float, float]) -> tuple[int, ...]:
+        """Ids of the drone and its attached peers, ascending; of the peers that claim to be nearest, where a descriptor cannot
+        list them all."""
+        limit_s = (self._rules.detached_after_periods + ROUNDING_PERIODS) * self._period_s
+        found = self.ids[(self.ages(now_s) <= limit_s) & (self.ids != self.drone)]
+        if len(found) >= MAX_WIDE_MEMBERS and found[-1] >= WIDE_FROM:
+            away_m = np.linalg.norm(np.array([self._known[i].position_m for i in found.tolist()]) - here_m, axis=1)
+            found = found[np.argsort(away_m, kind="stable")[: MAX_WIDE_MEMBERS - 1]]
+        return tuple(sorted([self.drone, *found.tolist()]))
+
     def believed(self) -> list[Descriptor]:
         """The latest descriptors of the peers that it does not doubt."""
         return [d for i, d in self._known.items() if i != self.drone and i not in self._doubted]
@@ -229,6 +240,8 @@ def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float
     descriptor, key_id, counter = opened
     sender, first = descriptor.agent_id, receivers[0]
     table, rules = first.table, first._rules
+    if sender >= table.heard_s.shape[1]:  # no drone of this fleet has such an id
+        return [(memory.drone, DropReason.MALFORMED) for memory in receivers]
     module = loops()
     found = module.hear(
         np.array([memory.row for memory in receivers]), table.first,

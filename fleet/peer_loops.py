@@ -78,14 +78,15 @@ def hear(
 
 
 @compiled
-def fill(me, now_s, period_s, window, ids, heard_s, bits, mbps, known):
-    """Let probes stand where nothing was measured: changes `known`, [N − 1] goodputs of drone `me` by ascending id."""
-    for peer in ids:
-        words, slot = bits[peer], peer - (peer > me)
-        if words[0] == 0 or slot >= len(known) or known[slot] > 0.0:
+def fill(now_s, period_s, window, peers, heard_s, bits, mbps, known):
+    """Let probes stand where nothing was measured: changes `known`, [K] goodputs to `peers`."""
+    for k in range(len(peers)):
+        peer = peers[k]
+        words = bits[peer]
+        if words[0] == 0 or known[k] > 0.0:
             continue
         missed = int((now_s - heard_s[peer]) / period_s - 0.5)
-        known[slot] = mbps[_count(words, window - max(0, min(missed, window)))]
+        known[k] = mbps[_count(words, window - max(0, min(missed, window)))]
 
 
 @compiled

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.scenarios.disc import AGENT_IDS
+FEWEST_COLUMNS = 256
+"""Other drones may have any id of a byte, whatever the scenario's fleet."""
 
 
 @cache
@@ -26,7 +27,7 @@ def loops() -> Any:
         ids, 0, none, 0, 0.0, 0.0, True, np.uint64(0), 1.0, 1.0, 1, square.astype(np.uint64), square, square,
         square.astype(np.uint8), bits[None],
     )  # fmt: skip
-    peer_loops.fill(0, 0.0, 1.0, 1, ids, none, bits, none, none)
+    peer_loops.fill(0.0, 1.0, 1, ids, none, bits, none, none)
     peer_loops.ages(0.0, 0.0, ids, none, none, none)
     peer_loops.overdue(0, 0.0, 1.0, 1.0, 1.0, 1.0, ids, none, none, flags, flags, flags)
     return peer_loops
@@ -43,7 +44,7 @@ class PeerTable:
 
     def __init__(self, receivers: int, window: int, first: int = 0) -> None:
         self.first, self.window = first, window
-        shape = (receivers, max(AGENT_IDS, first + receivers))
+        shape = (receivers, max(FEWEST_COLUMNS, first + receivers))
         self.heard_s = np.zeros(shape)
         """When the latest descriptor arrived."""
         self.stamps_s = np.zeros(shape)

@@ -30,17 +30,16 @@ class Probes:
         self._mbps = np.array([probed_mbps(arrived / table.window) for arrived in range(table.window + 1)])
         self._fill = loops().fill
 
-    def fill(self, me: int, goodput_mbps: Sequence[float], now_s: float, ids: NDArray[np.int64]) -> tuple[float, ...]:
+    def fill(self, peers: NDArray[np.int64], goodput_mbps: Sequence[float], now_s: float) -> tuple[float, ...]:
         """The goodputs of a drone's descriptor, Mb/s: measured ones stay, and probes stand for the others.
 
         A descriptor that is less than half a period overdue is not missed yet. Peers never heard stay 0.
 
         Args:
-            me: the drone.
-            goodput_mbps: as measured with payloads, to every other drone by ascending id; 0 without a measurement.
+            peers: [K], the drones that the goodputs are to.
+            goodput_mbps: [K], as measured with payloads; 0 without a measurement.
             now_s: the time, s.
-            ids: of the peers that may have been heard.
         """
         known = np.array(goodput_mbps, np.float64)
-        self._fill(me, now_s, self._period_s, self._window, ids, self._heard_s, self._bits, self._mbps, known)
+        self._fill(now_s, self._period_s, self._window, peers, self._heard_s, self._bits, self._mbps, known)
         return tuple(known.tolist())

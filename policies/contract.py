@@ -153,7 +153,12 @@ class Descriptor(NamedTuple):
 
     def with_roster(self, roster: Roster) -> Descriptor:
         """The same descriptor with this roster, and with goodputs to its members alone."""
-        goodput_mbps = tuple([self.goodput_to(i) for i in roster.members if i != self.agent_id])
+        me, members = self.agent_id, roster.members
+        if self.roster is None:
+            goodput_mbps = tuple([self.goodput_to(i) for i in members if i != me])
+        else:
+            known = dict(zip([i for i in self.roster.members if i != me], self.peer_goodput_mbps, strict=False))
+            goodput_mbps = tuple([known.get(i, 0.0) for i in members if i != me])
         return self._replace(peer_goodput_mbps=goodput_mbps, roster=roster)
 
 
@@ -322,7 +327,7 @@ def nothing(source: int, destination: int, reason: str) -> Directive:
     return Directive(source, destination, reason=reason)
 
 
-@lru_cache(maxsize=1 << 16)  # a few for each link of a hundred drones
+@lru_cache(maxsize=1 << 18)  # a few for each link of a thousand drones
 def _nothing(source: int, destination: int, reason: str) -> Directive:
     return Directive(source, destination, reason=reason)
 
@@ -334,7 +339,7 @@ def nothing_to_all(source: int, destinations: tuple[int, ...], reason: str) -> t
     return tuple([nothing(source, destination, reason) for destination in destinations])
 
 
-@lru_cache(maxsize=1 << 10)
+@lru_cache(maxsize=1 << 12)
 def _nothing_to_all(source: int, destinations: tuple[int, ...], reason: str) -> tuple[Directive, ...]:
     return tuple([_nothing(source, destination, reason) for destination in destinations])
 

@@ -9,7 +9,7 @@ import numpy as np
 from sortie.scenarios.compiled import compiled, part
 
 # constants of the file itself: kept machine code does not see that another file has changed
-_AGENT_IDS, _STEP = 256, 0.1
+_AGENT_IDS, _STEP = 1 << 16, 0.1
 
 
 @part

@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from math import acos, copysign, pi, sqrt
 from typing import NamedTuple
 
-AGENT_IDS = 256
-"""How many drone ids there are: an id is a byte."""
+AGENT_IDS = 1 << 16
+"""How many drone ids there are: an id is two bytes."""
+LISTED_IDS = 200
+"""In fleets up to this size a descriptor lists goodput by id; in larger ones to the members of its roster."""
 OVERLAP_STEP = 0.1
 """Overlaps are ranked in steps of a tenth, so that a metre of pose jitter does not reorder the peers."""
 
@@ -56,7 +58,7 @@ def rank_by_overlap(ego: int, overlap: Mapping[int, float]) -> list[int]:
     Policies in flight and the evaluation of recorded frames both rank peers by this function.
 
     Args:
-        ego: the id of the drone that receives, 0 … 255.
+        ego: the id of the drone that receives, 0 … 65,535.
         overlap: by peer, the share of the ego's footprint that the peer's footprint covers, 0 … 1.
     """
     # the step and the way round in one number, from which the id can be read again; most peers of a large fleet have 0

@@ -22,8 +22,9 @@ import numpy as np
 from sortie.fleet.coverage import pack_grid, unpack_grid
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.extensions import (
-    MAX_AGENT_ID,
+    WIDE_ID,
     append_extensions,
+    is_wide,
     listed_goodput,
     read_phase,
     with_extensions,
@@ -96,7 +97,7 @@ def encode_compact(d: Descriptor, form: Form) -> bytes:
     flags = (d.novelty_flags & 0x7F) | (_REGION_FLAG if region else 0)
     second, nanosecond = divmod(d.stamp_ns, 1_000_000_000)
     head = _HEAD.pack(
-        MAGIC, *form, second, nanosecond, d.agent_id, d.task_phase, flags, len(goodput), len(targets)
+        MAGIC, *form, second, nanosecond, WIDE_ID if is_wide(d) else d.agent_id, d.task_phase, flags, len(goodput), len(targets)
     )  # fmt: skip
     numbers = [
         *d.position_m, *d.orientation_xyzw, *d.velocity_mps, d.footprint_radius_m, d.battery_soc, d.cpu_headroom,
@@ -129,8 +130,6 @@ def decode_compact(data: bytes) -> Descriptor:
         raise MalformedDatagram(f"{len(data)} B, must be at least {size} with {peers} peers and {targets} targets")
     if nanosecond >= 1_000_000_000:
         raise MalformedDatagram(f"stamp.nanosec is {nanosecond}, must be below 10⁹")
-    if agent_id > MAX_AGENT_ID:
-        raise MalformedDatagram(f"agent_id is {agent_id}, must be at most {MAX_AGENT_ID}")
     bits = _BitReader(data[_HEAD.size : size])
     values = [_to_float(bits.take(number_bits), bounds, number_bits) for bounds in ranges]
     if not all(map(math.isfinite, values)):

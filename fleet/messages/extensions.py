@@ -18,6 +18,10 @@ Goodput stays in the descriptor's own list, where every version reads it: by asc
 to the roster's highest id. A reader that knows the roster keeps the members' entries; an older one passes over the
 roster and reads the same goodputs, with the others as unknown.
 
+In large fleets that list would not fit, nor an id into its byte. From a highest id of `WIDE_FROM` on, the field `wide`
+stands in place of the roster: the drone's id, the roster's epoch, and the members' ids, 2 B each. The descriptor's list
+then holds goodput to the members alone, and its id is `WIDE_ID`, so that a reader that does not know the field refuses it.
+
 To add a field: a field with a default in `sortie.policies.contract.Descriptor`, and a line in `FIELDS`.
 """
 
@@ -28,15 +32,25 @@ import reprlib
 import struct
 from collections.abc import Callable
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.perception.budget import CODEBOOK_BYTES
 from sortie.policies.contract import Descriptor, Roster, TaskPhase
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.errors import SortieError
 
 MAX_DESCRIPTOR_BYTES = 1024
 MAX_AGENT_ID = 254
+"""In a byte."""
+WIDE_ID = 255
+"""Stands in that byte for an id that follows in two bytes."""
+MAX_WIDE_ID = (1 << 16) - 2
+WIDE_FROM = LISTED_IDS
+"""A roster with this id or a higher one is written by its members' ids."""
+MAX_WIDE_MEMBERS = 128
+"""So many ids and goodputs fit into a descriptor, with 86 B to spare for its other sequences and fields."""
 VERSION = 2
 """Of the descriptors that this code writes with a block. Descriptors without one are version 1, the paper's."""
 _HEAD = struct.Struct("<BH")
@@ -91,14 +105,34 @@ def _not_a_feature_space(name: str) -> str:
     return f"feature_space is {reprlib.repr(name)}, must be 1 to 32 letters, digits or any of _ . + -"
 
 
+def is_wide(d: Descriptor) -> bool:
+    """Whether a descriptor names ids in two bytes: its own does not fit into one, or its roster reaches `WIDE_FROM`."""
+    return d.agent_id > MAX_AGENT_ID or (d.roster is not None and d.roster.members[-1:] >= (WIDE_FROM,))
+
+
 def _encode_roster(roster: Roster) -> bytes:
     """Epoch, 4 B, and a bit for each id, lowest first, up to the highest member's byte."""
     epoch, members = roster
-    if not 0 <= epoch < 2**32:
-        raise ValueError(f"roster.epoch is {epoch}, must be in [0, 2³²)")
-    if not members or members != tuple(sorted(set(members))) or not 0 <= members[0] <= members[-1] <= MAX_AGENT_ID:
-        raise ValueError(f"roster.members is {members}, must be ascending ids in [0, {MAX_AGENT_ID}], one at least")
     return epoch.to_bytes(4, "little") + sum(1 << i for i in members).to_bytes(members[-1] // 8 + 1, "little")
+
+
+def _encode_wide(drone: int, roster: Roster) -> bytes:
+    """The drone's id, 2 B, the epoch, 4 B, and the members' ids, 2 B each."""
+    return struct.pack(f"<HI{len(roster.members)}H", drone, *roster[:1], *roster.members)
+
+
+@lru_cache(maxsize=1 << 13)  # of each drone of a large fleet; it changes seldom
+def _decode_wide(value: bytes) -> tuple[int, Roster]:
+    count, odd = divmod(len(value) - 6, 2)
+    if count < 1 or odd:
+        raise MalformedDatagram(f"wide has {len(value)} B, must have 6 and 2 for each member, one at least")
+    drone, epoch, *members = struct.unpack(f"<HI{count}H", value)
+    if any(a >= b for a, b in pairwise(members)) or members[-1] > MAX_WIDE_ID or drone not in members:
+        raise MalformedDatagram(
+            f"wide names drone {drone} and members {reprlib.repr(tuple(members))}, must be ascending ids up to {MAX_WIDE_ID}, "
+            "the drone among them"
+        )
+    return drone, Roster(epoch, tuple(members))
 
 
 def _encode_codebook(digest: str) -> bytes:
@@ -130,38 +164,56 @@ FIELDS: tuple[ExtensionField, ...] = (
     ExtensionField("roster", 2, _encode_roster, _decode_roster),
     ExtensionField("codebook", 3, _encode_codebook, _decode_codebook),
 )
+WIDE_FIELD = 4
+"""Type of the field `wide`, which is no field of `Descriptor`: it is read as the drone's id and its roster."""
 """Every optional field that this version knows, by ascending type."""
-_BY_NUMBER = {field.number: field for field in FIELDS}
+_DECODERS = {field.number: (field.name, field.decode) for field in FIELDS} | {WIDE_FIELD: ("wide", _decode_wide)}
 _WITH_DEFAULTS = tuple((field, Descriptor._field_defaults[field.name]) for field in FIELDS)
 
 
 def listed_goodput(d: Descriptor) -> tuple[float, ...]:
-    """The goodputs as they are listed on the wire: by ascending id.
+    """The goodputs as they are listed on the wire: by ascending id; to the members alone where ids are wide.
 
     Raises:
-        ValueError: a roster without the drone itself, or another number of goodputs than of other members.
+        ValueError: no roster though the drone's id needs two bytes; a roster that no wire can hold, without the drone itself,
+            or with another number of other members than there are goodputs.
     """
     if d.roster is None:
+        if d.agent_id > MAX_AGENT_ID:
+            raise ValueError(f"agent_id is {d.agent_id}, must be at most {MAX_AGENT_ID} without a roster")
         return d.peer_goodput_mbps
-    if d.agent_id not in d.roster.members or len(d.peer_goodput_mbps) != len(d.roster.members) - 1:
+    epoch, members = d.roster
+    if not 0 <= epoch < 2**32:
+        raise ValueError(f"roster.epoch is {epoch}, must be in [0, 2³²)")
+    if not members or not 0 <= members[0] <= members[-1] <= MAX_WIDE_ID or any(a >= b for a, b in pairwise(members)):
         raise ValueError(
-            f"roster.members is {d.roster.members}, must hold agent_id = {d.agent_id} and as many others as "
+            f"roster.members is {reprlib.repr(members)}, must be ascending ids in [0, {MAX_WIDE_ID}], one at least"
+        )
+    if d.roster.slot(d.agent_id) is None or len(d.peer_goodput_mbps) != len(members) - 1:
+        raise ValueError(
+            f"roster.members is {reprlib.repr(members)}, must hold agent_id = {d.agent_id} and as many others as "
             f"peer_goodput has entries, {len(d.peer_goodput_mbps)}"
         )
-    return d.goodput_by_id(d.roster.members[-1] + 1)
+    return d.peer_goodput_mbps if is_wide(d) else d.goodput_by_id(members[-1] + 1)
 
 
 def with_extensions(d: Descriptor, block: bytes) -> Descriptor:
     """A descriptor that was read up to its block, with the block's fields.
 
     Raises:
-        MalformedDatagram: as `read_extensions`, or a roster that does not fit the goodputs.
+        MalformedDatagram: as `read_extensions`, an id that needs the field `wide` without it, or a roster that does not fit the
+            goodputs.
     """
-    if not block:
+    if not block and d.agent_id <= MAX_AGENT_ID:
         return d
     found = read_extensions(block)
-    roster = found.pop("roster", None)
+    roster, wide = found.pop("roster", None), found.pop("wide", None)
     d = d._replace(**found)
+    if wide is not None:
+        drone, members = wide
+        return _widened(d, drone, members, roster)
+    if d.agent_id > MAX_AGENT_ID:
+        raise MalformedDatagram(f"agent_id is {d.agent_id}, must be at most {MAX_AGENT_ID} without the field wide")
     if roster is None:
         return d
     grown = d.with_roster(roster)
@@ -175,6 +227,17 @@ def with_extensions(d: Descriptor, block: bytes) -> Descriptor:
     )
 
 
+def _widened(d: Descriptor, drone: int, roster: Roster, narrow: Roster | None) -> Descriptor:
+    if d.agent_id != WIDE_ID or narrow is not None:
+        raise MalformedDatagram(f"wide stands beside agent_id {d.agent_id} or a roster, must be beside {WIDE_ID} alone")
+    others = len(roster.members) - 1
+    if len(d.peer_goodput_mbps) != others:
+        raise MalformedDatagram(
+            f"wide names {others} other members, peer_goodput has {len(d.peer_goodput_mbps)} entries"
+        )
+    return d._replace(agent_id=drone, roster=roster)
+
+
 def append_extensions(body: bytes, d: Descriptor) -> bytes:
     """A descriptor's bytes with its optional fields behind them; `body` itself where all have their defaults.
 
@@ -182,12 +245,15 @@ def append_extensions(body: bytes, d: Descriptor) -> bytes:
         DescriptorTooLarge: more than 1,024 B, naming the part that is too long.
         ValueError: a value that its field cannot hold.
     """
-    block = b""
+    block, wide = b"", is_wide(d)
     for field, default in _WITH_DEFAULTS:
         value = getattr(d, field.name)
-        if value != default:
+        if value != default and not (wide and field.name == "roster"):
             encoded = field.encode(value)
             block += _HEAD.pack(field.number, len(encoded)) + encoded
+    if wide and d.roster is not None:
+        encoded = _encode_wide(d.agent_id, d.roster)
+        block += _HEAD.pack(WIDE_FIELD, len(encoded)) + encoded
     whole = body + bytes([VERSION]) + block if block else body
     if len(whole) > MAX_DESCRIPTOR_BYTES:
         peers, targets = len(listed_goodput(d)), len(d.priority_target_ids)
@@ -219,10 +285,11 @@ def read_extensions(block: bytes) -> dict[str, Any]:
             raise MalformedDatagram(f"extension {number} follows {last}, must be above it")
         if length > size - at:
             raise MalformedDatagram(f"extension {number} claims {length} B, {size - at} B are left")
-        field = _BY_NUMBER.get(number)
-        if field is not None:
+        known = _DECODERS.get(number)
+        if known is not None:
+            name, decode = known
             try:
-                found[field.name] = field.decode(block[at : at + length])
+                found[name] = decode(block[at : at + length])
             except MalformedDatagram:
                 if block[0] <= VERSION:
                     raise

@@ -1,7 +1,8 @@
 """Descriptors and directives as bytes: encode what is ours, trust nothing that comes in.
 
 A descriptor is 180 B at five drones and grows by 4 B a peer and 2 B a priority target; past 1 KB it is refused
-where it is made. Optional fields follow it (`sortie.fleet.messages.extensions`). A directive is 36 B. Floats are rounded
+where it is made. Optional fields follow it (`sortie.fleet.messages.extensions`). A directive is 36 B, and 40 B where an id
+does not fit into a byte: both ids then are 255 and follow behind it, in two bytes each. Floats are rounded
 to 32 bits on the way, and a directive's `reason` stays at home. Decoding holds every length, count, enumeration and
 range to its bound before anything is believed. A task phase that this version does not know is read as transit.
 """
@@ -18,7 +19,10 @@ from sortie.fleet.messages.compact import MARK, decode_compact
 from sortie.fleet.messages.extensions import (
     MAX_AGENT_ID,
     MAX_DESCRIPTOR_BYTES,
+    MAX_WIDE_ID,
+    WIDE_ID,
     append_extensions,
+    is_wide,
     listed_goodput,
     read_phase,
     with_extensions,
@@ -56,6 +60,8 @@ def _descriptor_layout(peers: int, targets: int) -> struct.Struct:
 
 MIN_DESCRIPTOR_BYTES = _descriptor_layout(0, 0).size
 DIRECTIVE_BYTES = _DIRECTIVE.size
+_WIDE_LINK = struct.Struct("<HH")
+_WIDE_MARKS = (WIDE_ID, WIDE_ID)
 _NUMBERS = {name: bound for name, bound in DIRECTIVE_BOUNDS.items() if name != "representation"}
 
 
@@ -82,7 +88,7 @@ def encode_descriptor(d: Descriptor) -> bytes:
             ENCAPSULATION,
             second,
             nanosecond,
-            d.agent_id,
+            WIDE_ID if is_wide(d) else d.agent_id,
             *d.position_m,
             *d.orientation_xyzw,
             *d.velocity_mps,
@@ -139,8 +145,6 @@ def decode_descriptor(data: bytes) -> Descriptor:
         raise MalformedDatagram("a float is not finite")
     if nanosecond >= 1_000_000_000:
         raise MalformedDatagram(f"stamp.nanosec is {nanosecond}, must be below 10⁹")
-    if agent_id > MAX_AGENT_ID:
-        raise MalformedDatagram(f"agent_id is {agent_id}, must be at most {MAX_AGENT_ID}")
     qx, qy, qz, qw = orientation
     if not 0.999 < qx * qx + qy * qy + qz * qz + qw * qw < 1.001:
         raise MalformedDatagram("orientation is not a unit quaternion")
@@ -176,25 +180,35 @@ def decode_descriptor(data: bytes) -> Descriptor:
     return with_extensions(found, data[end:])
 
 
+def directive_bytes(d: Directive) -> int:
+    """Size of a directive on the wire."""
+    return DIRECTIVE_BYTES + (_WIDE_LINK.size if max(d.source, d.destination) > MAX_AGENT_ID else 0)
+
+
 def encode_directive(d: Directive) -> bytes:
-    """Serialise a directive (36 B).
+    """Serialise a directive, in `directive_bytes`.
 
     Raises:
         ValueError: a field that its wire type cannot hold.
     """
+    link, behind = d[:2], b""
     roi = (0.0, 0.0, 0.0) if d.roi is None else (d.roi.x_m, d.roi.y_m, d.roi.radius_m)
     try:
-        return _DIRECTIVE.pack(
-            ENCAPSULATION,
-            d.source,
-            d.destination,
-            d.representation,
-            d.duty_percent,
-            *roi,
-            d.rho,
-            d.rate_hz,
-            d.deadline_s,
-            d.fusion_weight,
+        if max(link) > MAX_AGENT_ID:
+            link, behind = _WIDE_MARKS, _WIDE_LINK.pack(*link)
+        return (
+            _DIRECTIVE.pack(
+                ENCAPSULATION,
+                *link,
+                d.representation,
+                d.duty_percent,
+                *roi,
+                d.rho,
+                d.rate_hz,
+                d.deadline_s,
+                d.fusion_weight,
+            )
+            + behind
         )
     except (struct.error, OverflowError) as error:
         raise ValueError(f"directive {d.source}→{d.destination} does not fit its wire types: {error}") from None
@@ -206,13 +220,19 @@ def decode_directive(data: bytes) -> Directive:
     Raises:
         MalformedDatagram: for anything that is not exactly one valid directive.
     """
-    if len(data) != DIRECTIVE_BYTES:
+    is_long = len(data) == DIRECTIVE_BYTES + _WIDE_LINK.size
+    if len(data) != DIRECTIVE_BYTES and not is_long:
         raise MalformedDatagram(f"{len(data)} B, must be {DIRECTIVE_BYTES}")
-    header, source, destination, rung, duty, x, y, radius, rho, rate, deadline, weight = _DIRECTIVE.unpack(data)
+    header, source, destination, rung, duty, x, y, radius, rho, rate, deadline, weight = _DIRECTIVE.unpack_from(data)
     check_encapsulation(header)
     if not isfinite(x + y + radius + rho + rate + deadline + weight):
         raise MalformedDatagram("a float is not finite")
-    if source > MAX_AGENT_ID or destination > MAX_AGENT_ID or source == destination:
+    highest = MAX_AGENT_ID
+    if is_long and (source, destination) == _WIDE_MARKS:
+        (source, destination), highest = _WIDE_LINK.unpack_from(data, DIRECTIVE_BYTES), MAX_WIDE_ID
+    elif is_long:
+        raise MalformedDatagram(f"{len(data)} B, must be {DIRECTIVE_BYTES} for link {source}→{destination}")
+    if source > highest or destination > highest or source == destination:
         raise MalformedDatagram(f"link {source}→{destination} is none")
     if rung not in LEVELS:
         raise MalformedDatagram(f"representation is {rung}, must be in [0, {max(LEVELS)}]")

@@ -20,9 +20,10 @@ from sortie.policies.contract import (
     Roster,
     TaskPhase,
 )
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS
-from sortie.scenarios.schema import Fleet, Scenario, Section
+from sortie.scenarios.schema import Scenario, Section
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
@@ -33,8 +34,8 @@ def _most(section: type[Section], field: str) -> Any:
     return next(bound.le for bound in section.model_fields[field].metadata if hasattr(bound, "le"))
 
 
-LARGEST: int = _most(Fleet, "drones")
-"""The largest fleet that a scenario may have."""
+LARGEST = LISTED_IDS
+"""The largest fleet whose descriptors list goodput to everyone. In larger ones a drone hears its neighbours alone."""
 LONGEST_S = float(_most(Scenario, "duration_s"))
 """The longest sortie."""
 GONE = "detached_after_periods"

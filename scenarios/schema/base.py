@@ -16,7 +16,8 @@ from sortie.scenarios.plugins.reference import FILE, installed
 
 PointM = tuple[Annotated[float, Field(ge=-5000, le=5000)], Annotated[float, Field(ge=-5000, le=5000)]]
 Soc = Annotated[float, Field(gt=0, le=1)]
-DroneId = Annotated[int, Field(ge=0, le=254)]
+MOST_DRONES = 5000
+DroneId = Annotated[int, Field(ge=0, lt=MOST_DRONES)]
 Params = dict[str, float | int | bool | str]
 """Keyword arguments of a model that can be replaced from outside."""
 PhaseName = Literal["transit", "search", "track", "return"]

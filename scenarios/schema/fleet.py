@@ -7,7 +7,16 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import DroneId, ModelName, Params, PresetSection, Section, Soc, inconsistent
+from sortie.scenarios.schema.base import (
+    MOST_DRONES,
+    DroneId,
+    ModelName,
+    Params,
+    PresetSection,
+    Section,
+    Soc,
+    inconsistent,
+)
 from sortie.scenarios.schema.movement import (
     FlightGroup,
     Formation,
@@ -246,14 +255,16 @@ class Network(NamedTuple):
 
 
 class Fleet(Section):
-    drones: int = Field(5, ge=1, le=200, description="Number of drones; ids are 0 … drones − 1.")
+    drones: int = Field(5, ge=1, le=MOST_DRONES, description="Number of drones; ids are 0 … drones − 1.")
     formation: Formation = Formation()
     route: Route = Route()
     groups: tuple[FlightGroup, ...] = Field(
-        (), max_length=200, description="Drones that fly apart from the formation, on ways of their own."
+        (), max_length=MOST_DRONES, description="Drones that fly apart from the formation, on ways of their own."
     )
     ground: tuple[GroundStation, ...] = Field(
-        (), max_length=200, description="Members of the fleet that stand on the ground: ground stations and relays."
+        (),
+        max_length=MOST_DRONES,
+        description="Members of the fleet that stand on the ground: ground stations and relays.",
     )
     mobility: Mobility = Field(
         "formation",

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import DroneId, PhaseName, PointM, Section, Soc, inconsistent
+from sortie.scenarios.schema.base import MOST_DRONES, DroneId, PhaseName, PointM, Section, Soc, inconsistent
 
 
 class Target(Section):
@@ -32,12 +32,14 @@ class Phase(Section):
 
 
 class Group(Section):
-    drones: tuple[DroneId, ...] = Field(min_length=1, max_length=200, description="Who belongs to the group.")
+    drones: tuple[DroneId, ...] = Field(min_length=1, max_length=MOST_DRONES, description="Who belongs to the group.")
     phases: tuple[Phase, ...] = Field(
         min_length=1, max_length=100, description="The group's phases, in place of mission.phases."
     )
     reserve: tuple[DroneId, ...] = Field(
-        (), max_length=200, description="Drones of the group that wait on the ground and take over, in this order."
+        (),
+        max_length=MOST_DRONES,
+        description="Drones of the group that wait on the ground and take over, in this order.",
     )
 
 

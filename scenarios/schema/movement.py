@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import DroneId, ModelName, Params, PointM, Section, inconsistent
+from sortie.scenarios.schema.base import MOST_DRONES, DroneId, ModelName, Params, PointM, Section, inconsistent
 
 RANDOM_MOBILITY = ("random_waypoint", "gauss_markov")
 Mobility = Annotated[str, ModelName("mobility", ("formation", *RANDOM_MOBILITY), take_params=RANDOM_MOBILITY)]
@@ -156,7 +156,7 @@ class FlightGroup(Section):
     """Drones that fly apart from the fleet's formation; one alone flies a route of its own."""
 
     drones: tuple[DroneId, ...] = Field(
-        min_length=1, max_length=200, description="Who flies in it; they take its slots in this order."
+        min_length=1, max_length=MOST_DRONES, description="Who flies in it; they take its slots in this order."
     )
     formation: Formation = Field(Formation(), description="In place of fleet.formation, as a whole.")
     route: Route = Field(Route(), description="In place of fleet.route, as a whole.")

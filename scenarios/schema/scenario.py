@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.schema.base import Section, inconsistent
 from sortie.scenarios.schema.context import Context
 from sortie.scenarios.schema.events import BaseEvent, BatteryFault, CellFailure, DroneLeaves, Event, LinkDrop
@@ -56,6 +57,11 @@ class Scenario(Section):
     expect_decisions: tuple[DecisionExpectation, ...] = Field(
         (), max_length=1000, description="What the gates must take up, and when; asserted by `sortie check`."
     )
+
+    @property
+    def publishes_rosters(self) -> bool:
+        """Whether descriptors say which members of the fleet their drone knows: where the scenario wants it, and in large fleets."""
+        return self.context.roster or self.fleet.drones > LISTED_IDS
 
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:

@@ -19,12 +19,12 @@ from sortie.sim.cli.campaign import again
 from sortie.sim.cli.console import bars, err, out
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded, refuse
 from sortie.sim.cli.view import view
+from sortie.sim.engine.needs import ensure_room
 from sortie.sim.engine.watchers import Watcher, Watchers
 from sortie.sim.folders import RunError, settled
 from sortie.sim.identity import own_files
 from sortie.sim.policy_text import policy_overrides
 from sortie.sim.results import run_folder
-from sortie.sim.results.needs import ensure_room
 
 
 def fly(

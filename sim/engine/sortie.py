@@ -30,7 +30,6 @@ from sortie.perception.types import Capture
 from sortie.policies.contract import Policy
 from sortie.radio import Air
 from sortie.radio.rates import STANDARDS
-from sortie.radio.settings import AirSettings
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plugins.user_calls import guarded, watched
 from sortie.scenarios.schema import Perception, Scenario
@@ -45,7 +44,6 @@ from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
 from sortie.sim.engine.own_events import OwnEvents
 from sortie.sim.engine.own_metrics import loaded, own_metrics
-from sortie.sim.engine.own_models import of_radio
 from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
@@ -54,7 +52,7 @@ from sortie.sim.engine.separation import Separation
 from sortie.sim.engine.steering import Steering, area_m
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
-from sortie.sim.engine.world import OwnSenses, World, own_antennas, strongest_dbm
+from sortie.sim.engine.world import OwnSenses, World, air_settings
 from sortie.sim.identity import code_version, name_of, own_files, runs_user_code
 from sortie.sim.results import beliefs, disagreement, rosters
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
@@ -205,11 +203,7 @@ def build(
     batteries = FleetBatteries(scenario.fleet.batteries, scenario.fleet.overrides, len(drones), charges, mains)
     air = Air(
         env,
-        AirSettings.of(
-            scenario.radio.model_dump(exclude={"framing", "path_loss_params", "link_params"})
-            | of_radio(scenario)
-            | {"tx_power_dbm": strongest_dbm(scenario), "own_antennas": own_antennas(scenario)}
-        ),
+        air_settings(scenario),
         motion.position_m,
         seed=seed,
         replication=replication,
@@ -329,7 +323,7 @@ def _collect(parts: Parts, policies: PolicyPlan, policy: str, seed: int, replica
     """The record of a sortie that has ended."""
     air, notes, recorder = parts.air, parts.notes, parts.recorder
     more = {} if parts.journal is None else _decided(parts.journal, policies, parts.scenario)
-    if parts.scenario.context.roster:
+    if parts.scenario.publishes_rosters:
         more[rosters.TABLE] = notes.rosters.table()
     if parts.scenario.record.beliefs:
         more[beliefs.TABLE] = beliefs.table(*parts.world.believed())
@@ -378,7 +372,7 @@ def _rules(scenario: Scenario) -> PlaneRules:
         code_bytes=scenario.perception.code_bytes,
         publish_every=context.publish_every,
         form=Form(**context.form.model_dump()),
-        roster=context.roster,
+        roster=scenario.publishes_rosters,
         makes=equipment_of(scenario),
     )
 

@@ -30,9 +30,11 @@ from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Disc, TaskPhase
 from sortie.radio import Air
 from sortie.radio.counters import CAUSES as LOSS_CAUSES
+from sortie.radio.settings import AirSettings
 from sortie.radio.topology import connectivity, linked_drones
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
+from sortie.sim.engine.own_models import of_radio
 from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.tracking import FleetTracking
@@ -81,6 +83,19 @@ def own_antennas(scenario: Scenario) -> dict[int, str]:
     """The antennas of drones that have another than the fleet's."""
     each = enumerate(scenario.fleet.make_of_each)
     return {drone: make.antenna for drone, make in each if make is not None and make.antenna is not None}
+
+
+def air_settings(scenario: Scenario) -> AirSettings:
+    """The scenario's radio.
+
+    Raises:
+        PluginError: as `sortie.sim.engine.own_models.of_radio`.
+    """
+    return AirSettings.of(
+        scenario.radio.model_dump(exclude={"framing", "path_loss_params", "link_params"})
+        | of_radio(scenario)
+        | {"tx_power_dbm": strongest_dbm(scenario), "own_antennas": own_antennas(scenario)}
+    )
 
 
 def weaker_senders_db(scenario: Scenario) -> np.ndarray | None:

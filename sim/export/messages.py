@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from sortie.fleet.coverage import TARGET_FLAG, cameras_of, footprint_radius_m
 from sortie.fleet.plane import codebooks
 from sortie.policies.contract import PHASE_OF, Descriptor, Directive, Disc
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.results import rosters
 from sortie.sim.results.record import SortieRecord
@@ -56,7 +57,11 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             priority_target_ids=(targets[frame, group_of(row["drone"])],) if row["novelty_flags"] & TARGET_FLAG else (),
         )  # fmt: skip
         roster = roster_at(row["drone"], row["t_s"])
-        yield row["t_s"], descriptor if roster is None else descriptor.with_roster(roster)
+        if n > LISTED_IDS:  # the record lists goodput as the descriptor did
+            descriptor = descriptor._replace(roster=roster)
+        elif roster is not None:
+            descriptor = descriptor.with_roster(roster)
+        yield row["t_s"], descriptor
 
 
 def directives(record: SortieRecord) -> Iterator[tuple[float, Directive]]:

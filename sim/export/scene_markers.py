@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import Cars
 from sortie.perception.types import Boxes
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.schema.events import Jam
 from sortie.sim.results import palette as c
 from sortie.sim.results.flown_scene import BOX_HEIGHT_M, CIRCLE, cars_near, houses, jamming, scene_of, vehicles
@@ -112,7 +113,7 @@ class SceneMarkers:
             yield t_s, MISSION, self._array(t_s, markers)
 
     def _links(self) -> Iterator[Timed]:
-        if self._n < 2:
+        if not 2 <= self._n <= LISTED_IDS:
             return
         traffic = LinkTraffic(self._n, self._record.scenario.context.rate_hz)
         tables = self._record.tables

@@ -9,7 +9,7 @@ are no part of a trace, because a live drone has them itself (`sortie.sim.live.o
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -25,7 +25,7 @@ from sortie.perception.geometry import Cameras
 from sortie.perception.scene.height_field import HeightField
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
-from sortie.policies.contract import PERSON_FLAG, PHASE_NAMES, Disc, TaskPhase
+from sortie.policies.contract import PERSON_FLAG, PHASE_NAMES, Disc, TaskPhase, goodput_in
 from sortie.scenarios.schema import Lie, Scenario
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.pilot import plan_for
@@ -193,9 +193,10 @@ class ReplaySenses:
         """Charge and headrooms."""
         return self._published.platform
 
-    def goodput_mbps(self) -> tuple[float, ...]:
-        """To every other drone by ascending id."""
-        return self._published.goodput_mbps
+    def goodput_mbps(self, to: Sequence[int] | None = None) -> tuple[float, ...]:
+        """To some drones, 0 for those beyond the scenario's fleet; to every other one of that by ascending id without `to`."""
+        known = self._published.goodput_mbps
+        return known if to is None else tuple([goodput_in(known, self._drone, None, peer) for peer in to])
 
     def task(self) -> Task:
         """Phase, region, targets, and whether a person is in the region."""

@@ -144,7 +144,7 @@ class LiveNode:
         return heard and all(w.listeners >= 2 for w in others)
 
     def fly(
-        self, clock: WallClock, memory: PeerMemory, rules: PlaneRules, goodput_mbps: Callable[[], tuple[float, ...]]
+        self, clock: WallClock, memory: PeerMemory, rules: PlaneRules, goodput_mbps: Callable[..., tuple[float, ...]]
     ) -> None:
         """Begin the flight: what comes in goes to `memory`, and processor time counts from here."""
         self._clock, self._memory, self._rules = clock, memory, rules
@@ -194,7 +194,7 @@ class LiveNode:
 
     # --- sortie.fleet.agent.Modem -----------------------------------------------------------------------
 
-    goodput_mbps: Callable[[], tuple[float, ...]]
+    goodput_mbps: Callable[..., tuple[float, ...]]
 
     def broadcast(self, datagram: bytes) -> None:
         if self.is_muted() or self._context is None:
@@ -265,7 +265,8 @@ class LiveNode:
                 return
         refused = self._memory.hear(heard, self._clock.now)
         if isinstance(refused, DropReason):
-            self._refuse("descriptor", refused, heard.detail if isinstance(heard, Dropped) else "its counter was used")
+            told = "its counter was used" if refused == DropReason.REPLAYED else "an id that no drone has"
+            self._refuse("descriptor", refused, heard.detail if isinstance(heard, Dropped) else told)
             return
         self._heard += 1
         if isinstance(heard, Opened) and heard.descriptor.agent_id not in self._links:

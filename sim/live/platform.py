@@ -7,7 +7,7 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -177,9 +177,9 @@ class MavlinkSenses:
         task = self._replay.task()
         return task._replace(phase=TaskPhase.LANDING) if self._link.state.landed else task
 
-    def goodput_mbps(self) -> tuple[float, ...]:
-        """To every other drone by ascending id; replayed."""
-        return self._replay.goodput_mbps()
+    def goodput_mbps(self, to: Sequence[int] | None = None) -> tuple[float, ...]:
+        """As `sortie.fleet.agent.Modem` wants it; replayed."""
+        return self._replay.goodput_mbps(to)
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
         """Cars of the scene in range of the vehicle."""

@@ -27,7 +27,7 @@ def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
         code_bytes=scenario.perception.code_bytes,
         publish_every=scenario.context.publish_every,
         trust=scenario.context.trust,
-        roster=scenario.context.roster,
+        roster=scenario.publishes_rosters,
         makes=equipment_of(scenario),
         people=scenario.perception.thermal is not None,
         classes=len(scenario.perception.classes) > 1,

@@ -126,10 +126,9 @@ class Charts:
     def _goodput(self, descriptors: pa.Table) -> None:
         """The mean goodput of each drone's links that were tried lately; a gap while there are none."""
         drone, t_s = descriptors["drone"].to_numpy(), descriptors["t_s"].to_numpy()
-        links = descriptors["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(-1, max(1, self._n - 1))
         if self._n < 2:
             return
-        mean = mean_goodput(links)
+        mean = mean_goodput(descriptors)
         for i in range(self._n):
             self._canvas.scalars(f"plots/goodput/{i}", t_s[drone == i], mean[drone == i])
 

@@ -12,6 +12,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.link_state import is_tried
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import SPAN_M, Canvas
@@ -46,7 +47,7 @@ class LinkArrows:
 
     def add(self, t_s: Floats, position: Floats, airborne: NDArray[np.bool_], new: Mapping[str, pa.Table]) -> None:
         """Draw the frames at `t_s` [T] from positions [T, N, 3], `descriptors` and `transmissions`."""
-        if self._n < 2:
+        if not 2 <= self._n <= LISTED_IDS:  # of larger fleets nobody could read the links, nor hold them
             return
         goodput, mbps = self._traffic.add(t_s, new["descriptors"], new["transmissions"])
         self._broken(t_s, position, airborne, goodput)

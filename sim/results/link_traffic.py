@@ -13,13 +13,16 @@ Floats = NDArray[np.float64]
 RECENT_S = 1.0
 
 
-def mean_goodput(links: Floats) -> Floats:
-    """The mean over each row's links [..., link] that were measured or are silent, Mb/s; NaN where there are none.
+def mean_goodput(descriptors: pa.Table) -> Floats:
+    """[row]: the mean over a descriptor's links that were measured or are silent, Mb/s; NaN where there are none.
 
     A probed link is left out: its value says that its peer's descriptors arrive, and is no rate.
     """
-    tried = is_tried(links)
-    total, count = np.where(tried, links, 0.0).sum(axis=-1), tried.sum(axis=-1)
+    lists = descriptors["goodput_mbps"].combine_chunks()
+    rows, values = lists.value_parent_indices().to_numpy(), lists.flatten().to_numpy()
+    tried = is_tried(values)
+    total = np.bincount(rows[tried], values[tried], minlength=len(lists))
+    count = np.bincount(rows[tried], minlength=len(lists))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
@@ -30,7 +33,7 @@ class LinkTraffic:
     """
 
     def __init__(self, n: int, rate_hz: float) -> None:
-        """Args: `n` drones, 2 at least; `rate_hz` frames a second."""
+        """Args: `n` drones, 2 to `LISTED_IDS`, whose descriptors list goodput to all; `rate_hz` frames a second."""
         self._n, self._rate_hz = n, rate_hz
         self._frames = 0
         self._goodput: Floats = np.zeros((n, n))

@@ -26,6 +26,7 @@ from sortie.fleet.trust import Standing
 from sortie.policies.contract import PHASE_NAMES, Descriptor, Directive
 from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.scenarios import scratch
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.results.rosters import RosterLog
@@ -100,7 +101,7 @@ ABOUT = {
     "states": "A drone in a frame. Position and velocity ENU, attitude FLU in ENU (x, y, z, w), rates FLU. "
     "Voltage and current are at the pack's terminals; `spent_j` is what left the pack since take-off, all causes of `energy`; "
     "`looks` counts the frames before this one in which perception ran.",
-    "descriptors": "A descriptor published, with the hysteresis band of `policy.hysteresis`. Goodput to each other drone by ascending id, Mb/s; 0 is unknown, at most 2⁻¹⁰ is silent, at most 2⁻⁹ has no payload lately but descriptors arrive.",
+    "descriptors": "A descriptor published, with the hysteresis band of `policy.hysteresis`. Goodput to each other drone by ascending id, in fleets of more than 200 to the other members of its roster (table `rosters`), Mb/s; 0 is unknown, at most 2⁻¹⁰ is silent, at most 2⁻⁹ has no payload lately but descriptors arrive.",
     "receptions": "What became of descriptors on the air in the frame that begins at `t_s`, counted for each drone in the "
     "air that could receive one: heard, or lost to a cause. It met another descriptor (`collision_context`) or a payload's "
     "frame or its answer (`collision_data`), a sender that could not hear the first spoilt it (`hidden`), the signal was too "
@@ -274,7 +275,8 @@ def _unfold_descriptors(rows: Sequence[tuple[Any, ...]], drones: int) -> Sequenc
     region = zip(*(disc or _NO_DISC for disc in d["region"]), strict=True)
     return [
         t_s, d["agent_id"], d["stamp_ns"], wire_bytes, d["battery_soc"], d["cpu_headroom"], d["gpu_headroom"],
-        [one.goodput_by_id(drones) for one in descriptors], [PHASE_NAMES[phase] for phase in d["task_phase"]], *region, d["novelty_flags"],
+        [one.goodput_by_id(drones) if drones <= LISTED_IDS else one.peer_goodput_mbps for one in descriptors],
+        [PHASE_NAMES[phase] for phase in d["task_phase"]], *region, d["novelty_flags"],
         d["coverage_grid"],
     ]  # fmt: skip
 

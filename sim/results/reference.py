@@ -64,7 +64,7 @@ def page() -> str:
         "truck, 2 a person. `car` is then a person's number where the box is of one.",
         "",
         "With `record.views: true` the first three of these too, with `record.disagreement: true` the fourth, with "
-        "`context.roster: true` the fifth, with `record.beliefs: true` the last one. They are no part of the fingerprint.",
+        "`context.roster: true`, or more than 200 drones, the fifth, with `record.beliefs: true` the last one. They are no part of the fingerprint.",
         "",
         *table(
             ("table", "a row is", "columns"),

@@ -307,8 +307,7 @@ def _goodput(axes: Axes, record: SortieRecord) -> None:
     if _drones(record) < 2:
         return
     drone, t_s = table["drone"].to_numpy(), _column(table, "t_s")
-    links = table["goodput_mbps"].combine_chunks().flatten().to_numpy().reshape(len(t_s), _drones(record) - 1)
-    mean = mean_goodput(links)
+    mean = mean_goodput(table)
     edges = _edges(record)
     for i in range(_drones(record)):
         own = (drone == i) & ~np.isnan(mean)

@@ -238,7 +238,7 @@ def load(path: Path) -> SortieRecord:
             expected |= views.NEEDED
         if scenario.record.disagreement:
             expected[disagreement.TABLE] = disagreement.COLUMNS
-        if scenario.context.roster:
+        if scenario.publishes_rosters:
             expected[rosters.TABLE] = rosters.COLUMNS
         if scenario.record.beliefs:
             expected[beliefs.TABLE] = beliefs.COLUMNS

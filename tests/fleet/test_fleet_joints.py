@@ -447,7 +447,7 @@ def test_a_slot_is_of_the_peer_that_it_is_of(me: int) -> None:
         measured = [0.0, 0.0, 0.0]
         other = next(i for i in peers if i != heard)
         measured[peers.index(other)] = 55.0
-        filled = dict(zip(peers, mine.probes.fill(me, measured, 0.9, mine.ids), strict=True))
+        filled = dict(zip(peers, mine.probes.fill(np.array(peers), measured, 0.9), strict=True))
         assert heard_share(filled[heard]) == 1.0
         assert filled[other] == 55.0
         assert [v for i, v in filled.items() if i not in (heard, other)] == [0.0]

@@ -41,7 +41,7 @@ def test_probes_are_a_row_of_bits_however_far_they_look_back(
         bits = (bits << min(gap, periods) | 1) & ((1 << periods) - 1)
     now_s = (frame + later + 0.6) * PERIOD_S
     arrived = (bits << min(later, periods) & ((1 << periods) - 1)).bit_count()
-    assert mine.probes.fill(0, (0.0,), now_s, mine.ids) == (probed_mbps(arrived / periods),)
+    assert mine.probes.fill(np.array([1]), (0.0,), now_s) == (probed_mbps(arrived / periods),)
 
 
 def test_one_datagram_is_one_object_at_all_that_hear_it() -> None:

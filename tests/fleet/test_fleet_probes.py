@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from agent_rig import hear, memory
 
@@ -11,7 +12,8 @@ from sortie.scenarios.link_state import MEASURED_FOR_S, SILENT_MBPS, LinkState, 
 
 
 def filled(mine: PeerMemory, goodput_mbps: tuple[float, ...], now_s: float) -> tuple[float, ...]:
-    return mine.probes.fill(mine.drone, goodput_mbps, now_s, mine.ids)
+    peers = [i for i in range(len(goodput_mbps) + 1) if i != mine.drone]
+    return mine.probes.fill(np.array(peers), goodput_mbps, now_s)
 
 
 def test_probes_count_the_descriptors_heard_and_missed() -> None:
@@ -46,7 +48,7 @@ def test_probes_stand_where_nothing_was_measured_and_have_no_rate() -> None:
 def test_a_measurement_expires_and_the_next_one_is_taken_as_it_is() -> None:
     links = Goodput(2)
     links.measured(0, 1, 70.0, 1.0)
-    assert links.read(0, 1.0 + MEASURED_FOR_S) == [0.0, 70.0]
-    assert links.read(0, 1.01 + MEASURED_FOR_S) == [0.0, 0.0]
+    assert links.read(0, 1.0 + MEASURED_FOR_S) == {1: 70.0}
+    assert links.read(0, 1.01 + MEASURED_FOR_S) == {}
     links.measured(0, 1, 90.0, 10.0)
-    assert links.read(0, 10.0) == [0.0, 90.0]
+    assert links.read(0, 10.0) == {1: 90.0}

@@ -91,8 +91,8 @@ class Rig:
     def handshake(self, peer: int, size_bytes: int, capture: Capture, deadline_s: float) -> None:
         self.shaken.append((self.env.now, peer))
 
-    def goodput_mbps(self) -> tuple[float, ...]:
-        return (50.0,) * 4
+    def goodput_mbps(self, to: Sequence[int] | None = None) -> tuple[float, ...]:
+        return (50.0,) * (4 if to is None else len(to))
 
     def __getattr__(self, name: str) -> Any:  # the log
         if name in ("descriptor", "directive", "trust", "decision", "event", "alert"):

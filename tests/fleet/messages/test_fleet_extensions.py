@@ -18,6 +18,7 @@ from sortie.fleet.messages.extensions import (
     FIELDS,
     MAX_DESCRIPTOR_BYTES,
     VERSION,
+    WIDE_FIELD,
     DescriptorTooLarge,
     read_extensions,
 )
@@ -41,7 +42,7 @@ def block(*fields: bytes, version: int = VERSION) -> bytes:
 
 
 unknown_fields = st.dictionaries(
-    st.integers(FIELDS[-1].number + 1, 255), st.binary(max_size=60), max_size=6
+    st.integers(WIDE_FIELD + 1, 255), st.binary(max_size=60), max_size=6
 ).map(lambda found: b"".join(field(number, value) for number, value in sorted(found.items())))  # fmt: skip
 
 

@@ -146,7 +146,7 @@ def test_the_largest_fleet_that_fits() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"agent_id": 256}, "descriptor of agent 256 does not fit its wire types"),
+        ({"agent_id": 256}, "agent_id is 256, must be at most 254 without a roster"),
         ({"stamp_ns": 2**31 * 10**9}, "descriptor of agent 3 does not fit its wire types"),
         ({"footprint_radius_m": 1e39}, "descriptor of agent 3 does not fit its wire types"),
         ({"position_m": (1.0, 2.0)}, "descriptor of agent 3 does not fit its wire types"),
@@ -156,8 +156,8 @@ def test_the_largest_fleet_that_fits() -> None:
 def test_what_the_wire_cannot_hold_is_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         encode_descriptor(DESCRIPTOR._replace(**changes))
-    with pytest.raises(ValueError, match="directive 1→300 does not fit"):
-        encode_directive(DIRECTIVE._replace(destination=300))
+    with pytest.raises(ValueError, match="directive 1→70000 does not fit"):
+        encode_directive(DIRECTIVE._replace(destination=70000))
 
 
 GOOD = encode_descriptor(DESCRIPTOR)
@@ -185,7 +185,7 @@ def patch(data: bytes, at: int, new: bytes) -> bytes:
         ),
         (GOOD[:-1], "peer_goodput claims 4 entries in 179 B"),
         (patch(GOOD, 4, struct.pack("<I", 10**9)), "stamp.nanosec is 1000000000, must be below 10⁹"),
-        (patch(GOOD, 8, b"\xff"), "agent_id is 255, must be at most 254"),
+        (patch(GOOD, 8, b"\xff"), "agent_id is 255, must be at most 254 without the field wide"),
         (patch(GOOD, 12, NAN), "a float is not finite"),
         (patch(GOOD, 16, struct.pack("<2f", math.inf, -math.inf)), "a float is not finite"),
         (patch(GOOD, 84, NAN), "a float is not finite"),

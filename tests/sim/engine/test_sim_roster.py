@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from sim_examples import example
 
+from sortie.fleet.agent import Agent
 from sortie.fleet.messages.wire import encode_descriptor
-from sortie.fleet.probes import Probes
 from sortie.policies.contract import Descriptor
 from sortie.sim.engine import sortie as engine
 from sortie.sim.engine.sortie import run_sortie
@@ -32,24 +30,23 @@ SETTINGS = (ON, EVENTS, "fleet.formation.altitude_m=30", "mission.descent_mps=10
 
 
 @pytest.fixture(scope="module")
-def measured() -> dict[tuple[float, int], tuple[float, ...]]:
-    """What each drone measured, by ascending id, by time and drone; filled by `flown`."""
+def measured() -> dict[tuple[float, int], dict[int, float]]:
+    """What each drone measured, by peer, by time and drone; filled by `flown`."""
     return {}
 
 
 @pytest.fixture(scope="module")
-def flown(measured: dict[tuple[float, int], tuple[float, ...]]) -> SortieRecord:
+def flown(measured: dict[tuple[float, int], dict[int, float]]) -> SortieRecord:
     """Flown without a hysteresis band, so that drones publish what they measure."""
-    fill = Probes.fill
+    listed = Agent._goodput_mbps
 
-    def kept(
-        self: Probes, me: int, goodput_mbps: Sequence[float], now_s: float, ids: NDArray[np.int64]
-    ) -> tuple[float, ...]:
-        measured[now_s, me] = found = fill(self, me, goodput_mbps, now_s, ids)
+    def kept(self: Agent) -> tuple[float, ...]:
+        found = listed(self)
+        measured[self._env.now, self.drone] = dict(zip(self._listed.tolist(), found, strict=True))
         return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Probes, "fill", kept)
+        patch.setattr(Agent, "_goodput_mbps", kept)
         return run_sortie(example(*SETTINGS, "policy.hysteresis=0"))
 
 
@@ -65,7 +62,7 @@ def own(decision: Decision) -> Descriptor:
 
 
 def test_each_goodput_is_the_members_own_in_every_frame(
-    made: list[Decision], measured: dict[tuple[float, int], tuple[float, ...]]
+    made: list[Decision], measured: dict[tuple[float, int], dict[int, float]]
 ) -> None:
     checked = 0
     for d in made:
@@ -73,7 +70,7 @@ def test_each_goodput_is_the_members_own_in_every_frame(
         assert me.roster is not None
         for peer in set(range(5)) - {d.drone}:
             is_member = peer in me.roster.members
-            expected = known[peer - (peer > d.drone)] if is_member else 0.0
+            expected = known[peer] if is_member else 0.0
             assert me.goodput_to(peer) == np.float32(expected)
             checked += is_member and expected > 1.0
     assert checked > 100

@@ -12,10 +12,10 @@ from sortie.scenarios import scratch
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli.app import app
+from sortie.sim.engine import needs as module
+from sortie.sim.engine.needs import Needs, ensure_room, needs
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
-from sortie.sim.results import needs as module
-from sortie.sim.results.needs import Needs, ensure_room, needs
 
 Memory, Disk = namedtuple("Memory", "available"), namedtuple("Disk", "free")
 
@@ -53,6 +53,15 @@ def test_needs_rise_with_duration_and_drones() -> None:
     assert two_hours.memory - hour.memory < 10e6, "no detector: memory hardly depends on the duration"
     assert fleet.least_disk > 20 * two_hours.least_disk
     assert fleet.memory < 500e6
+
+
+def test_links_within_earshot_are_counted_for_large_fleets() -> None:
+    """All with all at 20 dBm; at −20 dBm, with drones 200 m apart, nearly nobody."""
+    apart = scenario(60, 1000).fleet.formation.model_copy(update={"spacing_m": 200.0})
+    loud = scenario(60, 1000)
+    fleet = loud.fleet.model_copy(update={"formation": apart})
+    quiet = loud.model_copy(update={"fleet": fleet, "radio": loud.radio.model_copy(update={"tx_power_dbm": -20.0})})
+    assert needs(loud).memory - needs(quiet).memory == pytest.approx(1000 * 999 * 20 * 32, rel=0.2)
 
 
 @pytest.mark.parametrize(

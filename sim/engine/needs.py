@@ -19,8 +19,12 @@ from sortie.fleet.coverage import RANGE_M
 from sortie.fleet.flight.motion import shapes_of
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.policies.contract import COVERAGE_BYTES
+from sortie.radio.channel.large_fleet import EPOCH
+from sortie.radio.channel.snr import SQUARE, earshot_m
 from sortie.scenarios import scratch
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.world import air_settings
 from sortie.sim.folders import RunError
 from sortie.sim.results.record import TABLES
 from sortie.sim.results.spool import BATCH_BYTES
@@ -32,6 +36,10 @@ TEXT_BYTES = 8
 """A word, as in a status or a reason."""
 AIRFRAME_FLOATS = 4
 """Of a drone in a frame, beside its motion: the airframe's z axis, and what the rotors draw."""
+PEER_BYTES = 46
+"""Of a drone's memory of a peer, heard or not (`sortie.fleet.peers`)."""
+LINK_BYTES = 2 * 4 * EPOCH + 3 * 4 * EPOCH
+"""Of a link within earshot in a large fleet: gain and shadowing in each frame of a block, and as much again in passing."""
 OBJECT_FACTOR = 8
 """Rows as Python objects over the same in Arrow."""
 SCORED_FLOATS = 8
@@ -77,6 +85,8 @@ def needs(scenario: Scenario) -> Needs:
         + OBJECT_FACTOR * batches
         + OUTCOME_BYTES * n * frames
         + SCORED_FLOATS * FLOAT_BYTES * possible["detections"]
+        + PEER_BYTES * n * n
+        + (LINK_BYTES * n * _neighbours(scenario) if n > SQUARE else 0)
     )
     return Needs(int(memory), int(motion + sure), int(motion + 2 * (sure + more)))
 
@@ -88,7 +98,7 @@ def row_bytes(columns: Mapping[str, pa.DataType], drones: int) -> float:
 
 def _bytes(type_: pa.DataType, drones: int) -> float:
     if pa.types.is_list(type_):
-        return OFFSET_BYTES + (drones - 1) * _bytes(type_.value_type, drones)
+        return OFFSET_BYTES + min(drones - 1, LISTED_IDS) * _bytes(type_.value_type, drones)
     if pa.types.is_binary(type_):
         return OFFSET_BYTES + COVERAGE_BYTES
     if pa.types.is_string(type_):
@@ -104,6 +114,12 @@ def _cars_in_range(scenario: Scenario) -> int:
     perception, mission = scenario.perception, scenario.mission
     scene = SceneModel(perception.scene, mission.target, bounds, mission.more_targets, perception.people)
     return max(scene.cars_near(0.0, x, y, RANGE_M) for x, y in waypoints)
+
+
+def _neighbours(scenario: Scenario) -> float:
+    """To how many others a drone has a link within earshot, in a formation of the whole fleet."""
+    apart = earshot_m(air_settings(scenario)) / scenario.fleet.formation.spacing_m
+    return min(scenario.fleet.drones - 1.0, math.pi * apart * apart)
 
 
 def shortage(need: Needs, run: Path) -> tuple[str, bool]:
