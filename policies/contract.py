@@ -153,17 +153,14 @@ class Descriptor(NamedTuple):
 
     def with_roster(self, roster: Roster) -> Descriptor:
         """The same descriptor with this roster, and with goodputs to its members alone."""
-        me, members = self.agent_id, roster.members
-        if self.roster is None:
-            goodput_mbps = tuple([self.goodput_to(i) for i in members if i != me])
-        else:
-            known = dict(zip([i for i in self.roster.members if i != me], self.peer_goodput_mbps, strict=False))
-            goodput_mbps = tuple([known.get(i, 0.0) for i in members if i != me])
+        ids = range(len(self.peer_goodput_mbps) + 1) if self.roster is None else self.roster.members
+        known = dict(zip([i for i in ids if i != self.agent_id], self.peer_goodput_mbps, strict=False))
+        goodput_mbps = tuple([known.get(i, 0.0) for i in roster.members if i != self.agent_id])
         return self._replace(peer_goodput_mbps=goodput_mbps, roster=roster)
 
 
 def goodput_in(known: tuple[float, ...], me: int, roster: Roster | None, peer: int) -> float:
-    """Goodput to `peer` in the list of drone `me`: the only place that knows which entry belongs to whom."""
+    """Goodput to `peer` in the list of drone `me`; `Descriptor.with_roster` reads the whole list at once."""
     if peer == me:
         return 0.0
     place = peer if roster is None else roster.slot(peer)

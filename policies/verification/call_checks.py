@@ -13,7 +13,7 @@ import math
 import sys
 import types
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from enum import Enum, EnumType
 from typing import Any
 
@@ -88,8 +88,10 @@ def on_behalf_of_the_policy(function: Any, args: tuple[Any, ...], kwargs: dict[s
     _refuse_to_hand_on(function, args, kwargs)
     args, kwargs = ordered_for(function, args, kwargs, _str)
     if _is_of_text(function) and function.__name__ == "join" and len(args) == 1 and not kwargs:
-        return join(function, list(args[0]))
-    if _is_of_text(function) or not takes_ranges(function):  # what is lazy is asked here, not there
+        return join(function, _texts_alone(list(args[0])))
+    if not takes_ranges(function) and any(map(_is_lazy, args)):  # it may ask for a part, or in another order
+        stop(f"gives something other than lists and tuples to {getattr(function, '__qualname__', function)}")
+    if _is_of_text(function):  # what is lazy is asked here, not there
         args = tuple([list(value) if _is_lazy(value) else value for value in args])
     if function is plain_sum:
         args = tuple([list(value) if type(value) is types.GeneratorType else value for value in args])
@@ -145,6 +147,13 @@ def _is_of_text(function: Any) -> bool:
 
 _LONGEST_TEXT = 600
 """Of a number; Python's settings decide from where on it is an error."""
+
+
+def _texts_alone(items: list[Any]) -> list[Any]:
+    """The items; raises what `join` raises if one of them is no text."""
+    if not all(issubclass(shown_class(item), str) for item in items):
+        "".join([0])  # type: ignore[list-item]
+    return items
 
 
 def _is_lazy(value: Any) -> bool:
@@ -317,6 +326,8 @@ def _type_of(*args: Any, **kwargs: Any) -> Any:
         stop("makes a class by type(…)")
     if callable(args[0]) and not isinstance(args[0], type):
         stop("asks what kind of function something is")  # Python functions stand for compiled ones
+    if hasattr(type(args[0]), "__next__"):
+        stop("asks what kind of iterator something is")  # another one may stand for it
     return shown_class(args[0])
 
 
@@ -330,15 +341,21 @@ COMPENSATES = sys.version_info >= (3, 12)
 
 
 def _sum(items: Any, /, start: Any = 0) -> Any:
-    listed = list(_each(items))
-    found = sum(listed, start)
+    listed: list[Any] = []
+
+    def asked() -> Iterator[Any]:  # one by one, as `sum` does
+        for item in _each(items):
+            listed.append(item)
+            yield item
+
+    found = sum(asked(), start)
     floats = len(listed) + (type(start) is not int or start != 0)
     over_reals = isinstance(found, Ranged) and not found._path.exact  # without rounding, as the verdict says
     # Two floats have the same sum either way.
     if COMPENSATES and floats > 2 and not over_reals and any(map(is_stand_in, (*listed, found))):
         stop("adds up floats with sum(…), which compensates rounding")
     if COMPENSATES and over_reals:
-        return found._made(found._term, lambda first, *rest: sum(rest, first), (start, *listed))
+        return found._made(found._term, lambda first, *rest: sum(rest, first), (start, *listed), found._most)
     return found
 
 

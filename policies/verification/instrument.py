@@ -8,6 +8,7 @@ is also recorded. What the policy keeps from one decision to the next is compare
 from __future__ import annotations
 
 import builtins
+import inspect
 import types
 from collections.abc import Callable, Sequence
 from pathlib import Path as File
@@ -16,7 +17,7 @@ from typing import Any
 from sortie.policies.verification.call_checks import CHECKS, attribute, guarded
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.kept import Kept, kept_by
-from sortie.policies.verification.notes import NOTED, noted
+from sortie.policies.verification.notes import NOTED, noted, taking_notes
 from sortie.policies.verification.outside import Outside
 from sortie.policies.verification.pure import PURE_MODULES, is_of_policies
 from sortie.policies.verification.source_checks import compiled
@@ -50,6 +51,7 @@ class Instrumented:
             self._kept = kept_by(self.function, self.module)
         WATCH.stopped = None
         try:
+            self._look(view, params)
             return self.function(view, **params)
         finally:
             if WATCH.stopped is not None:
@@ -57,6 +59,15 @@ class Instrumented:
             changed = self._kept.changed() or WATCH.changed()
             if changed:
                 raise Remembers(changed)
+
+    def _look(self, view: Any, params: dict[str, Any]) -> None:
+        """Call the policy's viewpoint, as a flight does before it asks for directives: it may change what the policy reads."""
+        viewpoint = getattr(self.function, "viewpoint", None)
+        if viewpoint is None:
+            return
+        known = inspect.signature(viewpoint).parameters
+        with taking_notes():  # of no use: the plain policy is asked for directives alone
+            viewpoint(view, **{name: value for name, value in params.items() if name in known})
 
 
 def instrumented(path: File, attribute: str) -> Instrumented:

@@ -97,21 +97,33 @@ def noted(value: Any) -> Any:
 
 _VALUES = frozenset({int, bool, float, str, bytes, type(None)})
 _SIZED = (list, tuple, dict, set, frozenset)
+_DEPTH = 4
+"""So far within one another, the contents of lists, tuples and dictionaries are compared."""
 _ANY = object()
 """The note of an object of which nothing is compared."""
 
 
-def _shown(value: Any) -> Any:
+def _shown(value: Any, depth: int = _DEPTH) -> Any:
     """What is compared of an object. Nothing that may change, or that lives longer for it."""
     kind = type(value)
     if kind in _VALUES or issubclass(kind, Ranged):
         return value
     if issubclass(kind, Enum):
         return kind.__qualname__, value._name_
+    if depth and (kind is list or kind is tuple):
+        return _Inside((kind.__name__, *[_shown(x, depth - 1) for x in value]))
+    if depth and kind is dict:
+        return _Inside(("dict", *[_shown(x, depth - 1) for item in value.items() for x in item]))
     for sized in _SIZED:
         if issubclass(kind, sized):
             return sized.__name__, sized.__len__(value)
     return _ANY
+
+
+class _Inside(tuple[Any, ...]):
+    """The note of a collection: its kind, and the notes of what is in it."""
+
+    __slots__ = ()
 
 
 def are_alike(notes: list[Any], real: list[Any], values: Mapping[str, float]) -> bool:
@@ -122,6 +134,8 @@ def are_alike(notes: list[Any], real: list[Any], values: Mapping[str, float]) ->
 def _is_alike(note: Any, real: Any, values: Mapping[str, float]) -> bool:
     if note is _ANY or real is _ANY:
         return True
+    if type(note) is _Inside and type(real) is _Inside:
+        return len(note) == len(real) and all(_is_alike(a, b, values) for a, b in zip(note, real, strict=True))
     value = note._value_in(values) if isinstance(note, Ranged) else note
     return type(value) is type(real) and (value == real or (value != value and real != real))
 

@@ -12,6 +12,7 @@ import importlib
 import math
 import operator
 import random
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -66,7 +67,7 @@ class SolvedPath(Path):
 
     def number(self, axis: str, low: float, high: float) -> Any:
         """The number of an axis within its bounds."""
-        return Solved(self, axis, self._term(axis, low, high))
+        return Solved(self, axis, self._term(axis, low, high), max(abs(low), abs(high)))
 
     def _term(self, axis: str, low: float, high: float) -> Any:
         if axis not in self._terms or axis not in self.ranges:
@@ -228,14 +229,20 @@ class SolvedPath(Path):
         return values[number._axis] if number._place is None else self._floats[number._place]
 
 
+_LARGEST = sys.float_info.max / 2
+"""Half of the largest float: rounding does not lead beyond it."""
+
+
 class Solved(Ranged):
     """A number with a term over the inputs of its path."""
 
-    __slots__ = ("_place", "_term")
+    __slots__ = ("_most", "_place", "_term")
 
-    def __init__(self, path: SolvedPath, axis: str, term: Any, place: int | None = None) -> None:
+    def __init__(self, path: SolvedPath, axis: str, term: Any, most: float, place: int | None = None) -> None:
         super().__init__(path, axis)
         self._term, self._place = term, place
+        self._most = most
+        """It is no farther from 0 than this."""
 
     def _other(self, other: object) -> tuple[Any, Any]:
         """The other operand and its term; None if it is not a number."""
@@ -277,31 +284,46 @@ class Solved(Ranged):
 
     __hash__ = Ranged.__hash__  # type: ignore[assignment]
 
-    def _combined(self, other: object, make: Callable[[Any, Any], Any], act: Callable[[Any, Any], Any]) -> Any:
+    def _combined(
+        self,
+        other: object,
+        make: Callable[[Any, Any], Any],
+        act: Callable[[Any, Any], Any],
+        most: Callable[[float, float], float] | None = None,
+    ) -> Any:
+        """A number of two. `most` bounds how far it is from 0, by how far they are; None asks the solver."""
         number, term = self._other(other)
         if term is None:
             return NotImplemented
         self._path.exact = False
-        return self._made(make(self._term, term), act, (self, number))
+        others = number._most if isinstance(number, Solved) else abs(number)
+        return self._made(
+            make(self._term, term), act, (self, number), math.inf if most is None else most(self._most, others)
+        )
 
-    def _made(self, term: Any, act: Callable[..., Any], given: Sequence[Any]) -> Solved:
+    def _made(self, term: Any, act: Callable[..., Any], given: Sequence[Any], most: float) -> Solved:
         """A number that the policy computes by `act`."""
         path: Any = self._path
-        return Solved(path, self._axis, term, path.computes(act, given))
+        if most > _LARGEST:
+            largest = path.constant(_LARGEST)
+            if not path._holds(path.z3.And(term <= largest, term >= -largest)):
+                path.refuse(f"may compute numbers beyond the largest float from {self._axis}")
+            most = _LARGEST
+        return Solved(path, self._axis, term, most, path.computes(act, given))
 
     def __add__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: a + b, operator.add)
+        return self._combined(other, lambda a, b: a + b, operator.add, operator.add)
 
     __radd__ = __add__
 
     def __sub__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: a - b, operator.sub)
+        return self._combined(other, lambda a, b: a - b, operator.sub, operator.add)
 
     def __rsub__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: b - a, lambda a, b: b - a)
+        return self._combined(other, lambda a, b: b - a, lambda a, b: b - a, operator.add)
 
     def __mul__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: a * b, operator.mul)
+        return self._combined(other, lambda a, b: a * b, operator.mul, operator.mul)
 
     __rmul__ = __mul__
 
@@ -322,10 +344,10 @@ class Solved(Ranged):
     def __pow__(self, other: object) -> Any:  # type: ignore[override]
         if other != 2 or type(other) is not int:
             self._cannot()
-        return self._combined(self, lambda a, b: a * b, lambda a, _: a**2)
+        return self._combined(self, lambda a, b: a * b, lambda a, _: a**2, operator.mul)
 
     def __neg__(self) -> Any:
-        return self._made(-self._term, operator.neg, (self,))  # exact for floats too
+        return self._made(-self._term, operator.neg, (self,), self._most)  # exact for floats too
 
     def __floordiv__(self, other: object) -> Any:
         return self._cannot()

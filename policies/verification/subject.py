@@ -49,12 +49,13 @@ def with_notes(policy: Policy) -> Policy:
     if isinstance(found, Shielded):
         return Shielded(with_notes(found.policy), found.rules)
     if isinstance(found, Guarded) and found.source is not None:
-        return Guarded(getattr(load_with_notes(found.source.file), found.source.name), found.source)
+        function = getattr(load_with_notes(found.source.file), found.source.name)
+        return Guarded(function, found.source, shares_lateness=False)
     return policy
 
 
 def _with_checks(source: Source) -> Policy:
-    found: Policy = Guarded(instrumented(source.file, source.name), source)
+    found: Policy = Guarded(instrumented(source.file, source.name), source, shares_lateness=False)
     return found
 
 

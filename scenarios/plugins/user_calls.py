@@ -62,10 +62,13 @@ class Guarded:
 
     __wrapped__: Callable[..., Any]
 
-    def __init__(self, function: Callable[..., Any], source: Source | None = None) -> None:
+    def __init__(
+        self, function: Callable[..., Any], source: Source | None = None, *, shares_lateness: bool = True
+    ) -> None:
+        """Args: `shares_lateness`: once it is late, other functions of the same source count as late too."""
         functools.update_wrapper(self, function)
         self.source = source
-        self._origin = None if source is None else (source.file, source.name)
+        self._origin = (source.file, source.name) if source is not None and shares_lateness else None
         self._late = ""  # what it exceeded: it is not called again
 
     def __deepcopy__(self, memo: object) -> Guarded:

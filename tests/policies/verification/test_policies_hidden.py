@@ -11,6 +11,7 @@ from policies_hidden import HARMLESS, KEPT, LATER, LISTED, ORDERS, TEXTS, UNLIST
 
 from sortie.policies.contract import PHASE_OF, FleetView
 from sortie.policies.registry import POLICIES, resolve
+from sortie.policies.verification import call_checks
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.kept import Kept
 from sortie.policies.verification.own_constants import views_at
@@ -164,11 +165,60 @@ def test_what_compiled_code_asks_in_its_own_order_is_not_proved(tmp_path: Path, 
         "bad = {'a': [len(sum(g(), [])) != 9 and 1.2370368 < soc * 3 < 1.2370374][:1]}['a'][0]",
     ],
 )
-def test_a_difference_is_noted_wherever_an_expression_stands(tmp_path: Path, use: str) -> None:
+def test_a_difference_is_noted_wherever_an_expression_stands(
+    tmp_path: Path, use: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a search in which `sum` asks for everything before it adds anything up: real objects show less."""
+    monkeypatch.setitem(call_checks._SPECIAL, sum, lambda items, start=0: sum(list(items), start))
     head = "rows = []\ndef g():\n    for k in range(3):\n        rows.append(k)\n        yield rows\ndef hold(x):\n    return lambda f: x\n"
     assert outcome(tmp_path, source(head + use)) == "drawn"
     assert outcome(tmp_path, source(head + use.replace("!= 9", "> 99"))) == "drawn"  # it is noted whatever comes of it
     assert outcome(tmp_path, source(head + use.replace("len(sum(g(), [])) != 9", "soc > 2"))) == "proved"
+
+
+NEAR = "abs(soc - 0.4123457) < 1e-9"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "bad = soc * me.cpu_headroom * 1e308 * 1e10 == math.inf",
+        f"bad = {NEAR} and soc * me.cpu_headroom * 1e308 * 1e10 > 1e308 * 10",
+        "bad = me.cpu_headroom * 1e305 / (soc + 1e-9) == math.inf",
+        "bad = (soc * me.cpu_headroom * 1e200) ** 2 == math.inf",
+    ],
+)
+def test_numbers_beyond_the_largest_float_are_not_followed(tmp_path: Path, body: str) -> None:
+    """Over the reals there is no infinity; floats reach it."""
+    found = verdict(tmp_path, source(body))
+    assert found.outcome == "drawn"
+    assert "may compute numbers beyond the largest float" in found.what
+
+
+def test_a_quotient_that_a_guard_keeps_small_is_followed(tmp_path: Path) -> None:
+    assert outcome(tmp_path, source("bad = soc > 0.2 and me.cpu_headroom / soc > 6")) == "proved over the reals"
+
+
+VIEWPOINT = """
+RATES = [2.0]
+def place(view):
+    if view.me is not None and {near}:
+        RATES[0] = 20.0
+    return None
+@looks_from(place)
+def decide(view):
+    return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=RATES[0]) for p in view.peers]
+"""
+
+
+def test_a_viewpoint_that_changes_what_the_policy_reads_is_memory(tmp_path: Path) -> None:
+    """A flight asks for the viewpoint first. One that changes nothing is no hindrance."""
+    head = "from sortie import Directive, Representation\nfrom sortie.policies.contract import looks_from\n"
+    text = head + VIEWPOINT.format(near="0.4123 < view.me.battery_soc < 0.4125")
+    found = verdict(tmp_path, text)
+    assert found.outcome == "drawn"
+    assert "remembers" in found.what
+    assert outcome(tmp_path, text.replace("RATES[0] = 20.0", "pass")) == "proved"
 
 
 RANKED_TWICE = "bad = peers_by_overlap(view)[0] == peers_by_overlap(view, view.peers[0])[0] == 9"

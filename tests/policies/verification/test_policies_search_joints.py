@@ -565,12 +565,14 @@ def test_notes_are_alike_if_all_that_is_compared_is_equal() -> None:
         (number, 0.5),
         (number + 1, 1.5),
         (TaskPhase.TRACK, TaskPhase.TRACK),
-        ([1], [2]),
+        ([1, (number, {2: [number]})], [1, (0.5, {2: [0.5]})]),
+        ({1}, {2}),
         (_one, len),
     ]
     assert all(alike(a, b) for a, b in equal)
     other = [
-        (3, 3.0), (1, True), (number, 0.6), (number, TaskPhase.TRACK), (TaskPhase.TRACK, TaskPhase.SEARCH), ([1], [1, 2]), ([1], (1,)),
+        (3, 3.0), (1, True), (number, 0.6), (number, TaskPhase.TRACK), (TaskPhase.TRACK, TaskPhase.SEARCH), ([1], [1, 2]), ([1], [2]), ([1], (1,)),
+        ((1, [number]), (1, [0.6])), ({1: 2}, {1: 3}), ({1: 2}, {3: 2}),
         (None, 0), ("a", "b"), ({1}, {1, 2}),
     ]  # fmt: skip
     assert not any(alike(a, b) for a, b in other)
