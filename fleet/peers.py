@@ -60,6 +60,12 @@ class PeerTable:
         nothing and nothing is asked of it; whether a wrong clock is to blame for its age."""
         self._counters: dict[int, NDArray[np.uint64]] = {}
 
+    @property
+    def pair_bytes(self) -> float:
+        """What a receiver's memory of a sender takes, with one key."""
+        arrays = [a for a in vars(self).values() if isinstance(a, np.ndarray)]
+        return sum(a.nbytes for a in (*arrays, self.counters(0))) / self.heard_s.size
+
     def counters(self, key_id: int) -> NDArray[np.uint64]:
         """The highest counter taken with a key, 0 for none."""
         if key_id not in self._counters:

@@ -18,7 +18,7 @@ Goodput stays in the descriptor's own list, where every version reads it: by asc
 to the roster's highest id. A reader that knows the roster keeps the members' entries; an older one passes over the
 roster and reads the same goodputs, with the others as unknown.
 
-In large fleets that list would not fit, nor an id into its byte. From a highest id of `WIDE_FROM` on, the field `wide`
+In large fleets that list would not fit, nor an id into its byte. If a roster names an id of `WIDE_FROM` or more, the field `wide`
 stands in place of the roster: the drone's id, the roster's epoch, and the members' ids, 2 B each. The descriptor's list
 then holds goodput to the members alone, and its id is `WIDE_ID`, so that a reader that does not know the field refuses it.
 
@@ -164,9 +164,9 @@ FIELDS: tuple[ExtensionField, ...] = (
     ExtensionField("roster", 2, _encode_roster, _decode_roster),
     ExtensionField("codebook", 3, _encode_codebook, _decode_codebook),
 )
+"""Every optional field that is one of `Descriptor`, by ascending type."""
 WIDE_FIELD = 4
 """Type of the field `wide`, which is no field of `Descriptor`: it is read as the drone's id and its roster."""
-"""Every optional field that this version knows, by ascending type."""
 _DECODERS = {field.number: (field.name, field.decode) for field in FIELDS} | {WIDE_FIELD: ("wide", _decode_wide)}
 _WITH_DEFAULTS = tuple((field, Descriptor._field_defaults[field.name]) for field in FIELDS)
 

@@ -17,6 +17,8 @@ import pyarrow as pa
 
 from sortie.fleet.coverage import RANGE_M
 from sortie.fleet.flight.motion import shapes_of
+from sortie.fleet.peers import PeerTable
+from sortie.fleet.probes import window_of
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.policies.contract import COVERAGE_BYTES
 from sortie.radio.channel.large_fleet import EPOCH
@@ -36,8 +38,6 @@ TEXT_BYTES = 8
 """A word, as in a status or a reason."""
 AIRFRAME_FLOATS = 4
 """Of a drone in a frame, beside its motion: the airframe's z axis, and what the rotors draw."""
-PEER_BYTES = 46
-"""Of a drone's memory of a peer, heard or not (`sortie.fleet.peers`)."""
 LINK_BYTES = 2 * 4 * EPOCH + 3 * 4 * EPOCH
 """Of a link within earshot in a large fleet: gain and shadowing in each frame of a block, and as much again in passing."""
 OBJECT_FACTOR = 8
@@ -85,7 +85,7 @@ def needs(scenario: Scenario) -> Needs:
         + OBJECT_FACTOR * batches
         + OUTCOME_BYTES * n * frames
         + SCORED_FLOATS * FLOAT_BYTES * possible["detections"]
-        + PEER_BYTES * n * n
+        + PeerTable(1, window_of(scenario.context.detached_after_periods)).pair_bytes * n * n
         + (LINK_BYTES * n * _neighbours(scenario) if n > SQUARE else 0)
     )
     return Needs(int(memory), int(motion + sure), int(motion + 2 * (sure + more)))

@@ -2,7 +2,7 @@
 
 | packets | from | to | when |
 |---|---|---|---|
-| descriptor: one DATA with its bytes, sealed as they flew | 10.0.0.(drone + 1), port 7401 | 239.255.0.1, port 7401 | when published |
+| descriptor: one DATA with its bytes, sealed as they flew | 10.0.0.(drone + 1), from drone 255 on 10.0.1.0, …, port 7401 | 239.255.0.1, port 7401 | when published |
 | directive: one DATA | a drone's policy node, port 7412 | its gate, port 7413 | when the gate takes it up |
 | payload: DATA, or DATA_FRAG where there are several fragments | sender, port 7411 | receiver, port 7411 | see below |
 
@@ -171,8 +171,8 @@ def _fragments_sent(row: Mapping[str, Any], each: int, tiled: bool) -> int:
 
 
 def address(drone: int) -> bytes:
-    """A drone's IPv4 address; ids are below 255."""
-    return bytes((10, 0, 0, drone + 1))
+    """A drone's IPv4 address."""
+    return bytes((10, 0, *divmod(drone + 1, 256)))
 
 
 def _whole(

@@ -29,6 +29,8 @@ from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words, event_in_words
 
+MOST_SYSTEMS = 255
+"""System ids of MAVLink."""
 DATAGRAM_BYTES = 1400
 """At most, with which a datagram passes Ethernet whole."""
 
@@ -47,11 +49,17 @@ class Stream:
     once a second, and decisions and events as texts. What happens to the whole fleet is said by drone 0.
 
     They are packed by `transmitters`, each when it is sent: packing numbers a frame and stamps its signature.
+
+    Raises:
+        RunError: more drones than system ids.
     """
 
     def __init__(
         self, scenario: Scenario, origin: Origin, key: bytes | None = None, begin_us: int | None = None
     ) -> None:
+        if scenario.fleet.drones > MOST_SYSTEMS:
+            bound = f"at most {MOST_SYSTEMS} for MAVLink, which has no more system ids"
+            raise RunError(f"fleet.drones is {scenario.fleet.drones}, must be {bound}")
         n, signed_at = scenario.fleet.drones, {} if begin_us is None else {"signed_at_us": begin_us}
         self.transmitters = [Transmitter(i, key, **signed_at) for i in range(n)]
         self.parameters = parameters_of(scenario)
@@ -109,7 +117,7 @@ def save_tlog(
         drone: this drone alone, with the system id that it has anyway.
 
     Raises:
-        RunError: no such drone, or the file cannot be written.
+        RunError: no such drone, more drones than system ids, or the file cannot be written.
         TraceError: its trace is needed for the origin and cannot be read.
     """
     if drone is not None and drone >= record.scenario.fleet.drones:

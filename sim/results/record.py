@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from sortie.fleet.agent import Ages
-from sortie.fleet.messages.wire import DIRECTIVE_BYTES
+from sortie.fleet.messages.wire import directive_bytes
 from sortie.fleet.staleness import LinkHealth
 from sortie.fleet.trust import Standing
 from sortie.policies.contract import PHASE_NAMES, Descriptor, Directive
@@ -297,7 +297,7 @@ class AgentNotes:
         recorder.unfold |= {"descriptors": partial(_unfold_descriptors, drones=drones), "ages": _unfold_ages}
         self.rosters = RosterLog()
         self._eval_steps: defaultdict[int, int] = defaultdict(int)  # decisions by their wall time
-        self._descriptor_bytes = self._directives = self._decisions = 0
+        self._descriptor_bytes = self._directives = self._directive_bytes = self._decisions = 0
 
     def descriptor(self, t_s: float, d: Descriptor, wire_bytes: int) -> None:
         """One descriptor was published."""
@@ -309,6 +309,7 @@ class AgentNotes:
     def directive(self, t_s: float, asked: Directive, enforced: Directive, link: LinkHealth, reason: str) -> None:
         """A gate enforces something new."""
         self._directives += 1
+        self._directive_bytes += directive_bytes(enforced)
         roi = enforced.roi or _NO_DISC
         self._rows["directives"].append(
             (
@@ -341,7 +342,7 @@ class AgentNotes:
         """Context-plane bytes: descriptors on the air, directives to the gates."""
         return {
             "context_descriptor_bytes": self._descriptor_bytes,
-            "context_directive_bytes": self._directives * DIRECTIVE_BYTES,
+            "context_directive_bytes": self._directive_bytes,
             "directives": self._directives,
             "decisions": self._decisions,
         }

@@ -40,6 +40,8 @@ SENT = {
 HANDSHAKES = "#a89a3c"
 FATES = {"lost": "#d02f45", "expired": "#8a90a0"}
 MISSION, EVENT, JAMMER = "#d02fae", "#8a6a00", "#c8201f"
+MOST_NAMED = 40
+"""A legend has room for so many names."""
 DISCS = 6
 """A mission region that moves is drawn on the map at so many times."""
 WINDOW_S = 5.0
@@ -114,8 +116,8 @@ def drawn(plots: Sequence[tuple[str, float, Callable[[Axes], None]]]) -> dict[st
 
 
 def legend_beside(axes: Axes) -> None:
-    """A legend to the right of the axes, where it hides no curve."""
-    if axes.get_legend_handles_labels()[1]:
+    """A legend to the right of the axes, where it hides no curve; none where nobody could read it."""
+    if 0 < len(axes.get_legend_handles_labels()[1]) <= MOST_NAMED:
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
 
 

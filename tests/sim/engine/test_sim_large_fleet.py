@@ -19,6 +19,9 @@ from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.errors import SortieError
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.messages import descriptors
+from sortie.sim.export.pcap import address, write_pcap
+from sortie.sim.export.telemetry import save_tlog
+from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
 from sortie.sim.results.link_traffic import mean_goodput
 from sortie.sim.results.outcome import outcome
@@ -64,6 +67,22 @@ def test_the_record_lists_goodput_as_the_descriptors_did(flown: SortieRecord, tm
         assert (again.agent_id, again.roster) == (d.agent_id, d.roster)
     run_folder.save(flown, tmp_path / "run")
     assert run_folder.load(tmp_path / "run").fingerprint == flown.fingerprint
+
+
+def test_exports_name_every_drone_or_refuse(flown: SortieRecord, tmp_path: Path) -> None:
+    """Addresses of a packet capture differ from drone to drone; MAVLink has 255 system ids."""
+    write_pcap(flown, tmp_path / "run.pcapng", 0)
+    assert len({address(i) for i in range(5000)}) == 5000
+    assert address(299) == bytes((10, 0, 1, 44))
+    with pytest.raises(RunError, match=r"fleet\.drones is 260, must be at most 255 for MAVLink"):
+        save_tlog(flown, tmp_path / "run.tlog", begin_us=0)
+
+
+def test_directives_count_with_the_bytes_that_they_have(flown: SortieRecord) -> None:
+    rows = flown.tables["directives"]
+    long = sum(max(link) > 254 for link in zip(rows["drone"].to_pylist(), rows["peer"].to_pylist(), strict=True))
+    assert long > 0
+    assert flown.totals["context_directive_bytes"] == 36 * rows.num_rows + 4 * long
 
 
 def test_the_same_again_is_the_same_record(flown: SortieRecord) -> None:
