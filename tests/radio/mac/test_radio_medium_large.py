@@ -10,6 +10,8 @@ import pytest
 import simpy
 
 from sortie.radio import Air, AirSettings
+from sortie.radio.channel.draws import fade_table
+from sortie.radio.channel.pathloss import range_m
 from sortie.radio.mac import edca
 from sortie.radio.mac.jobs import AirJob, GroupFrame
 from sortie.radio.mac.medium import FAINT_DB, Medium
@@ -96,6 +98,14 @@ def test_faint_frames_are_heard_as_energy_where_they_are_many() -> None:
     alone_s = first_frame_s(0, -200.0)
     assert first_frame_s(5, weakest_dbm - 10.0) == alone_s
     assert first_frame_s(20, weakest_dbm - 10.0) > alone_s + 0.9 * (GROUP_S - 1e-4)
+
+
+def test_links_of_the_default_radio_are_faint_beyond_a_kilometre() -> None:
+    """As the room's README has it."""
+    config = AirSettings()
+    fade_db = 10.0 * np.log10(fade_table(config.rician_k_db).max())
+    faint_at_m = range_m(config, config.tx_power_dbm - config.preamble_detection_dbm + FAINT_DB + fade_db)
+    assert faint_at_m == pytest.approx(1000.0, rel=0.05)
 
 
 def test_a_faint_frame_is_lost_to_a_weak_signal_whatever_else_is_on_the_air() -> None:
