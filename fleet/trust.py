@@ -104,11 +104,6 @@ class Standing(NamedTuple):
     """Judgements since the last at which it was heard."""
 
     @property
-    def elapsed(self) -> int:
-        """Seconds from its first judgement to its latest: its charge has fallen for so long."""
-        return self.seconds - 1
-
-    @property
     def trust(self) -> float:
         """1 until a doubt was found twice in a row, then halved by each further one; 0 from the sixth."""
         if self.strikes < STRIKES_TO_DOUBT:
@@ -150,10 +145,9 @@ def judge(
         where all can. The ego has nothing to doubt in itself, but its battery is one of the fleet's.
     """
     before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
-    fell_per_s = {
-        i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items() if i not in stations
-    }
+    fell_per_s = {i: (s[3] - known[i].battery_soc) / max(s[2] - 1, 1) for i, s in before.items() if i not in stations}
     by_fall = sorted(fell_per_s.values())
+    most_fell_per_s = max(by_fall[: len(by_fall) // 2 + 2], default=0.0)  # no median without one of them is higher
     # who was not heard for a while drained on: its fall, once it is heard again, is over this second too
     after = {i: s if i in known else s.unheard_of() for i, s in standings.items()}
     peers = [i for i in known if i != ego] if math.isfinite(form.blur_m) else []
@@ -162,13 +156,11 @@ def judge(
     )
     goodput_step_mbps, soc_step = form.goodput_step_mbps, form.soc_step
     for peer, claim in known.items():
-        standing = before[peer]
-        doubt = ""
+        strikes, reason, seconds, first_soc, least_soc, fine, unheard = before[peer]
+        doubt, soc = "", claim.battery_soc
         if peer != ego:
             came = arrivals.get(peer)
-            others_fell = 0.0
-            if peer not in stations:
-                others_fell = _median_without(by_fall, fell_per_s[peer]) * standing.elapsed
+            most_fell = most_fell_per_s * (seconds - 1)
             doubt = (
                 (_coverage_doubt(cells[peer], peer in looking) if cells else "")
                 or (
@@ -176,18 +168,20 @@ def judge(
                     if came and claim.counts(ego)  # who leaves the ego out claims no goodput to it
                     else ""
                 )
-                or battery_doubt(
-                    claim.battery_soc,
-                    standing.least_soc,
-                    standing.first_soc,
-                    others_fell,
-                    max(3 * soc_step, 0.0 if standing.fine else PERCENT),
+                or (
+                    battery_doubt(
+                        soc,
+                        least_soc,
+                        first_soc,
+                        0.0 if peer in stations else _median_without(by_fall, fell_per_s[peer]) * (seconds - 1),
+                        max(3 * soc_step, 0.0 if fine else PERCENT),
+                    )
+                    if soc > least_soc or (most_fell >= FALL and first_soc - soc < FALL_SHARE * most_fell)
+                    else ""
                 )
             )
-        strikes = min(standing.strikes + 1, MOST_STRIKES) if doubt else max(standing.strikes - 1, 0)
-        least_soc = min(standing.least_soc, claim.battery_soc)
-        _, reason, seconds, first_soc, _, fine, unheard = standing  # built anew, in a third of the time of `_replace`
-        after[peer] = Standing(strikes, doubt or reason, seconds, first_soc, least_soc, fine, unheard)
+        strikes = min(strikes + 1, MOST_STRIKES) if doubt else max(strikes - 1, 0)
+        after[peer] = Standing(strikes, doubt or reason, seconds, first_soc, min(least_soc, soc), fine, unheard)
     return after
 
 
@@ -201,14 +195,14 @@ def _median_without(ascending: Sequence[float], value: float) -> float:
     return high if rest % 2 else (ascending[middle - 1 + (middle > at)] + high) / 2
 
 
-def _aged(standing: Standing, soc: float) -> Standing:
-    """The standing a second later. Who is judged for the first time, fell at once, or was silent for long, begins anew with
-    its charge."""
+def _aged(standing: Standing, soc: float) -> tuple[int, str, int, float, float, bool, int]:
+    """A standing's values a second later. Who is judged for the first time, fell at once, or was silent for long, begins anew
+    with its charge."""
     strikes, reason, seconds, first_soc, least_soc, fine, unheard = standing
     fine = fine or abs(soc / PERCENT - round(soc / PERCENT)) > 1e-4
     if seconds == 0 or unheard >= LONG_SILENCE or soc < least_soc - min(JUMP * (1 + unheard), MOST_JUMP):
-        return Standing(strikes, reason, 1, soc, least_soc, fine)
-    return Standing(strikes, reason, seconds + 1, first_soc, least_soc, fine)
+        return strikes, reason, 1, soc, least_soc, fine, 0
+    return strikes, reason, seconds + 1, first_soc, least_soc, fine, 0
 
 
 def discounted(d: Descriptor) -> Descriptor:
@@ -254,7 +248,8 @@ class _Cells(NamedTuple):
     """Whether the drone is above the roofs."""
 
 
-_COUNTED: dict[tuple[object, ...], _Cells] = {}
+_COUNTED: dict[int, tuple[Descriptor, float, Cameras, _Cells]] = {}
+"""By the identity of the claim, which all who heard it share."""
 _MOST_COUNTED = 4096
 
 
@@ -266,18 +261,19 @@ def _count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[
         blur_m: how far a cell may be off by the descriptors' form.
         cameras: of the drone of each claim.
     """
-    keys = [
-        (d.coverage_grid, d.position_m, d.orientation_xyzw, d.velocity_mps, blur_m, its)
-        for d, its in zip(claims, cameras, strict=True)
+    found = [_COUNTED.get(id(d)) for d in claims]
+    new = [
+        k
+        for k, (d, its, one) in enumerate(zip(claims, cameras, found, strict=True))
+        if one is None or one[0] is not d or one[1] != blur_m or (one[2] is not its and one[2] != its)
     ]
-    new = {key: d for key, d in zip(keys, claims, strict=True) if key not in _COUNTED}
     if len(_COUNTED) + len(new) > _MOST_COUNTED:
         _COUNTED.clear()
-        new = dict(zip(keys, claims, strict=True))
-    for kind in dict.fromkeys([key[-1] for key in new]):
-        several = [key for key in new if key[-1] == kind]
-        _COUNTED.update(zip(several, _count([new[key] for key in several], blur_m, kind), strict=True))
-    return [_COUNTED[key] for key in keys]
+    for kind in dict.fromkeys([cameras[k] for k in new]):
+        several = [k for k in new if cameras[k] == kind]
+        for k, cells in zip(several, _count([claims[k] for k in several], blur_m, kind), strict=True):
+            _COUNTED[id(claims[k])] = found[k] = claims[k], blur_m, kind, cells
+    return [one[3] for one in found if one is not None]
 
 
 def _count(claims: Sequence[Descriptor], blur_m: float, cameras: Cameras) -> list[_Cells]:
