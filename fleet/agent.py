@@ -26,7 +26,8 @@ from sortie.fleet.peers import loops
 from sortie.fleet.plane import PlaneRules
 from sortie.fleet.senses import Sensed
 from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age, health
-from sortie.fleet.trust import JUDGED_EVERY_S, Standing
+from sortie.fleet.standings import Standing
+from sortie.fleet.trust import JUDGED_EVERY_S
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.checks import check_directives, differing

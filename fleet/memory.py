@@ -18,12 +18,12 @@ from sortie.fleet.messages.extensions import MAX_WIDE_MEMBERS, WIDE_FROM
 from sortie.fleet.peers import PeerTable, loops
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.probes import Probes, window_of
+from sortie.fleet.standings import STRIKES_TO_DOUBT, UNJUDGED, Standing, Standings
 from sortie.fleet.trust import (
     JUDGED_EVERY_S,
     LONG_SILENCE,
-    UNJUDGED,
     Arrival,
-    Standing,
+    charge_loop,
     discounted,
     judge,
     split_arrivals,
@@ -67,12 +67,13 @@ class PeerMemory:
         self._known: dict[int, Descriptor] = {}  # by ascending id
         self.ids: NDArray[np.int64] = np.empty(0, np.int64)
         """Of whom it has a descriptor, itself included, ascending; another array once there is one more."""
-        self._standings: dict[int, Standing] = {}
+        self._standings = Standings({}, table.heard_s.shape[1])
         self._doubted: frozenset[int] = frozenset()
         self._arrivals: dict[int, list[Arrival]] = {}
         self._judged_at_s = -math.inf
         self._stations = frozenset(i for i, its in rules.makes.items() if not its.flies)
         self._loops = loops()
+        charge_loop()
 
     def hear(self, opened: Opened | Dropped, now_s: float) -> DropReason | None:
         """Take a datagram in, as `hear`; returns why it was refused, None if it was accepted."""
@@ -195,7 +196,8 @@ class PeerMemory:
         """
         before = self._standings
         if now_s - self._judged_at_s >= LONG_SILENCE * JUDGED_EVERY_S:  # the drone itself was away
-            before = {i: standing._replace(unheard=LONG_SILENCE) for i, standing in before.items()}
+            before = Standings(before)
+            before.rows["unheard"] = LONG_SILENCE
         since_s, self._judged_at_s = max(now_s - self._fresh_s, self._judged_at_s), now_s
         looking: set[int] = set()
         # its own claims stand, however long ago another of its nodes published them
@@ -214,8 +216,9 @@ class PeerMemory:
             before, self.drone, heard, arrivals, self._rules.form, looking,
             lambda i: self._rules.equipment(i).cameras, self._stations,
         )  # fmt: skip
-        self._doubted = frozenset([i for i, s in after.items() if s.strikes and s.trust < 1.0])
-        moved = [i for i in heard if after[i].strikes != before.get(i, UNJUDGED).strikes]
+        strikes, were = after.rows["strikes"], before.rows["strikes"]
+        self._doubted = frozenset(np.flatnonzero(strikes >= STRIKES_TO_DOUBT).tolist())
+        moved = np.flatnonzero(strikes != were).tolist()
         return [(peer, after[peer]) for peer in moved if after[peer].trust != before.get(peer, UNJUDGED).trust]
 
 

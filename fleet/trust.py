@@ -13,17 +13,18 @@ All of it is pure: `judge` takes what is known and gives what is thought of a pe
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Callable, Container, Mapping, Sequence
+from functools import cache
 from itertools import pairwise
 from statistics import median
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from sortie.fleet.coverage import LOOK_STANDS_S, attitude, camera_states, unpack_grid
 from sortie.fleet.messages.compact import FULL, Form
+from sortie.fleet.standings import MOST_STRIKES, Standing, Standings
 from sortie.perception.geometry import USUAL, Cameras
 from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
 
@@ -44,11 +45,7 @@ UNDERSTATED, OVERSTATED = 0.1, 1.5
 """A claim is a doubt below the first times what was seen to arrive (an estimate rises by 0.3 of the gap at each
 sample), or above the second times the data rate at which it came: no link carries more than that."""
 
-# --- battery
-JUMP, MOST_JUMP = 0.015, 0.05
-"""A fall by so much a second, or by the second at once, is a fault, or a lie that begins; either way the charge is watched
-anew. Above a step of whole percents, and no higher: in a fleet of two or three a fault below it passes for the fleet's
-fall. A small pack that is heard every ten seconds falls by more than the first between two claims."""
+# --- battery; a jump, and what else the charge is watched for, is in `sortie.fleet.trust_loops`
 RISE = 0.03
 """Charge that may come back: estimators of real drones correct themselves by a few percent."""
 PERCENT = 0.01
@@ -61,7 +58,6 @@ LONG_SILENCE = 30
 shorter silence it is taken to have flown on behind a weak link. Had it rested, four seconds of flight before that would
 still be more than FALL_SHARE of the others'."""
 
-STRIKES_TO_DOUBT, MOST_STRIKES = 2, 6
 UNKNOWN_GRID = bytes(64)
 
 
@@ -87,41 +83,13 @@ class Arrival(NamedTuple):
         return self.size_bytes * 8e-6 / max(self.took_s, 1e-4)
 
 
-class Standing(NamedTuple):
-    """What one drone thinks of another."""
+@cache
+def charge_loop() -> Any:
+    """The compiled loop, imported and made ready at its first use."""
+    from sortie.fleet.trust_loops import watch_charge
 
-    strikes: int = 0
-    reason: str = ""
-    """The latest doubt."""
-    seconds: int = 0
-    """Judgements since it was first judged, those included at which nothing was heard of it."""
-    first_soc: float = 0.0
-    """Its charge when it was first judged."""
-    least_soc: float = 1.0
-    fine: bool = False
-    """Whether it ever told its charge more finely than in whole percents."""
-    unheard: int = 0
-    """Judgements since the last at which it was heard."""
-
-    @property
-    def elapsed(self) -> int:
-        """Seconds from its first judgement to its latest: its charge has fallen for so long."""
-        return self.seconds - 1
-
-    @property
-    def trust(self) -> float:
-        """1 until a doubt was found twice in a row, then halved by each further one; 0 from the sixth."""
-        if self.strikes < STRIKES_TO_DOUBT:
-            return 1.0
-        return 0.0 if self.strikes >= MOST_STRIKES else 0.5 ** (self.strikes - STRIKES_TO_DOUBT + 1)
-
-    def unheard_of(self) -> Standing:
-        """The standing a second later, in which nothing was heard of the drone."""
-        strikes, reason, seconds, first_soc, least_soc, fine, unheard = self
-        return Standing(strikes, reason, seconds + 1, first_soc, least_soc, fine, unheard + 1)
-
-
-UNJUDGED = Standing()
+    watch_charge(Standings({}).rows, np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.bool_), 0.0)
+    return watch_charge
 
 
 def judge(
@@ -133,7 +101,7 @@ def judge(
     looking: Container[int] = (),
     cameras: Callable[[int], Cameras] = lambda _: USUAL,
     stations: Container[int] = (),
-) -> dict[int, Standing]:
+) -> Standings:
     """What `ego` thinks of everyone after one more second.
 
     Args:
@@ -149,66 +117,40 @@ def judge(
         Standings of all in `known`, and of others a second older: one strike more where a claim cannot be so, one less
         where all can. The ego has nothing to doubt in itself, but its battery is one of the fleet's.
     """
-    before = {i: _aged(standings.get(i, UNJUDGED), d.battery_soc) for i, d in known.items()}
-    fell_per_s = {
-        i: (s.first_soc - known[i].battery_soc) / max(s.elapsed, 1) for i, s in before.items() if i not in stations
-    }
-    by_fall = sorted(fell_per_s.values())
+    claims, ids = list(known.values()), np.array(list(known), np.int64)
+    after = Standings(standings, int(ids.max(initial=-1)) + 1)
     # who was not heard for a while drained on: its fall, once it is heard again, is over this second too
-    after = {i: s if i in known else s.unheard_of() for i, s in standings.items()}
-    peers = [i for i in known if i != ego] if math.isfinite(form.blur_m) else []
-    cells = dict(
-        zip(peers, _count_cells([known[i] for i in peers], form.blur_m, [cameras(i) for i in peers]), strict=True)
+    claimed_soc, flies = (
+        np.array([d.battery_soc for d in claims]),
+        np.array([i not in stations for i in known], np.bool_),
     )
-    goodput_step_mbps, soc_step = form.goodput_step_mbps, form.soc_step
-    for peer, claim in known.items():
-        standing = before[peer]
-        doubt = ""
-        if peer != ego:
-            came = arrivals.get(peer)
-            others_fell = 0.0
-            if peer not in stations:
-                others_fell = _median_without(by_fall, fell_per_s[peer]) * standing.elapsed
-            doubt = (
-                (_coverage_doubt(cells[peer], peer in looking) if cells else "")
-                or (
-                    goodput_doubt(claim.goodput_to(ego), came, goodput_step_mbps)
-                    if came and claim.counts(ego)  # who leaves the ego out claims no goodput to it
-                    else ""
-                )
-                or battery_doubt(
-                    claim.battery_soc,
-                    standing.least_soc,
-                    standing.first_soc,
-                    others_fell,
-                    max(3 * soc_step, 0.0 if standing.fine else PERCENT),
-                )
+    false_charge, others_fell = charge_loop()(after.rows, ids, claimed_soc, flies, form.soc_step)
+    peers = [i for i in known if i != ego]
+    cells = dict.fromkeys(peers, NO_CELLS)
+    if math.isfinite(form.blur_m):
+        counted = _count_cells([known[i] for i in peers], form.blur_m, [cameras(i) for i in peers])
+        cells = dict(zip(peers, counted, strict=True))
+    doubts = {}
+    for k, (peer, claim, is_false) in enumerate(zip(known, claims, false_charge.tolist(), strict=True)):
+        if peer == ego:
+            continue
+        doubt, came = _coverage_doubt(cells[peer], peer in looking), arrivals.get(peer)
+        if not doubt and came and claim.counts(ego):  # who leaves the ego out claims no goodput to it
+            doubt = goodput_doubt(claim.goodput_to(ego), came, form.goodput_step_mbps)
+        if not doubt and is_false:
+            standing = after[peer]
+            unseen = max(3 * form.soc_step, 0.0 if standing.fine else PERCENT)
+            doubt = battery_doubt(
+                claim.battery_soc, standing.least_soc, standing.first_soc, float(others_fell[k]), unseen
             )
-        strikes = min(standing.strikes + 1, MOST_STRIKES) if doubt else max(standing.strikes - 1, 0)
-        least_soc = min(standing.least_soc, claim.battery_soc)
-        _, reason, seconds, first_soc, _, fine, unheard = standing  # built anew, in a third of the time of `_replace`
-        after[peer] = Standing(strikes, doubt or reason, seconds, first_soc, least_soc, fine, unheard)
+        if doubt:
+            doubts[peer] = doubt
+    after.reasons |= doubts
+    strikes, struck = after.rows["strikes"], np.array(list(doubts), np.int64)
+    raised = np.minimum(strikes[struck] + 1, MOST_STRIKES)
+    strikes[ids] = np.maximum(strikes[ids], 1) - 1
+    strikes[struck] = raised
     return after
-
-
-def _median_without(ascending: Sequence[float], value: float) -> float:
-    """The median of the others, where `value` is one of several; 0 where it is the only one."""
-    at, rest = bisect_left(ascending, value), len(ascending) - 1
-    if not rest:
-        return 0.0
-    middle = rest // 2
-    high = ascending[middle + (middle >= at)]
-    return high if rest % 2 else (ascending[middle - 1 + (middle > at)] + high) / 2
-
-
-def _aged(standing: Standing, soc: float) -> Standing:
-    """The standing a second later. Who is judged for the first time, fell at once, or was silent for long, begins anew with
-    its charge."""
-    strikes, reason, seconds, first_soc, least_soc, fine, unheard = standing
-    fine = fine or abs(soc / PERCENT - round(soc / PERCENT)) > 1e-4
-    if seconds == 0 or unheard >= LONG_SILENCE or soc < least_soc - min(JUMP * (1 + unheard), MOST_JUMP):
-        return Standing(strikes, reason, 1, soc, least_soc, fine)
-    return Standing(strikes, reason, seconds + 1, first_soc, least_soc, fine)
 
 
 def discounted(d: Descriptor) -> Descriptor:
@@ -254,7 +196,11 @@ class _Cells(NamedTuple):
     """Whether the drone is above the roofs."""
 
 
-_COUNTED: dict[tuple[object, ...], _Cells] = {}
+NO_CELLS = _Cells(0, 0, False)
+"""Of a descriptor without a coverage grid."""
+
+_COUNTED: dict[int, tuple[Descriptor, float, Cameras, _Cells]] = {}
+"""By the identity of the claim, which all who heard it share."""
 _MOST_COUNTED = 4096
 
 
@@ -266,18 +212,19 @@ def _count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[
         blur_m: how far a cell may be off by the descriptors' form.
         cameras: of the drone of each claim.
     """
-    keys = [
-        (d.coverage_grid, d.position_m, d.orientation_xyzw, d.velocity_mps, blur_m, its)
-        for d, its in zip(claims, cameras, strict=True)
+    found = [_COUNTED.get(id(d)) for d in claims]
+    new = [
+        k
+        for k, (d, its, one) in enumerate(zip(claims, cameras, found, strict=True))
+        if one is None or one[0] is not d or one[1] != blur_m or (one[2] is not its and one[2] != its)
     ]
-    new = {key: d for key, d in zip(keys, claims, strict=True) if key not in _COUNTED}
     if len(_COUNTED) + len(new) > _MOST_COUNTED:
         _COUNTED.clear()
-        new = dict(zip(keys, claims, strict=True))
-    for kind in dict.fromkeys([key[-1] for key in new]):
-        several = [key for key in new if key[-1] == kind]
-        _COUNTED.update(zip(several, _count([new[key] for key in several], blur_m, kind), strict=True))
-    return [_COUNTED[key] for key in keys]
+    for kind in dict.fromkeys([cameras[k] for k in new]):
+        several = [k for k in new if cameras[k] == kind]
+        for k, cells in zip(several, _count([claims[k] for k in several], blur_m, kind), strict=True):
+            _COUNTED[id(claims[k])] = found[k] = claims[k], blur_m, kind, cells
+    return [one[3] for one in found if one is not None]
 
 
 def _count(claims: Sequence[Descriptor], blur_m: float, cameras: Cameras) -> list[_Cells]:

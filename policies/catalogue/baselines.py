@@ -20,7 +20,7 @@ from math import floor
 
 from sortie.policies.catalogue.attached import among_attached
 from sortie.policies.catalogue.prior.full import full_sharing
-from sortie.policies.contract import FEATURE_CELLS, Directive, FleetView, boxes_across_networks, nothing
+from sortie.policies.contract import FEATURE_CELLS, Directive, FleetView, boxes_across_networks, nothing, nothing_to_all
 from sortie.policies.geometry import peers_by_overlap
 
 RESHUFFLE_S = 10
@@ -165,4 +165,4 @@ def _draw(view: FleetView, salt: int, whose: int, among: Sequence[int], k: int) 
 @among_attached
 def silence(view: FleetView) -> list[Directive]:
     """Nothing to anyone: five single drones."""
-    return [nothing(view.ego, p, "fixed: silence") for p in view.peers]
+    return list(nothing_to_all(view.ego, view.peers, "fixed: silence"))

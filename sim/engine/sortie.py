@@ -37,7 +37,7 @@ from sortie.scenarios.streams import stream
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
-from sortie.sim.engine.garbage import LEFTOVERS, older_objects_kept
+from sortie.sim.engine.garbage import LEFTOVERS, cycles_searched_rarely
 from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
@@ -134,7 +134,7 @@ def run_sortie(
         own = loaded(scenario)
         parts = build(scenario, policies, seed, replication, detector_of)
         files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited during the flight
-        with older_objects_kept():
+        with cycles_searched_rarely():
             fly(parts, each_second, observer)
         record = _collect(parts, policies, name, seed, replication)
         metrics = own_metrics(own, record)

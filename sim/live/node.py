@@ -28,7 +28,7 @@ from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
 from sortie.fleet.plane import PlaneRules
 from sortie.fleet.staleness import LinkHealth, health
-from sortie.fleet.trust import Standing
+from sortie.fleet.standings import Standing
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView
 from sortie.scenarios.representation import NAME_OF

@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 from sortie.fleet.agent import Ages
 from sortie.fleet.messages.wire import directive_bytes
 from sortie.fleet.staleness import LinkHealth
-from sortie.fleet.trust import Standing
+from sortie.fleet.standings import Standing
 from sortie.policies.contract import PHASE_NAMES, Descriptor, Directive
 from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.scenarios import scratch

@@ -32,7 +32,8 @@ from sortie.fleet.peers import PeerTable
 from sortie.fleet.plane import DroneStatus, Equipment, PlaneRules, codebooks
 from sortie.fleet.senses import FlightSenses, Sensed, believed
 from sortie.fleet.sensor_faults import sensor_errors
-from sortie.fleet.trust import Arrival, Standing, battery_doubt, coverage_doubt, goodput_doubt, judge
+from sortie.fleet.standings import Standing
+from sortie.fleet.trust import Arrival, battery_doubt, coverage_doubt, goodput_doubt, judge
 from sortie.perception import budget
 from sortie.perception.geometry import USUAL
 from sortie.perception.scene.scene_model import SceneModel

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import median
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from fleet_examples import grid_on_a_plain
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sortie.fleet import trust, trust_loops
 from sortie.fleet.coverage import View, pack_grid, placed, unpack_grid
 from sortie.fleet.lies import falsified
 from sortie.fleet.messages.compact import Form, decode_compact, encode_compact
+from sortie.fleet.standings import UNJUDGED, Standing, Standings
 from sortie.fleet.trust import (
     LONG_SILENCE,
     Arrival,
-    Standing,
     battery_doubt,
     coverage_doubt,
     discounted,
@@ -342,3 +344,34 @@ def test_a_doubted_drone_stays_where_it_is_and_says_nothing() -> None:
     small = discounted(d)
     assert (small.position_m, small.footprint_radius_m, small.agent_id) == (d.position_m, 42.0, 3)
     assert (set(small.coverage_grid), small.battery_soc, small.peer_goodput_mbps) == ({0}, 0.0, (0.0,) * 4)
+
+
+@given(st.data())
+def test_the_compiled_loop_finds_what_the_formula_finds(data: st.DataObject) -> None:
+    """A fleet whose charge falls, stands still, jumps and is not heard, second by second against `battery_doubt`."""
+    drones = data.draw(st.integers(1, 6))
+    standings, grid = Standings({}), bytes(64)
+    socs, stations = [0.9] * drones, data.draw(st.sets(st.integers(0, drones - 1)))
+    for _ in range(data.draw(st.integers(1, 12))):
+        falls = st.sampled_from([0.0, 0.0, 0.01, 0.012, 0.03, -0.04, 0.08])
+        socs = [soc - data.draw(falls) for soc in socs]
+        heard = sorted({0, *data.draw(st.sets(st.integers(0, drones - 1)))})
+        known = {i: honest(i)._replace(coverage_grid=grid, battery_soc=socs[i]) for i in heard}
+        before, standings = standings, judge(standings, 0, known, {}, stations=stations)
+        fell_per_s = {
+            i: (standings[i].first_soc - socs[i]) / max(standings[i].seconds - 1, 1) for i in heard if i not in stations
+        }
+        for i in heard:
+            others, was, now = [f for k, f in fell_per_s.items() if k != i], before.get(i, UNJUDGED), standings[i]
+            others_fell = median(others) * (now.seconds - 1) if others and i not in stations else 0.0
+            doubt = battery_doubt(
+                socs[i], was.least_soc, now.first_soc, others_fell, max(3 * Form().soc_step, 0.0 if now.fine else 0.01)
+            )
+            assert now.strikes == (min(was.strikes + 1, 6) if doubt and i else max(was.strikes - 1, 0))
+            assert now.reason == (doubt if doubt and i else was.reason)
+            assert now.least_soc == min(was.least_soc, socs[i])
+
+
+def test_the_compiled_loop_has_the_constants_of_the_formula() -> None:
+    for name in ("RISE", "PERCENT", "FALL", "FALL_SHARE", "LONG_SILENCE"):
+        assert getattr(trust_loops, f"_{name}") == getattr(trust, name)

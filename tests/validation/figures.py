@@ -701,6 +701,14 @@ def _campaign_scale() -> Tables:
     return campaign_scale.tables()
 
 
+def _pace() -> Tables:
+    import pace
+
+    made, found = pace.tables()
+    pace.draw(found, ROOT / "docs/results/fleet_pace.png")
+    return made
+
+
 def _inference_libraries() -> Tables:
     """Needs onnx, onnxruntime and openvino for their rows."""
     measured = _benchmarks("tests/benchmarks/test_bench_inference_libraries.py")
@@ -761,6 +769,7 @@ FIGURES: dict[str, Figure] = {
     "inference_libraries": Figure(2, _inference_libraries, timed=True, network=True),
     "campaign_scale": Figure(10, _campaign_scale, timed=True),
     "speed": Figure(12, _speed, timed=True),
+    "pace": Figure(12, _pace, timed=True),
     "difficulty": Figure(12, _difficulty, network=True),
     "surrogate_in_flight": Figure(45, _surrogate_in_flight, network=True),
     "arms": Figure(20, _arms, network=True),

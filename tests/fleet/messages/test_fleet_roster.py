@@ -15,7 +15,8 @@ from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.compact import FULL, Form, encode_compact
 from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES, VERSION
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
-from sortie.fleet.trust import UNJUDGED, Arrival, judge
+from sortie.fleet.standings import UNJUDGED
+from sortie.fleet.trust import Arrival, judge
 from sortie.policies.contract import Descriptor, FleetView, LinkState, Roster
 from sortie.policies.damping import apply_hysteresis
 

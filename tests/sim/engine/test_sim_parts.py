@@ -46,11 +46,17 @@ def test_no_part_gains_an_attribute_in_flight(monkeypatch: pytest.MonkeyPatch) -
     assert [d.airborne for d in parts.world.drones] == [i != 2 for i in range(len(parts.agents))]
 
 
-def test_a_flight_leaves_the_garbage_collector_alone() -> None:
-    """The collector belongs to the process, which may be somebody else's."""
-    before, seen = (gc.isenabled(), gc.get_threshold()), set()
-    run_sortie(load("track_target", SETS), progress=lambda _: seen.add((gc.isenabled(), gc.get_threshold())))
-    assert seen == {before} == {(gc.isenabled(), gc.get_threshold())}
+@pytest.mark.parametrize("new", [0, 700, 90_000])
+def test_a_flight_gives_the_garbage_collector_back_as_it_was(new: int) -> None:
+    """It belongs to the process, which may be somebody else's. In flight it searches more rarely, and stays off if it was."""
+    at_first, seen = gc.get_threshold(), set()
+    gc.set_threshold(new, *at_first[1:])
+    try:
+        run_sortie(load("track_target", SETS), progress=lambda _: seen.add((gc.isenabled(), gc.get_threshold()[0])))
+        assert gc.get_threshold()[0] == new
+    finally:
+        gc.set_threshold(*at_first)
+    assert seen == {(True, {0: 0, 700: 10_000, 90_000: 90_000}[new])}
 
 
 @pytest.mark.parametrize("name", ["world", "transport"])
