@@ -1026,28 +1026,26 @@ def run(
 
 
 @part
-def fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, J):
-    for k in range(JOB_COLUMNS):
-        J[job, k] = 0
-    J[job, KIND], J[job, STATION], J[job, FLOW], J[job, JOB_ACCESS] = kind, station, flow, access_class
-    J[job, COUNT], J[job, FULL_BYTES], J[job, LAST_BYTES], J[job, AIR_NS] = count, full_bytes, last_bytes, air_ns
-    J[job, READY_AT], J[job, IS_LIVE], J[job, HEAD_AT] = at, 1, -1
-
-
-@loop
-def submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, N, D, J):
-    """A job comes to its station at a time that is not yet over."""
-    mark(station, 1, D)
-    fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, J)
-    before, following = -1, S[station, COMING]
-    while following >= 0 and J[following, READY_AT] <= at:
-        before, following = following, J[following, FOLLOWING]
-    J[job, FOLLOWING] = following
-    if before < 0:
-        S[station, COMING], S[station, ARRIVE_AT] = job, at
-        renew(station, S, N)
-    else:
-        J[before, FOLLOWING] = job
+def enter(entered, S, N, D, J):
+    """Jobs come to their stations, at times that are not yet over; the row of the latest one names the one before it."""
+    before = -1
+    while entered >= 0:  # from here on each row names the one after it
+        earlier = J[entered, FOLLOWING]
+        J[entered, FOLLOWING] = before
+        before, entered = entered, earlier
+    while before >= 0:
+        job, station = before, J[before, STATION]
+        before = J[job, FOLLOWING]
+        mark(station, 1, D)
+        ahead_of, following = -1, S[station, COMING]
+        while following >= 0 and J[following, READY_AT] <= J[job, READY_AT]:
+            ahead_of, following = following, J[following, FOLLOWING]
+        J[job, FOLLOWING] = following
+        if ahead_of < 0:
+            S[station, COMING], S[station, ARRIVE_AT] = job, J[job, READY_AT]
+            renew(station, S, N)
+        else:
+            J[ahead_of, FOLLOWING] = job
 
 
 @loop
@@ -1082,11 +1080,12 @@ def cancel(job, t, S, N, D, J, requests):
 
 
 @loop
-def substitute(old, job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, D, J):
+def substitute(old, job, S, D, J):
     """A job takes the place of one that waits in its station's queue; false if that one does not wait there."""
+    station = J[old, STATION]
     mark(station, 1, D)
     is_first = S[station, COMING] == old
-    before = S[station, HEAD + access_class]
+    before = S[station, HEAD + J[old, JOB_ACCESS]]
     while before >= 0 and J[before, FOLLOWING] != old:
         before = J[before, FOLLOWING]
     if before < 0 and not is_first:  # it has come at this very instant
@@ -1095,15 +1094,14 @@ def substitute(old, job, kind, station, flow, access_class, count, full_bytes, l
             before = J[before, FOLLOWING]
         if before < 0:
             return False
-    fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, J[old, READY_AT], J)
-    J[job, FOLLOWING] = J[old, FOLLOWING]
+    J[job, FOLLOWING], J[job, READY_AT] = J[old, FOLLOWING], J[old, READY_AT]
     if is_first:
         S[station, COMING] = job
     else:
         J[before, FOLLOWING] = job
     J[old, IS_LIVE] = 0
-    if S[station, TAIL + access_class] == old:
-        S[station, TAIL + access_class] = job
+    if S[station, TAIL + J[old, JOB_ACCESS]] == old:
+        S[station, TAIL + J[old, JOB_ACCESS]] = job
     return True
 
 
@@ -1213,8 +1211,10 @@ SIZES = 8
 
 
 @compiled
-def ahead(at, since, until):
+def ahead(at, entered, since, until):
     """Bring the first state up to `since`, and run a copy of it ahead; no copy where its drops must be read first.
+
+    First, jobs come that have not yet done so: `entered` is the latest of them (see `enter`), −1 is none.
 
     Arrays come by address, for numba looks at each array that it is handed, which costs more than most runs:
     `SIZES` sizes, the 13 arrays of the first state, those of its copy, and what they share. An `until` before `since` is no copy.
@@ -1252,6 +1252,7 @@ def ahead(at, since, until):
     C = carray(pointer(at[48]), (17,), np.int64)
     F = carray(pointer(at[49]), (5,), np.float64)
     curves = carray(pointer(at[50]), (14, 5), np.float64)
+    enter(entered, S, N, D, J)
     reached, told = run(
         since,
         S,
