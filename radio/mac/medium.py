@@ -101,7 +101,7 @@ class _State:
 
 
 _S, _N, _P, _W, _WHY, _G, _J, _M, _T, _SEG_AT, _SEG, _LS, _DROPS = range(13)
-_JOBS, _FLOWS = 16, 32
+_JOBS, _FLOWS = 64, 32
 _DROPS_KEPT = 512
 """Given up fragments that a run keeps before they must be read, at the least."""
 
@@ -199,7 +199,7 @@ class Medium(Generic[J, F]):
         self._receiver: IntArray = np.zeros(0, np.int64)
         self._gain: FloatArray = np.zeros(0)
         self._extra = np.zeros(1)
-        self._shared: tuple[NDArray[Any], ...] = ()
+        self._shared_addresses: list[int] = []
         self._share()
 
     @staticmethod
@@ -256,11 +256,10 @@ class Medium(Generic[J, F]):
         self.replan()
 
     def _share(self) -> None:
-        self._shared = (
+        self._shared_addresses = _addresses((
             self._differing, self._flow_ints, self._flow_floats, self._out, self._touch, self._begin, self._receiver, self._gain, self._extra, self._fade, self._keys,
             self._rates, self._limits, self._orders, self._ints, self._floats, self._curves,
-        )  # fmt: skip
-        self._shared_addresses = _addresses(self._shared)
+        ))  # fmt: skip
         self._settled.table = self._planned.table = None
 
     def _make_table(self) -> IntArray:
@@ -331,6 +330,7 @@ class Medium(Generic[J, F]):
         now_s, queue = self._env.now, self._queues[old.sender]
         if queue[0] is not old:
             self.read(old)
+            self._take_in()
             self._open(new, now_s)
             a = self._settled.arrays
             if self._e.substitute(old.row, new.row, a[_S], self._differing, a[_J]):
@@ -380,6 +380,7 @@ class Medium(Generic[J, F]):
 
     def _take(self, job: J, *, requests: bool) -> None:
         self.read(job)
+        self._take_in()
         a, now_s = self._settled.arrays, self._env.now
         self._e.cancel(job.row, round(now_s * 1e9), a[_S], a[_N], self._differing, a[_J], requests)
         self._leave(job, now_s)
@@ -472,6 +473,7 @@ class Medium(Generic[J, F]):
     def drop_context(self, sender: int) -> None:
         """Forget a drone's group frames and its block-ack requests, waiting or to come; a frame on the air ends."""
         self.sync()
+        self._take_in()
         a, e = self._settled.arrays, self._e
         rows = a[_J]
         is_request = (rows[:, e.IS_LIVE] == 1) & (rows[:, e.STATION] == sender) & (rows[:, e.KIND] == e.BLOCK_REQUEST)
@@ -489,13 +491,20 @@ class Medium(Generic[J, F]):
     def sync(self) -> None:
         """Bring the settled state up to now; what happens at this very instant is still to come."""
         until, settled = round(self._env.now * 1e9) - 1, self._settled
-        while settled.now_ns < until or settled.entered >= 0:
+        while settled.now_ns < until:
             table = self._make_table() if settled.table is None else settled.table
-            until = max(until, settled.now_ns)
             settled.now_ns, told = self._e.ahead(table, settled.entered, until, until - 1)
             settled.entered = -1
             if told < 0:
                 self._drain()
+
+    def _take_in(self) -> None:
+        """Have the stations take in what has entered, before one of their jobs is taken out or replaced."""
+        settled = self._settled
+        if settled.entered >= 0:
+            table = self._make_table() if settled.table is None else settled.table
+            self._e.ahead(table, settled.entered, -1, -2)  # and no more
+            settled.entered = -1
 
     def replan(self) -> None:
         """Something has come from outside: plan anew when all that comes at this instant has come."""

@@ -553,11 +553,10 @@ def test_nobody_begins_to_send_on_a_medium_that_it_senses_busy(traffic: list, po
     """Every event by itself; answers and a station that begins within the 4 µs that sensing takes are exempt."""
     b = Bench(power_dbm, 4)
     _play(b, traffic, [])
-    arrays, shared = b.medium._settled.arrays, b.medium._shared
     for _, who, frames, deadline_s, context in traffic:  # once more, at one instant, and event by event
         b.announce(who) if context else b.submit(who, frames, deadline_s)
-    b.medium.sync()  # the stations take them in
-    arrays = b.medium._settled.arrays
+    b.medium._take_in()
+    arrays, table = b.medium._settled.arrays, b.medium._make_table()
     stations = arrays[0]
     busy_since = np.full(4, 10**18)
     for _ in range(3000):
@@ -565,7 +564,7 @@ def test_nobody_begins_to_send_on_a_medium_that_it_senses_busy(traffic: list, po
         if t == edca.FAR:
             break
         before = stations.copy()
-        edca.run(t, *arrays, *shared)
+        edca.ahead(table, -1, t, t - 1)
         begun = (stations[:, edca.TX_BEGIN] == t) & (stations[:, edca.TX_END] != edca.FAR)
         own = np.isin(stations[:, edca.TX_KIND], (edca.GROUP, edca.BLOCK_REQUEST, edca.RTS, edca.DATA))
         for s in np.flatnonzero(begun & own & (before[:, edca.AWAITS] == edca.NOTHING)):
