@@ -500,9 +500,11 @@ class Air:
         """What the sender has got through so far, bits as goodput counts them."""
         queue = self.medium.queued(sender)
         if queue:
-            self.medium.sync()
             head = queue[0]
+            if self._service.minstrel is not None:  # what it learns is read next
+                self.medium.sync()
             if head.begun_s < now_s:  # else it cannot have got through anything
+                self.medium.sync()
                 self.medium.read(head)
                 self._book(head)
         return self._drained_bits[sender]

@@ -296,6 +296,7 @@ class Medium(Generic[J, F]):
         """From now on a sender uses a link like this."""
         if link == self._tuned[flow]:
             return
+        self.sync()  # what has been sent so far was sent as before
         self._tuned[flow] = link
         self._flow_ints[flow, self._e.FLOW_MCS :] = max(0, link.mcs), link.frames, link.dead
         loss = -1.0 if link.loss != link.loss else link.loss
