@@ -68,7 +68,8 @@ def gauss_markov(innovations: Floats, sigma_db: float, keep: float, before_db: F
     Returns:
         [frames, ...] dB.
     """
-    out: Floats = sqrt(1.0 - keep**2) * sigma_db * innovations
+    out: Floats = np.empty_like(innovations)
+    np.multiply(sqrt(1.0 - keep**2) * sigma_db, innovations, out=out)
     stationary = sigma_db * innovations[0]
     out[0] = stationary if before_db is None else np.where(np.isnan(before_db), stationary, out[0] + keep * before_db)
     for before, now in pairwise(out):
