@@ -32,7 +32,7 @@ from sortie.radio.mac.jobs import End
 from sortie.radio.mac.medium import Medium
 from sortie.radio.overrides import Overrides
 from sortie.radio.relay import Routes
-from sortie.radio.sample import Sample, Service, Use
+from sortie.radio.sample import UNUSED, Sample, Service, UseNow
 from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission
 from sortie.scenarios.link_state import SILENT_MBPS, WAITING_MBPS
@@ -108,6 +108,7 @@ class Air:
             settings.group_rate_mbps, n_drones, self.counters, self._gone,
             seed=seed, replication=replication, frame_s=frame_s, publish_spread=publish_spread, as_lists=n_drones <= SQUARE,
         )  # fmt: skip
+        self._service = Service(settings, self.channel.noise_dbm)
         self.medium = Medium[Sample, Broadcast](
             env,
             settings,
@@ -115,14 +116,14 @@ class Air:
             seed,
             replication,
             self.channel.noise_dbm,
-            self._begin,
+            self._service.begin,
             self._end,
             self._broadcasts.end,
         )
         self._links: LinkList | None = None
         self._link_lists: tuple[NDArray[np.int64], NDArray[np.int64]]
-        self._service = Service(settings, self.channel.noise_dbm)
-        self._uses: dict[tuple[int, int], tuple[int, Use, float]] = {}  # in this frame, of links with unicast traffic
+        self._uses: dict[tuple[int, int], UseNow] = {}  # of links with unicast traffic
+        self._uses_since = 0  # earlier ones are out of date
         self._rows_db: tuple[list[list[float]], list[list[float]]] | None = None  # of this frame, made at first use
         self._goodput = Goodput(n_drones)
         self._drained_bits = [0.0] * n_drones
@@ -170,19 +171,19 @@ class Air:
 
     def _retune(self) -> None:
         """The links, or who is there, have changed: find out anew how those with traffic are used."""
-        self._uses = {}
+        self._uses_since += 1
         for queue in self.medium.queues():
-            for k, s in enumerate(queue):
-                _, use, snr_db = self._use(s.sender, s.receiver)
-                if k == 0:
-                    self._service.begin(s, use, snr_db, self._env.now, fresh=False)
+            for s in queue:
+                s.use = self._use(s.sender, s.receiver)
+            self._service.begin(queue[0], self._env.now, fresh=False)
 
-    def _use(self, sender: int, receiver: int) -> tuple[int, Use, float]:
-        """How a link is used in this frame: the medium's number for it, its use, and its mean SNR as it is."""
-        found = self._uses.get((sender, receiver))
-        if found is None:
+    def _use(self, sender: int, receiver: int) -> UseNow:
+        """How a link is used in this frame."""
+        ends = sender, receiver
+        found = self._uses.get(ends)
+        if found is None or found[3] != self._uses_since:
             now_s, medium = self._env.now, self.medium
-            flow = medium.flow(sender, receiver)
+            flow = medium.flow(sender, receiver) if found is None else found[0]
             minstrel = self._service.minstrel
             if minstrel is not None:
                 minstrel.sent(sender, receiver, now_s, medium.learned(flow).tolist())
@@ -190,7 +191,7 @@ class Air:
             known_db, snr_db = self._snr_of(sender, receiver)
             use = self._service.use(sender, receiver, now_s, known_db, receiver in self._gone, given)
             medium.tune(flow, use.link)
-            found = self._uses[sender, receiver] = flow, use, snr_db
+            found = self._uses[ends] = flow, use, snr_db, self._uses_since
         return found
 
     def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
@@ -294,12 +295,12 @@ class Air:
         self._numbers = number + 1
         hop = receiver if self._routes is None else self._routes.next_hop(sender, receiver, self._routes.max_hops)
         drained_bits, gone = self._drained(sender, now), sender in self._gone
-        flow, _, snr_db = (-1, None, self._snr_of(sender, hop)[1]) if gone else self._use(sender, hop)
+        use = (-1, UNUSED, self._snr_of(sender, hop)[1], -1) if gone else self._use(sender, hop)
         s = self._in_flight[number] = Sample(
             number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
-            fragments(payload_bytes, piece_bytes or self._settings.fragment_bytes), snr_db, drained_bits, piece_bytes or 0,
+            fragments(payload_bytes, piece_bytes or self._settings.fragment_bytes), use, drained_bits, piece_bytes or 0,
         )  # fmt: skip
-        s.receiver, s.flow = hop, flow
+        s.receiver = hop
         self.counters.data_sent_bytes += payload_bytes
         if gone:
             s.live = False
@@ -361,11 +362,6 @@ class Air:
         if s.number in self._in_flight:
             self._close(s, _LOST, "sender_gone", self._env.now)
 
-    def _begin(self, s: Sample, now_s: float) -> None:
-        """A sample comes to the head of its queue."""
-        _, use, snr_db = self._use(s.sender, s.receiver)
-        self._service.begin(s, use, snr_db, now_s, fresh=True)
-
     def _snr_of(self, sender: int, receiver: int) -> tuple[float, float]:
         """Mean SNR of a link as its sender knows it, from the frame before, and as it is."""
         rows = self._rows_db
@@ -410,7 +406,8 @@ class Air:
         here = s.receiver
         hop = self._routes.next_hop(here, s.target, self._routes.max_hops - s.hops)
         s.forward(here, hop, now_s, self._drained(here, now_s))
-        s.flow, _, _ = self._use(here, hop)
+        s.use = self._use(here, hop)
+        s.flow = s.use[0]
         self._queue(s)
 
     def _forget(self, s: Sample) -> None:
@@ -425,7 +422,7 @@ class Air:
             self._close(s, _EXPIRED, "deadline_in_service", self._env.now)
             return
         s.repairs += 1
-        self._use(s.sender, s.receiver)
+        s.use = self._use(s.sender, s.receiver)
         self._service.prepare(s)
         self.medium.submit(s)
 
@@ -503,9 +500,11 @@ class Air:
         """What the sender has got through so far, bits as goodput counts them."""
         queue = self.medium.queued(sender)
         if queue:
-            self.medium.sync()
             head = queue[0]
+            if self._service.minstrel is not None:  # what it learns is read next
+                self.medium.sync()
             if head.begun_s < now_s:  # else it cannot have got through anything
+                self.medium.sync()
                 self.medium.read(head)
                 self._book(head)
         return self._drained_bits[sender]
@@ -516,9 +515,9 @@ class Air:
             self._book(s)
             window = now_s - s.mark_s
             if window >= _WINDOW_S or (window > 0.0 and s.mark_s == s.begun_s):
-                mbps = min(
-                    s.mark_bits / window * 1e-6, s.full_mbps
-                )  # a lone frame is acknowledged later than it arrives
+                mbps = s.mark_bits / window * 1e-6
+                if mbps > s.full_mbps:  # a lone frame is acknowledged later than it arrives
+                    mbps = s.full_mbps
                 self._goodput.measured(s.sender, s.receiver, mbps, now_s)
         else:
             waited = now_s - s.t_queued_s

@@ -26,11 +26,11 @@ from sortie.radio.mac.airtime import (
     tries,
 )
 from sortie.radio.mac.contention import SIFS_S, SLOT_S, contention
-from sortie.radio.mac.jobs import NO_FRAMES, AirJob
+from sortie.radio.mac.jobs import NO_FRAMES, NONE_DROPPED, AirJob
 from sortie.radio.mac.medium import Link
 from sortie.radio.mac.rate_control import Minstrel
 from sortie.radio.overrides import LinkNow
-from sortie.radio.rates import STANDARDS, StandardName, rate_table
+from sortie.radio.rates import STANDARDS, StandardName, rate_table, snr_index
 from sortie.radio.settings import AirSettings
 from sortie.radio.transmission import Status, Transmission
 
@@ -40,23 +40,36 @@ _DELIVERED = Status.DELIVERED  # members of an enumeration are slow to look up
 _MAX_KEPT = 20_000
 
 
+class Use(NamedTuple):
+    """How a link is used in this frame: what the medium must know, why nobody is reached, and the rate of full A-MPDUs."""
+
+    link: Link
+    unreachable: str
+    full_mbps: float
+
+
+UseNow = tuple[int, Use, float, int]
+"""A link in this frame: the medium's number for it, its use, its mean SNR as it is, and which time this was found out."""
+UNUSED = Use(Link(-1, dead=True), "", 0.0)
+
+
 class Sample(AirJob):
     """A sample, its current pass through the medium, and the goodput measurement that it carries."""
 
     __slots__ = (
         "arrived", "begun_s", "drained_bits", "fragments", "full_mbps", "hops", "key", "kind", "left", "lost", "mark_bits", "mark_frames",
         "mark_s", "mcs", "on_done", "origin", "pass_wire", "payload_bytes", "piece_bytes", "pieces", "receiver", "reliable",
-        "repairs", "repairs_before", "sent_before", "snr_db", "t_first_s", "t_queued_s", "t_sent_s", "target", "unreachable", "wire_bytes",
+        "repairs", "repairs_before", "sent_before", "snr_db", "t_first_s", "t_queued_s", "t_sent_s", "target", "unreachable", "use", "wire_bytes",
     )  # fmt: skip
 
     def __init__(
         self, number: int, sender: int, receiver: int, kind: str, payload_bytes: int, reliable: bool, t_sent_s: float,
-        deadline_s: float, on_done: Callable[[Transmission], None], fragments: int, snr_db: float, drained_bits: float,
+        deadline_s: float, on_done: Callable[[Transmission], None], fragments: int, use: UseNow, drained_bits: float,
         piece_bytes: int,
     ) -> None:  # fmt: skip
-        """Args: `fragments` of the whole sample; `drained_bits` what the sender had got through when this was written;
+        """Args: `fragments` of the whole sample; `use` of its first link; `drained_bits` what the sender had got through when this was written;
         the rest as in `Air.send`."""
-        super().__init__(number, sender, deadline_s)
+        AirJob.__init__(self, number, sender, deadline_s)
         self.receiver = receiver  # of this hop, as `sender`
         self.origin, self.target = sender, receiver
         self.hops = 1
@@ -77,7 +90,7 @@ class Sample(AirJob):
         self.pieces: IntArray | None = np.arange(fragments) if piece_bytes else None  # of this pass, in their order
         self.arrived: list[IntArray] = []  # pieces at the end of this hop
         self.mcs = -1
-        self.snr_db = snr_db
+        self.flow, _, self.snr_db, _ = self.use = use
         self.unreachable = ""  # '' or the reason
         self.sent_before = 0  # frames of this pass that were sent before it became so
         self.wire_bytes = 0.0  # of passes that are over
@@ -108,7 +121,7 @@ class Sample(AirJob):
         self.here = NO_FRAMES
         if self.dropped:
             self.lost += len(self.dropped)
-            self.dropped = set()
+            self.dropped = NONE_DROPPED
         return missing
 
     def forward(self, sender: int, receiver: int, now_s: float, drained_bits: float) -> None:
@@ -151,14 +164,6 @@ class Sample(AirJob):
         return tuple.__new__(Transmission, row)  # half the time of the constructor
 
 
-class Use(NamedTuple):
-    """How a link is used in this frame: what the medium must know, why nobody is reached, and the rate of full A-MPDUs."""
-
-    link: Link
-    unreachable: str
-    full_mbps: float
-
-
 @lru_cache(maxsize=64)
 def full_goodputs_mbps(
     bandwidth_mhz: int, standard: StandardName, fragment_bytes: int, max_ampdu_frames: int
@@ -170,6 +175,13 @@ def full_goodputs_mbps(
         exchanges = frames_exchanges(m, each, each, rate_mbps, max_ampdu_frames, standard=STANDARDS[standard])
         found.append(m * fragment_bytes * 8e-6 / exchanges.channel_s(contention(1)))
     return tuple(found)
+
+
+@lru_cache(maxsize=64)
+def _plain_uses(full_mbps: tuple[float, ...]) -> tuple[Use, ...]:
+    """How a link is used that has nothing but its MCS; MCS −1, no link, is the last one."""
+    by_mcs = [Use(Link(mcs), "", mbps) for mcs, mbps in enumerate(full_mbps)]
+    return (*by_mcs, Use(Link(-1, dead=True), "no_link", 0.0))
 
 
 class Service:
@@ -186,9 +198,7 @@ class Service:
         )
         self.least_snr_db = settings.preamble_detection_dbm - noise_dbm
         self.minstrel = Minstrel(self._rates) if settings.rate_control == "minstrel" else None
-        no_link = Use(Link(-1, dead=True), "no_link", 0.0)
-        by_mcs = [Use(Link(mcs), "", mbps) for mcs, mbps in enumerate(self._full_mbps)]
-        self._plain = (*by_mcs, no_link)  # MCS −1 is the last one
+        self._plain = _plain_uses(self._full_mbps)
         self._mbps_at: FloatArray | None = None
         # payloads come in few sizes
         self._equivalents: dict[tuple[int, int, int], float] = {}
@@ -223,7 +233,7 @@ class Service:
         return Use(link, reason, full_mbps)
 
     def _ideal_mcs(self, snr_db: float) -> int:
-        return self._table.mcs[self._table.index(snr_db)] if snr_db >= self.least_snr_db else -1
+        return self._table.mcs[snr_index(snr_db)] if snr_db >= self.least_snr_db else -1
 
     def _given_mcs(self, mcs: int, given: LinkNow) -> int:
         """The slowest MCS that carries a traced goodput (or the fastest); some MCS where a loss alone is traced."""
@@ -248,8 +258,9 @@ class Service:
         body_s = max(frames * frame_s - around_s - self._standard.preamble_s, frames * 1e-6)
         return frames * 8e-6 * (self._frame_bytes + MPDU_DELIMITER) / body_s, frames
 
-    def begin(self, s: Sample, use: Use, snr_db: float, now_s: float, *, fresh: bool) -> None:
+    def begin(self, s: Sample, now_s: float, *, fresh: bool = True) -> None:
         """A sample comes to the head of its queue (`fresh`), or its link has changed while it is there."""
+        _, use, snr_db, _ = s.use
         if fresh and isnan(s.t_first_s):
             s.t_first_s = now_s
         if fresh:

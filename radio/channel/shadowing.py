@@ -8,6 +8,7 @@ the surroundings change. It is a sum of plane waves whose wave vectors are drawn
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import exp, sqrt
 from typing import Any, TypeVar
 
@@ -67,15 +68,12 @@ def gauss_markov(innovations: Floats, sigma_db: float, keep: float, before_db: F
     Returns:
         [frames, ...] dB.
     """
-    renew = sqrt(1.0 - keep**2)
     out: Floats = np.empty_like(innovations)
-    for t, normals in enumerate(innovations):
-        if before_db is None:
-            before_db = sigma_db * normals
-        else:
-            new = keep * before_db + renew * sigma_db * normals
-            before_db = np.where(np.isnan(before_db), sigma_db * normals, new) if t == 0 else new
-        out[t] = before_db
+    np.multiply(sqrt(1.0 - keep**2) * sigma_db, innovations, out=out)
+    stationary = sigma_db * innovations[0]
+    out[0] = stationary if before_db is None else np.where(np.isnan(before_db), stationary, out[0] + keep * before_db)
+    for before, now in pairwise(out):
+        now += keep * before
     return out
 
 

@@ -163,8 +163,9 @@ class Channel:
                 settings.shadowing_sigma_db, settings.shadowing_distance_m, settings.shadowing_time_s, seed, replication
             )
         early = min(n_drones, SQUARE)
-        rng = stream(seed, replication, (), "link model")
-        self._own = None if settings.link is None else own_link(settings.link, n_drones, frame_s, rng)
+        self._own = None
+        if settings.link is not None:
+            self._own = own_link(settings.link, n_drones, frame_s, stream(seed, replication, (), "link model"))
         self._drawn = StreamShadowing(settings, seed, replication, early, frame_s)
         self._crowd: Crowd | None = None
         if n_drones > SQUARE:

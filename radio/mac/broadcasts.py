@@ -29,7 +29,7 @@ class Broadcast(GroupFrame):
     __slots__ = ("on_heard",)
 
     def __init__(self, sender: int, airtime_s: float, wire_bytes: int, on_heard: OnHeard) -> None:
-        super().__init__(sender, airtime_s, wire_bytes)
+        GroupFrame.__init__(self, sender, airtime_s, wire_bytes)
         self.on_heard = on_heard
 
 

@@ -877,40 +877,11 @@ def conclude(s, t, S, N, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin,
     return told
 
 
-@loop
+@part
 def run(
-    until,
-    S,
-    N,
-    P,
-    W,
-    WHY,
-    G,
-    J,
-    M,
-    T,
-    SEG_AT,
-    SEG,
-    LS,
-    DROPS,
-    D,
-    LI,
-    LF,
-    OUT,
-    TOUCH,
-    begin,
-    receiver,
-    gain,
-    extra,
-    fade,
-    keys,
-    RATES,
-    LIMITS,
-    ORDER,
-    C,
-    F,
-    curves,
-):
+    until, S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, LI, LF, OUT, TOUCH, begin, receiver, gain, extra, fade,
+    keys, RATES, LIMITS, ORDER, C, F, curves,
+):  # fmt: skip
     """Run the stations until something has to be told, until a time, or until the table of drops must be read first.
 
     Returns: the time reached, and how many rows of OUT are to be told; −1 where the drops must be read.
@@ -1026,28 +997,26 @@ def run(
 
 
 @part
-def fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, J):
-    for k in range(JOB_COLUMNS):
-        J[job, k] = 0
-    J[job, KIND], J[job, STATION], J[job, FLOW], J[job, JOB_ACCESS] = kind, station, flow, access_class
-    J[job, COUNT], J[job, FULL_BYTES], J[job, LAST_BYTES], J[job, AIR_NS] = count, full_bytes, last_bytes, air_ns
-    J[job, READY_AT], J[job, IS_LIVE], J[job, HEAD_AT] = at, 1, -1
-
-
-@loop
-def submit(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, N, D, J):
-    """A job comes to its station at a time that is not yet over."""
-    mark(station, 1, D)
-    fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, J)
-    before, following = -1, S[station, COMING]
-    while following >= 0 and J[following, READY_AT] <= at:
-        before, following = following, J[following, FOLLOWING]
-    J[job, FOLLOWING] = following
-    if before < 0:
-        S[station, COMING], S[station, ARRIVE_AT] = job, at
-        renew(station, S, N)
-    else:
-        J[before, FOLLOWING] = job
+def enter(entered, S, N, D, J):
+    """Jobs come to their stations, at times that are not yet over; the row of the latest one names the one before it."""
+    before = -1
+    while entered >= 0:  # from here on each row names the one after it
+        earlier = J[entered, FOLLOWING]
+        J[entered, FOLLOWING] = before
+        before, entered = entered, earlier
+    while before >= 0:
+        job, station = before, J[before, STATION]
+        before = J[job, FOLLOWING]
+        mark(station, 1, D)
+        ahead_of, following = -1, S[station, COMING]
+        while following >= 0 and J[following, READY_AT] <= J[job, READY_AT]:
+            ahead_of, following = following, J[following, FOLLOWING]
+        J[job, FOLLOWING] = following
+        if ahead_of < 0:
+            S[station, COMING], S[station, ARRIVE_AT] = job, J[job, READY_AT]
+            renew(station, S, N)
+        else:
+            J[ahead_of, FOLLOWING] = job
 
 
 @loop
@@ -1082,11 +1051,12 @@ def cancel(job, t, S, N, D, J, requests):
 
 
 @loop
-def substitute(old, job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, at, S, D, J):
+def substitute(old, job, S, D, J):
     """A job takes the place of one that waits in its station's queue; false if that one does not wait there."""
+    station = J[old, STATION]
     mark(station, 1, D)
     is_first = S[station, COMING] == old
-    before = S[station, HEAD + access_class]
+    before = S[station, HEAD + J[old, JOB_ACCESS]]
     while before >= 0 and J[before, FOLLOWING] != old:
         before = J[before, FOLLOWING]
     if before < 0 and not is_first:  # it has come at this very instant
@@ -1095,15 +1065,14 @@ def substitute(old, job, kind, station, flow, access_class, count, full_bytes, l
             before = J[before, FOLLOWING]
         if before < 0:
             return False
-    fill(job, kind, station, flow, access_class, count, full_bytes, last_bytes, air_ns, J[old, READY_AT], J)
-    J[job, FOLLOWING] = J[old, FOLLOWING]
+    J[job, FOLLOWING], J[job, READY_AT] = J[old, FOLLOWING], J[old, READY_AT]
     if is_first:
         S[station, COMING] = job
     else:
         J[before, FOLLOWING] = job
     J[old, IS_LIVE] = 0
-    if S[station, TAIL + access_class] == old:
-        S[station, TAIL + access_class] = job
+    if S[station, TAIL + J[old, JOB_ACCESS]] == old:
+        S[station, TAIL + J[old, JOB_ACCESS]] = job
     return True
 
 
@@ -1213,8 +1182,10 @@ SIZES = 8
 
 
 @compiled
-def ahead(at, since, until):
+def ahead(at, entered, since, until):
     """Bring the first state up to `since`, and run a copy of it ahead; no copy where its drops must be read first.
+
+    First, jobs come that have not yet done so: `entered` is the latest of them (see `enter`), −1 is none.
 
     Arrays come by address, for numba looks at each array that it is handed, which costs more than most runs:
     `SIZES` sizes, the 13 arrays of the first state, those of its copy, and what they share. An `until` before `since` is no copy.
@@ -1222,19 +1193,6 @@ def ahead(at, since, until):
     Returns: the time that the copy has reached, or the first state where there is none, and as `run`.
     """
     n, links, jobs, window, flows, mcs, drops, extras = at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7]
-    S = carray(pointer(at[8]), (n, STATION_COLUMNS), np.int64)
-    N = carray(pointer(at[9]), (2, n), np.int64)
-    P = carray(pointer(at[10]), (n,), np.float64)
-    W = carray(pointer(at[11]), (links,), np.float64)
-    WHY = carray(pointer(at[12]), (links,), np.uint8)
-    G = carray(pointer(at[13]), (5,), np.int64)
-    J = carray(pointer(at[14]), (jobs, JOB_COLUMNS), np.int64)
-    M = carray(pointer(at[15]), (n, window), np.uint8)
-    T = carray(pointer(at[16]), (n, window), np.int32)
-    SEG_AT = carray(pointer(at[17]), (n, OVERLAPS), np.int64)
-    SEG = carray(pointer(at[18]), (n, OVERLAPS), np.float64)
-    LS = carray(pointer(at[19]), (flows, mcs + 1, 2), np.int64)
-    DROPS = carray(pointer(at[20]), (drops, 2), np.int64)
     D = carray(pointer(at[34]), (2 * n + 1,), np.int64)
     LI = carray(pointer(at[35]), (flows, FLOW_COLUMNS), np.int64)
     LF = carray(pointer(at[36]), (flows, 3), np.float64)
@@ -1252,88 +1210,44 @@ def ahead(at, since, until):
     C = carray(pointer(at[48]), (17,), np.int64)
     F = carray(pointer(at[49]), (5,), np.float64)
     curves = carray(pointer(at[50]), (14, 5), np.float64)
-    reached, told = run(
-        since,
-        S,
-        N,
-        P,
-        W,
-        WHY,
-        G,
-        J,
-        M,
-        T,
-        SEG_AT,
-        SEG,
-        LS,
-        DROPS,
-        D,
-        LI,
-        LF,
-        OUT,
-        TOUCH,
-        begin,
-        receiver,
-        gain,
-        extra,
-        fade,
-        keys,
-        RATES,
-        LIMITS,
-        ORDER,
-        C,
-        F,
-        curves,
-    )
-    if until < since or told < 0:
-        return reached, told
-    S2 = carray(pointer(at[21]), (n, STATION_COLUMNS), np.int64)
-    N2 = carray(pointer(at[22]), (2, n), np.int64)
-    P2 = carray(pointer(at[23]), (n,), np.float64)
-    W2 = carray(pointer(at[24]), (links,), np.float64)
-    WHY2 = carray(pointer(at[25]), (links,), np.uint8)
-    G2 = carray(pointer(at[26]), (5,), np.int64)
-    J2 = carray(pointer(at[27]), (jobs, JOB_COLUMNS), np.int64)
-    M2 = carray(pointer(at[28]), (n, window), np.uint8)
-    T2 = carray(pointer(at[29]), (n, window), np.int32)
-    SEG_AT2 = carray(pointer(at[30]), (n, OVERLAPS), np.int64)
-    SEG2 = carray(pointer(at[31]), (n, OVERLAPS), np.float64)
-    LS2 = carray(pointer(at[32]), (flows, mcs + 1, 2), np.int64)
-    DROPS2 = carray(pointer(at[33]), (drops, 2), np.int64)
-    copy(
-        S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, S2, N2, P2, W2, WHY2, G2, J2, M2, T2, SEG_AT2, SEG2, LS2,
-        DROPS2, begin, C,
-    )  # fmt: skip
-    return run(
-        until,
-        S2,
-        N2,
-        P2,
-        W2,
-        WHY2,
-        G2,
-        J2,
-        M2,
-        T2,
-        SEG_AT2,
-        SEG2,
-        LS2,
-        DROPS2,
-        D,
-        LI,
-        LF,
-        OUT,
-        TOUCH,
-        begin,
-        receiver,
-        gain,
-        extra,
-        fade,
-        keys,
-        RATES,
-        LIMITS,
-        ORDER,
-        C,
-        F,
-        curves,
-    )
+    first, goal = SIZES, since
+    while True:  # first the first state, then its copy: what is called in one place is compiled into it
+        S = carray(pointer(at[first]), (n, STATION_COLUMNS), np.int64)
+        N = carray(pointer(at[first + 1]), (2, n), np.int64)
+        P = carray(pointer(at[first + 2]), (n,), np.float64)
+        W = carray(pointer(at[first + 3]), (links,), np.float64)
+        WHY = carray(pointer(at[first + 4]), (links,), np.uint8)
+        G = carray(pointer(at[first + 5]), (5,), np.int64)
+        J = carray(pointer(at[first + 6]), (jobs, JOB_COLUMNS), np.int64)
+        M = carray(pointer(at[first + 7]), (n, window), np.uint8)
+        T = carray(pointer(at[first + 8]), (n, window), np.int32)
+        SEG_AT = carray(pointer(at[first + 9]), (n, OVERLAPS), np.int64)
+        SEG = carray(pointer(at[first + 10]), (n, OVERLAPS), np.float64)
+        LS = carray(pointer(at[first + 11]), (flows, mcs + 1, 2), np.int64)
+        DROPS = carray(pointer(at[first + 12]), (drops, 2), np.int64)
+        if first == SIZES:
+            enter(entered, S, N, D, J)
+        reached, told = run(
+            goal, S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, LI, LF, OUT, TOUCH, begin, receiver, gain, extra,
+            fade, keys, RATES, LIMITS, ORDER, C, F, curves,
+        )  # fmt: skip
+        if first > SIZES or until < since or told < 0:
+            return reached, told
+        S2 = carray(pointer(at[21]), (n, STATION_COLUMNS), np.int64)
+        N2 = carray(pointer(at[22]), (2, n), np.int64)
+        P2 = carray(pointer(at[23]), (n,), np.float64)
+        W2 = carray(pointer(at[24]), (links,), np.float64)
+        WHY2 = carray(pointer(at[25]), (links,), np.uint8)
+        G2 = carray(pointer(at[26]), (5,), np.int64)
+        J2 = carray(pointer(at[27]), (jobs, JOB_COLUMNS), np.int64)
+        M2 = carray(pointer(at[28]), (n, window), np.uint8)
+        T2 = carray(pointer(at[29]), (n, window), np.int32)
+        SEG_AT2 = carray(pointer(at[30]), (n, OVERLAPS), np.int64)
+        SEG2 = carray(pointer(at[31]), (n, OVERLAPS), np.float64)
+        LS2 = carray(pointer(at[32]), (flows, mcs + 1, 2), np.int64)
+        DROPS2 = carray(pointer(at[33]), (drops, 2), np.int64)
+        copy(
+            S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, S2, N2, P2, W2, WHY2, G2, J2, M2, T2, SEG_AT2, SEG2, LS2,
+            DROPS2, begin, C,
+        )  # fmt: skip
+        first, goal = SIZES + 13, until

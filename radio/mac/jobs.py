@@ -22,6 +22,7 @@ class End(Enum):
 
 
 NO_FRAMES = np.arange(0)
+NONE_DROPPED: frozenset[int] = frozenset()
 
 
 class AirJob:
@@ -45,7 +46,7 @@ class AirJob:
         self.row = self.flow = -1
         self.frames = self.full_bytes = self.last_bytes = 0
         self.arrived_frames = self.sent_frames = 0  # of this pass, as the medium told last
-        self.dropped: set[int] = set()  # frames of this pass that used up their tries, by index
+        self.dropped: set[int] | frozenset[int] = NONE_DROPPED  # frames of this pass that used up their tries, by index
         self.keeps_frames = False  # whether `here` is kept: which frames of this pass are at the receiver
         self.here = NO_FRAMES
         self.granted_s = self.pass_granted_s = 0.0

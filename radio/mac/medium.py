@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from heapq import heappop, heappush
 from math import inf, nan
+from struct import Struct
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -24,7 +25,7 @@ from simpy.events import NORMAL, EventPriority
 
 from sortie.radio.channel.draws import fade_table
 from sortie.radio.mac.airtime import CONTROL_MBPS, ampdu_frames, frame_bytes
-from sortie.radio.mac.jobs import AirJob, End, GroupFrame
+from sortie.radio.mac.jobs import NONE_DROPPED, AirJob, End, GroupFrame
 from sortie.radio.rates import CURVES, LEGACY_CURVES, STANDARDS, group_curve
 from sortie.radio.settings import AirSettings, EdcaSettings
 from sortie.scenarios.plain_sum import plain_sum
@@ -71,17 +72,26 @@ class Link(NamedTuple):
     """Probability that a try is lost besides the packet error rate."""
 
 
+def _addresses(arrays: tuple[NDArray[Any], ...]) -> list[int]:
+    """Where arrays begin; addresses know no strides."""
+    assert all(each.flags.c_contiguous for each in arrays)  # noqa: S101
+    return [each.ctypes.data for each in arrays]
+
+
 class _State:
     """Everything about the stations that a run changes, in arrays; `now_ns` is how far they have been run.
 
-    `rows` and `drops` are the numbers of two of the arrays, one after another: a lone number is read faster this way.
+    `rows`, `drops` and `fates` are the numbers of three of the arrays, one after another: few numbers are read faster this way.
     """
 
-    __slots__ = ("arrays", "drops", "jobs", "now_ns", "rows", "table")
+    __slots__ = ("addresses", "arrays", "drops", "entered", "fates", "jobs", "now_ns", "rows", "table")
 
-    def __init__(self, arrays: tuple[NDArray[Any], ...], jobs: int, now_ns: int) -> None:
+    def __init__(self, arrays: tuple[NDArray[Any], ...], jobs: int, now_ns: int, entered: int = -1) -> None:
         self.arrays, self.jobs, self.now_ns = arrays, jobs, now_ns
-        self.rows, self.drops = (memoryview(arrays[k].reshape(-1).data) for k in (_J, _DROPS))
+        self.addresses = _addresses(arrays)
+        self.entered = entered
+        """Row of the latest job that the stations have yet to take in (see `edca.enter`); −1 is none."""
+        self.rows, self.drops, self.fates = (memoryview(arrays[k].reshape(-1).data) for k in (_J, _DROPS, _WHY))
         self.table: IntArray | None = None
         """Sizes and addresses for `edca.ahead`; None when one of the arrays has become another."""
 
@@ -91,8 +101,8 @@ class _State:
 
 
 _S, _N, _P, _W, _WHY, _G, _J, _M, _T, _SEG_AT, _SEG, _LS, _DROPS = range(13)
-_JOBS, _FLOWS = 16, 32
-_DROPS_KEPT = 8192
+_JOBS, _FLOWS = 64, 32
+_DROPS_KEPT = 512
 """Given up fragments that a run keeps before they must be read, at the least."""
 
 
@@ -138,7 +148,7 @@ class Medium(Generic[J, F]):
         self._last = self._event()
         self._on_last: list[Callable[[simpy.Event], None]] = [self._replan]
         self._on_time: list[Callable[[simpy.Event], None]] = [self._on_timer]
-        self._told: list[list[int]] = []
+        self._told: list[int] = []  # kinds and rows by turns
         self._is_telling = False
         self._free = list(range(_JOBS))[::-1]
         self._finished: list[int] = []
@@ -153,11 +163,7 @@ class Medium(Generic[J, F]):
         keys = [stream(seed, replication, i, "channel access").bit_generator.random_raw() for i in range(n)]
         self._keys = np.array(keys, np.uint64)
         self._fade = fade_table(settings.rician_k_db)
-        curves = [*CURVES, group_curve(settings.group_rate_mbps), LEGACY_CURVES[CONTROL_MBPS]]
-        centre_db, slope, weight = np.array(curves).T
-        sure = 10.0 ** ((centre_db + 36.001 / slope) / 10.0)  # the stations' form of the curve is 0 from 36 on
-        even = 10.0 ** ((centre_db - np.log(np.expm1(0.7 / weight)) / slope) / 10.0)
-        self._curves = np.column_stack((centre_db, slope, weight, sure, even))
+        self._curves = _curves(settings.group_rate_mbps)
         self._window = window = int(self._ints[e.C_BLOCK])
         stations = np.zeros((n, e.STATION_COLUMNS), np.int64)
         for column in (e.TX_END, e.RESPONSE_AT, e.TIMEOUT_AT, e.GRANT, e.GRANT_LOW, e.ARRIVE_AT):
@@ -186,13 +192,14 @@ class Medium(Generic[J, F]):
         self._flow_floats = np.zeros((_FLOWS, 3))
         self._orders = np.zeros((_FLOWS, mcs), np.int64)
         self._out = np.zeros((2 * n + 8, 2), np.int64)
+        self._out_rows = memoryview(self._out.reshape(-1).data)
         self._first: list[int] = []  # as `_begin`, in a list
         self._touch = np.zeros(2 * n + 2, np.int64)
         self._begin: IntArray = np.zeros(n + 1, np.int64)
         self._receiver: IntArray = np.zeros(0, np.int64)
         self._gain: FloatArray = np.zeros(0)
         self._extra = np.zeros(1)
-        self._shared: tuple[Any, ...] = ()
+        self._shared_addresses: list[int] = []
         self._share()
 
     @staticmethod
@@ -249,10 +256,10 @@ class Medium(Generic[J, F]):
         self.replan()
 
     def _share(self) -> None:
-        self._shared = (
+        self._shared_addresses = _addresses((
             self._differing, self._flow_ints, self._flow_floats, self._out, self._touch, self._begin, self._receiver, self._gain, self._extra, self._fade, self._keys,
             self._rates, self._limits, self._orders, self._ints, self._floats, self._curves,
-        )  # fmt: skip
+        ))  # fmt: skip
         self._settled.table = self._planned.table = None
 
     def _make_table(self) -> IntArray:
@@ -262,9 +269,8 @@ class Medium(Generic[J, F]):
             self._n, len(self._receiver), len(a[_J]), self._window, len(a[_LS]), len(self._rates), len(a[_DROPS]),
             len(self._extra),
         )  # fmt: skip
-        arrays = (*a, *self._planned.arrays, *self._shared)
-        assert all(each.flags.c_contiguous for each in arrays)  # noqa: S101 (addresses know no strides)
-        self._settled.table = table = np.array([*sizes, *(each.ctypes.data for each in arrays)], np.int64)
+        addresses = (*self._settled.addresses, *self._planned.addresses, *self._shared_addresses)
+        self._settled.table = table = np.array([*sizes, *addresses], np.int64)
         return table
 
     def flow(self, sender: int, receiver: int) -> int:
@@ -290,6 +296,7 @@ class Medium(Generic[J, F]):
         """From now on a sender uses a link like this."""
         if link == self._tuned[flow]:
             return
+        self.sync()  # what has been sent so far was sent as before
         self._tuned[flow] = link
         self._flow_ints[flow, self._e.FLOW_MCS :] = max(0, link.mcs), link.frames, link.dead
         loss = -1.0 if link.loss != link.loss else link.loss
@@ -307,12 +314,11 @@ class Medium(Generic[J, F]):
     def submit(self, job: J) -> None:
         """Queue a job behind its sender's others; its `flow`, `frames`, `full_bytes` and `last_bytes` are set."""
         now_s, queue = self._env.now, self._queues[job.sender]
-        entry = self._enter(job, now_s)
+        self._open(job, now_s)
+        self._settled.entered = job.row
         queue.append(job)
         if len(queue) == 1:
             self._on_begin(job, now_s)
-        settled = self._settled.arrays
-        self._e.submit(*entry, settled[_S], settled[_N], self._differing, settled[_J])
         self.replan()
 
     def replace(self, old: J, new: J) -> None:
@@ -325,9 +331,10 @@ class Medium(Generic[J, F]):
         now_s, queue = self._env.now, self._queues[old.sender]
         if queue[0] is not old:
             self.read(old)
-            entry = self._enter(new, now_s)
+            self._take_in()
+            self._open(new, now_s)
             a = self._settled.arrays
-            if self._e.substitute(old.row, *entry, a[_S], self._differing, a[_J]):
+            if self._e.substitute(old.row, new.row, a[_S], self._differing, a[_J]):
                 queue[queue.index(old)] = new
                 self._leave(old, now_s)
                 self.replan()
@@ -337,27 +344,27 @@ class Medium(Generic[J, F]):
         self._take(old, requests=True)
         self.submit(new)
 
-    def _enter(self, job: J, now_s: float) -> tuple[int, ...]:
-        """Open a row for a job; returns it as the stations want it."""
+    def _open(self, job: J, now_s: float) -> None:
+        """Open a row for a job."""
         job.row = row = self._free.pop() if self._free else self._new_row()
         self._at_row[row] = job
         job.live = True
         job.arrived_frames = job.sent_frames = 0
-        if job.dropped:
-            job.dropped = set()
+        job.dropped = NONE_DROPPED
         job.pass_granted_s = 0.0
         job.t_start_s = nan
         self._pushes += 1
         if job.deadline_s < inf:
             heappush(self._deadlines, (round(job.deadline_s * 1e9), job.number, self._pushes, job))
-        return (
-            row, self._e.DATA, job.sender, job.flow, self._payload_access, job.frames, job.full_bytes, job.last_bytes, 0,
-            round(now_s * 1e9),
+        settled = self._settled
+        _write_row(
+            settled.rows, row * _ROW_BYTES, _DATA, job.sender, job.flow, settled.entered, job.frames, job.full_bytes, job.last_bytes,
+            0, 1, self._payload_access, round(now_s * 1e9), 0, 0, 0, 0, 0, 0, 0, -1,
         )  # fmt: skip
 
     def _new_row(self) -> int:
         """A row for a job when none is free: one of those that are finished, or a row more."""
-        live, told = self._settled.arrays[_J][:, self._e.IS_LIVE], {row for _, row in self._told}
+        live, told = self._settled.arrays[_J][:, self._e.IS_LIVE].tolist(), set(self._told[1::2])
         self._free = [row for row in self._finished if not live[row] and row not in told]  # it may be its turn yet
         self._finished = [row for row in self._finished if live[row] or row in told]
         if not self._free:
@@ -374,6 +381,7 @@ class Medium(Generic[J, F]):
 
     def _take(self, job: J, *, requests: bool) -> None:
         self.read(job)
+        self._take_in()
         a, now_s = self._settled.arrays, self._env.now
         self._e.cancel(job.row, round(now_s * 1e9), a[_S], a[_N], self._differing, a[_J], requests)
         self._leave(job, now_s)
@@ -394,11 +402,11 @@ class Medium(Generic[J, F]):
 
     def read(self, job: J) -> None:
         """Bring a job's figures up to the settled state (see `sync`)."""
-        settled, e = self._settled, self._e
+        settled = self._settled
         if settled.drops[0]:
             self._drain()
-        first = job.row * e.JOB_COLUMNS
-        low, high, arrived, air_ns, head_at = settled.rows[first + e.LOW : first + e.JOB_COLUMNS].tolist()
+        first = job.row * _ROW_BYTES + _FIGURES_AT
+        low, high, arrived, air_ns, head_at = _read_figures(settled.rows, first)
         job.arrived_frames, job.sent_frames = arrived, high
         granted_s = air_ns * _NS
         job.granted_s += granted_s - job.pass_granted_s
@@ -413,9 +421,11 @@ class Medium(Generic[J, F]):
         """Give the jobs what the settled state has dropped. The plan may tell the same again: a set takes it once."""
         drops = self._settled.arrays[_DROPS]
         for row, index in drops[1 : drops[0, 0] + 1].tolist():
-            job = self._at_row.get(row)
+            job: Any = self._at_row.get(row)
             if job is not None:
-                job.dropped.add(index)  # type: ignore[union-attr]
+                if not job.dropped:
+                    job.dropped = set()
+                job.dropped.add(index)
         drops[0, 0] = 0
 
     def in_service(self, sender: int) -> J | None:
@@ -450,19 +460,21 @@ class Medium(Generic[J, F]):
         """A group frame comes to its station's queue, `in_s` from now."""
         frame.row = row = self._free.pop() if self._free else self._new_row()
         self._at_row[row] = frame
-        length, settled = frame.wire_bytes, self._settled.arrays
-        at_ns, air_ns = round((self._env.now + in_s) * 1e9), round(frame.airtime_s * 1e9)
-        entry = (row, self._e.GROUP, frame.sender, 0, self._group_access, 1, length, length, air_ns, at_ns)
-        self._e.submit(*entry, settled[_S], settled[_N], self._differing, settled[_J])
-        if self._timer is not None and at_ns > self._planned.now_ns and not self._is_telling:
-            planned = self._planned.arrays  # the plan stands: it ends before
-            self._e.submit(*entry, planned[_S], planned[_N], self._differing, planned[_J])
-        else:
+        length, at_ns = frame.wire_bytes, round((self._env.now + in_s) * 1e9)
+        stands = self._timer is not None and at_ns > self._planned.now_ns and not self._is_telling
+        for state in (self._settled, self._planned) if stands else (self._settled,):
+            _write_row(
+                state.rows, row * _ROW_BYTES, _GROUP, frame.sender, 0, state.entered, 1, length, length, 0, 1,
+                self._group_access, at_ns, 0, 0, 0, 0, 0, 0, round(frame.airtime_s * 1e9), -1,
+            )  # fmt: skip
+            state.entered = row
+        if not stands:  # else the plan ends before the frame comes
             self.replan()
 
     def drop_context(self, sender: int) -> None:
         """Forget a drone's group frames and its block-ack requests, waiting or to come; a frame on the air ends."""
         self.sync()
+        self._take_in()
         a, e = self._settled.arrays, self._e
         rows = a[_J]
         is_request = (rows[:, e.IS_LIVE] == 1) & (rows[:, e.STATION] == sender) & (rows[:, e.KIND] == e.BLOCK_REQUEST)
@@ -482,9 +494,18 @@ class Medium(Generic[J, F]):
         until, settled = round(self._env.now * 1e9) - 1, self._settled
         while settled.now_ns < until:
             table = self._make_table() if settled.table is None else settled.table
-            settled.now_ns, told = self._e.ahead(table, until, until - 1)
+            settled.now_ns, told = self._e.ahead(table, settled.entered, until, until - 1)
+            settled.entered = -1
             if told < 0:
                 self._drain()
+
+    def _take_in(self) -> None:
+        """Have the stations take in what has entered, before one of their jobs is taken out or replaced."""
+        settled = self._settled
+        if settled.entered >= 0:
+            table = self._make_table() if settled.table is None else settled.table
+            self._e.ahead(table, settled.entered, -1, -2)  # and no more
+            settled.entered = -1
 
     def replan(self) -> None:
         """Something has come from outside: plan anew when all that comes at this instant has come."""
@@ -502,33 +523,33 @@ class Medium(Generic[J, F]):
 
     def _replan(self, _: simpy.Event) -> None:
         self._is_replanning = False
-        self._plan(self._event())
+        now_s = self._env.now
+        self._plan(self._event(), now_s, max(round(now_s * 1e9) - 1, self._settled.now_ns))
 
-    def _plan(self, timer: simpy.Event) -> None:
-        """Run a copy ahead to whatever must be told next, and set the timer there."""
+    def _plan(self, timer: simpy.Event, now_s: float, since: int) -> None:
+        """Bring the settled state up to `since`, run a copy ahead to whatever must be told next, and set the timer there."""
         self._timer = None
         if not self._at_row:
             return
-        settled, deadlines, now_s = self._settled, self._deadlines, self._env.now
+        settled, deadlines = self._settled, self._deadlines
         while deadlines and not deadlines[0][3].live:
             heappop(deadlines)
-        since = round(now_s * 1e9) - 1
-        if since < settled.now_ns:
-            since = settled.now_ns
         until = since + _AHEAD_NS
         if deadlines and deadlines[0][0] < until:
-            until = max(deadlines[0][0], since)
+            until = deadlines[0][0] if deadlines[0][0] > since else since
         ahead = self._e.ahead
         table = self._make_table() if settled.table is None else settled.table
-        reached, told = ahead(table, since, until)
+        reached, told = ahead(table, settled.entered, since, until)
+        settled.entered = self._planned.entered = -1
         while reached < since:
             self._drain()
-            reached, told = ahead(table, since, until)
+            reached, told = ahead(table, -1, since, until)
         settled.now_ns, self._planned.now_ns = since, reached
-        self._told = self._out[:told].tolist() if told > 0 else []
+        self._told = self._out_rows[: 2 * told].tolist() if told > 0 else []
         timer.callbacks = self._on_time
         self._timer = timer
-        self._env.schedule(timer, NORMAL, max(0.0, reached * _NS - now_s))
+        delay_s = reached * _NS - now_s
+        self._env.schedule(timer, NORMAL, delay_s if delay_s > 0.0 else 0.0)
 
     def _on_timer(self, event: simpy.Event) -> None:
         if event is not self._timer:
@@ -538,7 +559,9 @@ class Medium(Generic[J, F]):
         if settled.drops[0]:
             self._drain()
         self._is_telling = True
-        for kind, row in self._told:
+        told = self._told
+        for k in range(0, len(told), 2):
+            kind, row = told[k], told[k + 1]
             job = self._at_row.get(row)
             if job is None:
                 continue  # it was taken out, and what the stations owed it is done
@@ -557,11 +580,11 @@ class Medium(Generic[J, F]):
                 is_served = is_head and job.t_start_s < now - _NS
                 self._on_end(job, End.DEADLINE_IN_SERVICE if is_served else End.DEADLINE_QUEUED, now)
         self._is_telling = False
-        self._plan(event)
+        self._plan(event, now, self._settled.now_ns)
 
     def _end_group(self, frame: F, row: int) -> None:
         first, last = self._first[frame.sender : frame.sender + 2]
-        receivers, fates = self._receiver[first:last], self._settled.arrays[_WHY][first:last].tobytes()
+        receivers, fates = self._receiver[first:last], bytes(self._settled.fates[first:last])
         self._finished.append(row)
         del self._at_row[row]
         frame.row = -1
@@ -601,7 +624,22 @@ class Medium(Generic[J, F]):
 
 _T_GROUP = 0
 """As `edca.T_GROUP`."""
-_ENDS = {1: End.ARRIVED, 2: End.OVER, 3: End.UNREACHABLE}
+_GROUP, _DATA = 1, 2
+"""As in `edca`."""
+_write_row, _read_figures = Struct("19q").pack_into, Struct("5q").unpack_from
+_ROW_BYTES, _FIGURES_AT = 8 * 19, 8 * 14
+"""A row of `edca.JOB_COLUMNS`, and the columns from `edca.LOW` on."""
+_ENDS = (None, End.ARRIVED, End.OVER, End.UNREACHABLE)
+
+
+@cache
+def _curves(group_rate_mbps: float) -> FloatArray:
+    """The packet error rates as the stations read them."""
+    curves = [*CURVES, group_curve(group_rate_mbps), LEGACY_CURVES[CONTROL_MBPS]]
+    centre_db, slope, weight = np.array(curves).T
+    sure = 10.0 ** ((centre_db + 36.001 / slope) / 10.0)  # the stations' form of the curve is 0 from 36 on
+    even = 10.0 ** ((centre_db - np.log(np.expm1(0.7 / weight)) / slope) / 10.0)
+    return np.column_stack((centre_db, slope, weight, sure, even))
 
 
 def _tables(
@@ -646,4 +684,4 @@ def _longer(values: NDArray[Any], length: int) -> NDArray[Any]:
 def _sized(state: _State, lengths: dict[int, int]) -> _State:
     """A state with some arrays longer or shorter."""
     arrays = [_longer(a, lengths[k]) if k in lengths else a for k, a in enumerate(state.arrays)]
-    return _State(tuple(arrays), lengths.get(_J, state.jobs), state.now_ns)
+    return _State(tuple(arrays), lengths.get(_J, state.jobs), state.now_ns, state.entered)

@@ -33,7 +33,7 @@ from sortie.radio.mac.rate_control import INTERVAL_S, Minstrel
 from sortie.radio.overrides import LinkNow, Overrides
 from sortie.radio.rates import LEGACY_CURVES, STANDARDS, group_curve
 from sortie.radio.relay import Routes, cheapest
-from sortie.radio.sample import Sample, Service
+from sortie.radio.sample import UNUSED, Sample, Service
 from sortie.radio.settings import AccessSettings, AirSettings, BurstSettings, EdcaSettings
 from sortie.radio.topology import connectivity, linked_drones
 from sortie.radio.transmission import Status
@@ -317,7 +317,9 @@ def test_power_and_antennas_act_on_fleets_of_any_size(n: int) -> None:
 
 
 def sample(payload: int, fragments: int, piece_bytes: int = 0, *, reliable: bool = False) -> Sample:
-    return Sample(0, 0, 1, "k", payload, reliable, 0.0, 1.0, lambda row: None, fragments, 20.0, 0.0, piece_bytes)
+    return Sample(
+        0, 0, 1, "k", payload, reliable, 0.0, 1.0, lambda row: None, fragments, (0, UNUSED, 20.0, 0), 0.0, piece_bytes
+    )
 
 
 def test_frames_are_as_long_as_what_they_carry() -> None:
@@ -409,11 +411,14 @@ def test_a_measurement_begins_anew_with_another_rate_alone() -> None:
     service = Service(CALM, -88.0)
     s = sample(3000, 3)
     good, weak = (service.use(0, 1, 0.0, db, False) for db in (40.0, 12.0))
-    service.begin(s, good, 40.0, 1.0, fresh=True)
+    s.use = 0, good, 40.0, 0
+    service.begin(s, 1.0)
     s.mark_bits = 500.0
-    service.begin(s, good, 39.0, 2.0, fresh=False)
+    s.use = 0, good, 39.0, 1
+    service.begin(s, 2.0, fresh=False)
     assert (s.mark_s, s.mark_bits, s.snr_db, s.t_first_s) == (1.0, 500.0, 39.0, 1.0)
-    service.begin(s, weak, 12.0, 3.0, fresh=False)
+    s.use = 0, weak, 12.0, 2
+    service.begin(s, 3.0, fresh=False)
     assert (s.mark_s, s.mark_bits, s.t_first_s, s.begun_s) == (3.0, 0.0, 1.0, 1.0)
     s.forward(1, 2, 4.0, 77.0)
     assert (s.t_queued_s, s.drained_bits, s.hops, s.t_sent_s) == (4.0, 77.0, 2, 0.0)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import integrate, stats
 
-from sortie.radio.mac import edca
+from sortie.radio.mac import edca, medium
 from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, frame_bytes, frames_exchanges, legacy_ppdu_s, ppdu_s
 from sortie.radio.mac.contention import SIFS_S, SLOT_S, saturation_mbps
 from sortie.radio.mac.jobs import AirJob, End, GroupFrame
@@ -553,10 +553,10 @@ def test_nobody_begins_to_send_on_a_medium_that_it_senses_busy(traffic: list, po
     """Every event by itself; answers and a station that begins within the 4 µs that sensing takes are exempt."""
     b = Bench(power_dbm, 4)
     _play(b, traffic, [])
-    arrays, shared = b.medium._settled.arrays, b.medium._shared
     for _, who, frames, deadline_s, context in traffic:  # once more, at one instant, and event by event
         b.announce(who) if context else b.submit(who, frames, deadline_s)
-    arrays = b.medium._settled.arrays
+    b.medium._take_in()
+    arrays, table = b.medium._settled.arrays, b.medium._make_table()
     stations = arrays[0]
     busy_since = np.full(4, 10**18)
     for _ in range(3000):
@@ -564,7 +564,7 @@ def test_nobody_begins_to_send_on_a_medium_that_it_senses_busy(traffic: list, po
         if t == edca.FAR:
             break
         before = stations.copy()
-        edca.run(t, *arrays, *shared)
+        edca.ahead(table, -1, t, t - 1)
         begun = (stations[:, edca.TX_BEGIN] == t) & (stations[:, edca.TX_END] != edca.FAR)
         own = np.isin(stations[:, edca.TX_KIND], (edca.GROUP, edca.BLOCK_REQUEST, edca.RTS, edca.DATA))
         for s in np.flatnonzero(begun & own & (before[:, edca.AWAITS] == edca.NOTHING)):
@@ -574,6 +574,31 @@ def test_nobody_begins_to_send_on_a_medium_that_it_senses_busy(traffic: list, po
             if stations[s, edca.IS_BUSY] and not before[s, edca.IS_BUSY]:
                 busy_since[s] = t
         assert ((arrays[2] >= 0.0) & (arrays[2] < 1e9)).all()
+
+
+def test_a_frame_that_comes_after_the_plan_is_sent_also_where_somebody_looks_before() -> None:
+    b = Bench(-50.0)
+    b.submit(0, 600)
+    b.run(1e-3)
+    b.announce(1, in_s=1.0)
+    b.run(2e-3)
+    b.medium.sync()
+    b.run()
+    assert [(round(t, 2), sender) for t, sender, _ in b.heard] == [(1.0, 1)]
+
+
+def test_the_medium_writes_a_job_s_row_as_the_stations_read_it() -> None:
+    assert (medium._T_GROUP, medium._GROUP, medium._DATA) == (edca.T_GROUP, edca.GROUP, edca.DATA)
+    assert (medium._ROW_BYTES, medium._FIGURES_AT) == (8 * edca.JOB_COLUMNS, 8 * edca.LOW)
+    b = Bench(-50.0)
+    b.run(1e-3)
+    job = b.submit(1, 5)
+    row = b.medium._settled.rows[job.row * edca.JOB_COLUMNS :][: edca.JOB_COLUMNS].tolist()
+    given = {
+        edca.KIND: edca.DATA, edca.STATION: 1, edca.FLOW: job.flow, edca.FOLLOWING: -1, edca.COUNT: 5, edca.FULL_BYTES: FRAME,
+        edca.LAST_BYTES: FRAME, edca.IS_LIVE: 1, edca.JOB_ACCESS: 1, edca.READY_AT: 1_000_000, edca.HEAD_AT: -1,
+    }  # fmt: skip
+    assert row == [given.get(column, 0) for column in range(edca.JOB_COLUMNS)]
 
 
 def test_it_never_polls() -> None:

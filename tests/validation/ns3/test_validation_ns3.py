@@ -14,8 +14,10 @@ import wifi_ns3
 from wifi_air import QUIET, run_air
 from wifi_compare import LOADS, SATURATED, beyond, figures, means, through_air, through_ns3
 from wifi_ns3 import Ns3Missing, driver, run_ns3
+from wifi_parts import Stations, parts_ms
 from wifi_plan import Case, Plan, cross, grid, line, pairs_of, sortie_plan
 
+from sortie.radio.mac import medium
 from sortie.radio.rates import CURVES, LEGACY_CURVES
 
 
@@ -198,6 +200,18 @@ def test_what_lies_beyond_its_bound() -> None:
 def test_every_case_is_named_once() -> None:
     names = [case.name for case in (*LOADS, *SATURATED)]
     assert len(set(names)) == len(names)
+
+
+def test_the_parts_of_a_plan_s_time_are_measured_on_the_same_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case("3 in a line", "line", 3, payload_bytes=20_000, pairs=4, stop_s=0.9)
+    assert list(parts_ms(case, 1)) == ["all", "set-up and frames", "events and rows", "stations"]
+    runs = []
+    for again in (False, True):
+        monkeypatch.setattr(medium, "_edca", lambda again=again: Stations(again))
+        runs.append(run_air(case.plan(1), 0.6, 0.9, mcs=7, **QUIET))
+    assert len(runs[0]["data"]) == 36
+    pd.testing.assert_frame_equal(runs[0]["data"], runs[1]["data"])
+    pd.testing.assert_frame_equal(runs[0]["descriptors"], runs[1]["descriptors"])
 
 
 def test_the_air_runs_a_plan_at_the_mcs_that_is_asked_for() -> None:
