@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from sortie.policies.contract import Directive, FleetView
+from sortie.policies.contract import Directive, FleetView, Representation
 
 
 def older_views(view: FleetView) -> Iterator[tuple[tuple[int, ...], float, FleetView]]:
@@ -45,13 +45,19 @@ def _rise(old: Directive | None, d: Directive) -> str | None:
     """In what a directive is higher than the one before."""
     if old is None:
         return "there was none before" if d.representation > 0 else None
-    if d.representation > old.representation:
-        return f"representation rises from {old.representation:d} to {d.representation:d}"
-    if d.representation == old.representation and d.rho > old.rho:
+    before, after = _rung(old), _rung(d)
+    if after > before:
+        return f"representation rises from {before:d} to {after:d}"
+    if after == before and d.rho > old.rho:
         return f"rho rises from {old.rho} to {d.rho}"
     if d.rate_hz > old.rate_hz:
         return f"rate_hz rises from {old.rate_hz} to {d.rate_hz}"
     return None
+
+
+def _rung(d: Directive) -> Representation:
+    """Its representation; plain numbers are not ordered by fidelity."""
+    return Representation(d.representation) if type(d.representation) is int else d.representation
 
 
 def by_peer(directives: Iterable[Directive]) -> dict[int, Directive]:

@@ -261,7 +261,10 @@ def _to_node(tree: ast.expr) -> Node:
     """The tree of an expression, by an allow-list: everything else is refused."""
     match tree:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
-            return Number(value)
+            try:
+                return Number(float(value))
+            except OverflowError:
+                raise InvariantError(f"the number {str(value)[:9]}… is too large") from None
         case ast.Name(id=word):
             if word in CONSTANTS:
                 return Number(CONSTANTS[word])

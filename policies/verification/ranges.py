@@ -312,7 +312,9 @@ class DescriptorOfRanges(Descriptor):
         path: Path = self._origin.system.path
         path.refuse("uses a whole descriptor, which cannot be searched")
 
-    __lt__ = __le__ = __gt__ = __ge__ = __add__ = __mul__ = __rmul__ = __contains__ = __hash__ = __repr__ = _whole
+    __lt__ = __le__ = __gt__ = __ge__ = __add__ = __radd__ = __mul__ = __rmul__ = __contains__ = __hash__ = __repr__ = (
+        _whole
+    )
     __reduce__ = __reduce_ex__ = __getnewargs__ = __copy__ = __deepcopy__ = count = index = _whole
     _replace = _asdict = _make = with_roster = goodput_by_id = _whole
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from sortie.fleet.staleness import cap_by_age, health
-from sortie.policies.checks import find_inexact
-from sortie.policies.contract import DETACHED_AFTER_PERIODS, Directive, Disc, Policy, nothing
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import DETACHED_AFTER_PERIODS, Directive, Disc, Policy, PolicyError, nothing
 from sortie.policies.damping import EPSILON_S, DampedLink, damp, is_climb, is_switch, lower_of
 from sortie.policies.verification.confine import Reached
 from sortie.policies.verification.enforced import effective
@@ -31,6 +31,7 @@ from sortie.policies.verification.search import Budget, Run, rosters
 from sortie.policies.verification.subject import searchable, with_notes
 from sortie.policies.verification.symbols import Path, Ranged, Refused, explore
 from sortie.policies.verification.words import DWELL, Span
+from sortie.scenarios.plugins.user_calls import text_of
 from sortie.sim.check.closed_loop import PlaneTimes
 
 MOST_STATES = 200_000
@@ -159,10 +160,13 @@ def _letters_of(
 
     def act() -> Letter:
         view = decided.now()
-        answer = decided.decide(view)
-        wrong = find_inexact(answer)
-        if wrong is not None:
-            raise NotFinite(f"it breaks the contract: {wrong}")
+        try:
+            answer = decided.decide(view)
+            check_directives(answer, view)
+        except PolicyError as error:
+            raise NotFinite(f"it breaks the contract: {error}") from None
+        except Exception as error:
+            raise NotFinite(f"it raises {type(error).__name__}: {text_of(error, str)}") from None
         asked = {d.destination: _plain(d, view.ego) for d in answer}
         links = []
         for peer in decided.system.peers:

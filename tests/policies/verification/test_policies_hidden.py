@@ -278,6 +278,16 @@ def test_a_function_in_the_place_of_another_one_is_memory(tmp_path: Path) -> Non
     assert outcome(tmp_path, text) in ("drawn", "searched", "refuted")
 
 
+@pytest.mark.parametrize("part", ["((1,) + me)[7]", "sum([me], ())[6]", "functools.reduce(operator.add, [(), me])[6]"])
+def test_what_is_stored_in_a_descriptor_is_not_read_through_a_plain_tuple(tmp_path: Path, part: str) -> None:
+    """A function is noted as one, and not which it is."""
+    body = f"try:\n    rule = RULES[type({part})]\nexcept KeyError:\n    rule = never\nbad = rule(soc * 3)"  # as many notes
+    head = "def near(x):\n    return 1.2370368 < x < 1.2370374\ndef never(x):\n    return 7.0 < x < 8.0\nRULES = {float: near}\n"
+    found = verdict(tmp_path, source(body).replace("STATE = ", f"{head}STATE = ", 1))
+    assert found.outcome == "drawn"
+    assert "uses a whole descriptor" in found.what
+
+
 def test_a_large_floor_quotient_is_not_monotone_and_not_proved(tmp_path: Path) -> None:
     c = -1.6653345369377348e-16
     assert [0.5049018169110862 // c, 0.5049018169110863 // c, 0.5049018169110864 // c] == [

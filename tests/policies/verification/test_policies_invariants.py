@@ -103,6 +103,7 @@ def test_a_text_has_a_line_each_and_comments() -> None:
         ("True", "'True' is not allowed"),
         ("'a' == 'b'", "is not allowed"),
         ("(" * 500 + "roi" + ")" * 500, "is not an expression"),
+        ("rate_hz <= " + "9" * 400, "the number 999999999… is too large"),
     ],
 )
 def test_what_is_refused(line: str, message: str) -> None:

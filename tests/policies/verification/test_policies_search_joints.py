@@ -267,6 +267,8 @@ def test_what_counts_as_a_rise() -> None:
     assert raised_part([_link(1, maps, 0.5)], [_link(1, boxes, 0.9)]) is None  # the share of another rung
     assert "rate_hz rises" in str(raised_part([_link(1, maps)], [_link(1, boxes, rate_hz=2.1)]))
     assert "none before" in str(raised_part([], [_link(1, boxes)]))
+    plain = [Directive(0, 1, 5, rate_hz=2.0)], [Directive(0, 1, 3, rate_hz=2.0)]  # type: ignore[arg-type]
+    assert "representation rises from 5 to 3" in str(raised_part(*plain))
     assert raised_part([], [_link(1, none)]) is None
     # higher than with the peer that is gone: a rise only if it is higher than without that peer too
     assert raised_part([_link(1, none)], [_link(1, boxes)], [_link(1, boxes)]) is None

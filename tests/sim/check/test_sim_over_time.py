@@ -66,6 +66,12 @@ def moved_region(view):
 
 def flips(view):
     return send(view, 0.0 if any(view.me.goodput_to(p) < 33.0 for p in view.peers) else 5.0)
+
+def by_a_flag(view):
+    return send(view, {0: 2.0}[view.me.novelty_flags & 1])
+
+def too_fast_by_a_flag(view):
+    return send(view, 31.0 if view.me.novelty_flags & 1 else 2.0)
 """
 
 
@@ -146,6 +152,8 @@ def test_a_largest_fleet_of_one_drone_counts_as_two_because_one_has_no_link(file
         ("one_of_two_regions", "switches_in(0.5) <= 2", "regions other than the drone's own"),
         ("moved_region", "switches_in(0.5) <= 2", "regions other than the drone's own"),
         ("two_rates", "count_links(climbs_in(1) > 1) <= 1", "counts of changes together with functions over links"),
+        ("by_a_flag", "climbs_in(dwell) <= 1", "it raises KeyError: 1"),
+        ("too_fast_by_a_flag", "climbs_in(dwell) <= 1", "it breaks the contract: .* rate_hz is 31.0"),
     ],
 )
 def test_what_no_proof_is_given_for(name: str, line: str, why: str, file: Path) -> None:
