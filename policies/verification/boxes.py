@@ -21,8 +21,10 @@ _FIRST_LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0)
 _PLAIN = frozenset({float, int, Representation})
 Changes = tuple[tuple[int, float], ...]
 """New values of a link's fields, by their places."""
-Known = dict[Any, tuple[str, Changes | None]]
-"""By a link's fields, or by its brackets: the lines that it breaks, and its changes; None for those if nothing keeps the lines."""
+Correction = tuple[str, Changes | None]
+"""The lines that a link breaks, and its changes; None for those if nothing keeps the lines."""
+Known = dict[Any, Sequence[Correction]]
+"""The correction of a link, by its fields; or those of which links in the same brackets take the nearest."""
 
 
 class Box:

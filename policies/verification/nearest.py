@@ -46,31 +46,35 @@ def nearest(
     box: Box,
     also: tuple[Part, ...],
     context: Context,
-) -> tuple[Link | None, bool]:
-    """The nearest link in the box that keeps the parts `also`, None if none was found; and whether counts decided.
+    *,
+    with_others: bool = False,
+) -> tuple[Link | None, list[Link] | None]:
+    """The nearest link in the box that keeps the parts `also`, None if none was found; and others that change as many fields.
 
-    Counts decided if two boxes to be tried never changed equally many fields, so that amounts were not compared. Then all
-    links in the same brackets change alike.
+    All links in the same brackets change to one of these, to the nearest. There is no other one where two boxes to be tried
+    never changed equally many fields, so that amounts were not compared. None where not all were found.
 
     Args:
         before: the link.
         box: the lines that apply to it.
         also: parts of lines about several links.
         context: what all are judged on.
+        with_others: look for the others too, if there may be any.
     """
     named: Any = box.clipped(before)
     if None in named.values():
-        return None, True
+        return None, []
     parts, region, number, by_count = box.parts + also, context.me.region, 0, True
+    found: list[Link] = []
+    fewest = (0, 0)
     queue: list[_Try] = []
     this: _Try = (0, _HERE, 0, box.room, named, before, named, None)
     for _ in range(MOST):
         exempted, far, _, room, named, base, changes, exempts = this
-        if room is None:
-            return base, by_count
-        after = changed(base, changes, region)
+        after = base if room is None else changed(base, changes, region)
         ways: Sequence[_Way] = ()
-        if after is None:
+        keeps_all = room is None
+        if after is None or room is None:
             pass
         elif exempts is not None:
             ways = _mended(before, exempts, room, named, context, after)
@@ -86,11 +90,18 @@ def nearest(
                         heapq.heappush(queue, (exempted + 1, far, number, room, named, after, _NO_CHANGE, part.exempt))
                     break
             else:
-                if not queue or (queue[0][:2] >= this[:2] and not _follows(before, named, after)):
-                    return after, by_count
-                number += 1
-                found = distance(before, after)
-                heapq.heappush(queue, (exempted, found, number, None, named, after, _NO_CHANGE, None))
+                keeps_all = not queue or (queue[0][:2] >= this[:2] and not _follows(before, named, after))
+                if not keeps_all:
+                    number += 1
+                    at = distance(before, after)
+                    heapq.heappush(queue, (exempted, at, number, None, named, after, _NO_CHANGE, None))
+        if keeps_all and after is not None:
+            if by_count or not with_others:
+                return after, [] if by_count else None
+            fields = exempted, distance(before, after)[0]
+            fewest = fewest if found else fields
+            if fields == fewest and after not in found:
+                found.append(after)
         # The only way is followed at once, without its distance, where all in the queue makes more conditions false.
         only = len(ways) == 1 and (not queue or queue[0][0] > exempted)
         here = None if only or not ways else further(_HERE, before, named)
@@ -110,12 +121,12 @@ def nearest(
             if not only:
                 heapq.heappush(queue, this)
         if not only:
-            if not queue:
-                return None, by_count
+            if not queue or (found and _fewest(queue[0]) > fewest):
+                return (found[0], found[1:]) if found else (None, [])
             this = heapq.heappop(queue)
             if by_count and queue and _fewest(queue[0]) == _fewest(this):
                 by_count = False
-    return None, by_count
+    return (found[0] if found else None), ([] if by_count else None)
 
 
 def _fewest(a_try: _Try) -> tuple[int, int]:

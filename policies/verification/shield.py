@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, Disc, FleetView, Policy
-from sortie.policies.verification.boxes import Box, Changes, Known, box_of
+from sortie.policies.verification.boxes import Box, Correction, Known, box_of
 from sortie.policies.verification.compiled import Context, Rule, compiled
 from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, Recent, just_heard
-from sortie.policies.verification.links import Ceiling, Far, Link, as_directive, as_link, distance
+from sortie.policies.verification.links import HIGHEST, Ceiling, Far, Link, as_directive, as_link, distance
 from sortie.policies.verification.nearest import nearest
 from sortie.policies.verification.words import CHANGES
 from sortie.scenarios.representation import NAME_OF
@@ -38,6 +38,8 @@ Ceilings = Mapping[int, Ceiling]
 """What the link to each peer may carry at most."""
 _MOST_KNOWN = 512
 """Corrections that a box remembers, of senders with a region and without one each."""
+_AS_GOOD = 1e-9
+"""Two changes that differ by less are compared by a search, which rounds otherwise."""
 _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
 
 
@@ -169,7 +171,7 @@ def _keep_alone(
     return directives, links, all_kept
 
 
-def _correction(context: Context, link: Link, box: Box, known: Known) -> tuple[str, Changes | None]:
+def _correction(context: Context, link: Link, box: Box, known: Known) -> Correction:
     """The lines that a link breaks, and its changes; None for those if nothing keeps the lines."""
     key = box.key(link)
     if key is None:
@@ -178,26 +180,46 @@ def _correction(context: Context, link: Link, box: Box, known: Known) -> tuple[s
     if found is None:
         if len(known) >= _MOST_KNOWN:
             known.clear()
-        brackets = key if box.brackets is None else box.brackets.of(context, link)
-        found = known.get(brackets)
-        if found is None:
-            found, by_count = _searched(context, link, box)
-            if by_count:
-                known[brackets] = found
-        known[key] = found
+        found = known[key] = (_shared(context, link, box, known),)
+    return found[0]
+
+
+def _shared(context: Context, link: Link, box: Box, known: Known) -> Correction:
+    """The same, by a search that was made for another link in the same brackets, if there was one."""
+    if box.brackets is None:
+        return _searched(context, link, box)[0]
+    brackets = box.brackets.of(context, link)
+    choices = known.get(brackets)
+    if choices is not None:
+        found = choices[0] if len(choices) == 1 else _nearest_of(link, choices)
+        if found is not None:
+            return found
+    found, others = _searched(context, link, box)
+    if others is not None:
+        known[brackets] = found, *others
     return found
 
 
-def _searched(context: Context, link: Link, box: Box) -> tuple[tuple[str, Changes | None], bool]:
-    """The same, and whether counts decided."""
+def _nearest_of(link: Link, choices: Sequence[Correction]) -> Correction | None:
+    """Of corrections that change equally many fields, that with the smallest change; None if two are as good."""
+    far = [sum([abs(value - link[at]) / HIGHEST[at] for at, value in changes or ()]) for _, changes in choices]
+    least, second = heapq.nsmallest(2, far)
+    return choices[far.index(least)] if second - least > _AS_GOOD else None
+
+
+def _searched(context: Context, link: Link, box: Box) -> tuple[Correction, list[Correction] | None]:
+    """The same, and those that change as many fields; None where not all were found."""
     broken = box.broken(context, link)
     if not broken:
-        return ("", ()), True
-    after, by_count = nearest(link, box, (), context)
+        return ("", ()), []
+    after, others = nearest(link, box, (), context, with_others=box.brackets is not None)
     texts = _texts(box, broken)
     if after is None:
-        return (texts, None), by_count
-    return (texts, tuple(compress(enumerate(after), map(operator.is_not, after, link)))), by_count
+        return (texts, None), None if others is None else []
+    each: list[Correction] = [
+        (texts, tuple(compress(enumerate(a), map(operator.is_not, a, link)))) for a in (after, *(others or ()))
+    ]
+    return each[0], None if others is None else each[1:]
 
 
 @lru_cache(maxsize=1024)

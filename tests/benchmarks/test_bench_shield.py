@@ -1,9 +1,8 @@
 """How long a shield takes for one decision: ten lines, five fields, 20 drones.
 
 `make bench-all` prints it. A decision takes at most 0.3 ms, even if each link has another directive with new numbers that
-breaks several lines: links with similar numbers share a search. With `ten lines and a choice` it takes 0.45 ms. There two
-ways to keep a line change equally many fields, so the search must compare by how much, for each link anew. Lines about
-several links that exclude each other on one link may take a few milliseconds: the links that keep them are searched.
+breaks several lines: links with similar numbers share a search. With `ten lines and a choice` two ways to keep a line
+change equally many fields. Then the search finds both, and each link takes the nearer one. Lines about several links that exclude each other on one link may take a few milliseconds: the links that keep them are searched.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ CHOICE = (
     .replace("when human: duty >= 0.8", "duty <= 1")
     .replace("(fusion_weight >= 0.2 or representation == none)", "(fusion_weight >= 0.8 or duty >= 0.9)")
 )
-"""The last line is kept by the smaller change."""
+"""The last line is kept by the smaller of two changes."""
 
 EXCLUSIVE = {
     "six exclusive lines": "\n".join(f"any_link(rate_hz == {hz})" for hz in range(1, 7)),

@@ -255,6 +255,8 @@ def test_a_decision_does_not_depend_on_what_was_decided_before(seed: int, line: 
     [
         "rate_hz < 5\nrho != 0.5\nfusion_weight >= 0.2 or representation == none",
         "rate_hz <= 5 or rho <= 0.2\nfusion_weight >= 0.5 or deadline_s <= 0.3",  # how much a field changes decides
+        "rate_hz == 1 or rate_hz == 3 or rho >= 0.9\nrho == 0 or rho == 0.5 or duty >= 0.9",
+        "rate_hz <= 2 or duty >= 0.8\nrepresentation <= tracks or duty >= 0.9 or fusion_weight >= 0.95",
         "rate_hz * deadline_s <= 2\nrho <= fusion_weight\nrate_hz <= 6",
         "rate_hz * deadline_s <= 2\ndeadline_s >= 0.5\nrho <= 0.4",
         "rate_hz * deadline_s <= 2\nrate_hz <= 2\ndeadline_s <= 0.5",
