@@ -272,9 +272,9 @@ def build(
     ]
     scorer = None
     if detector is not None:
-        drawn = taking_turns(scenario, seed, replication)
+        turns = taking_turns(scenario, seed, replication)
         scorer = Scorer(
-            env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people, plan.region, drawn
+            env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people, plan.region, turns
         )
     own_events = OwnEvents(scenario, world, seed, replication)
     schedule(scenario, world, transport, membership, own_events, seed=seed, replication=replication)

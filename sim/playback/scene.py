@@ -289,10 +289,10 @@ class Drawing:
 
     def _seen(self, seen: list[Sighting]) -> None:
         if self._takes_turns:
-            for t_s in dict.fromkeys(s.t_s for s in seen):
-                scored, nothing = {s.drone for s in seen if s.t_s == t_s}, [Boxes.empty()]
+            for now_s in dict.fromkeys(s.t_s for s in seen):
+                scored, nothing = {s.drone for s in seen if s.t_s == now_s}, [Boxes.empty()]
                 for drone in self._shown - scored:
-                    self._sighting_rows(drone, np.array([t_s]), nothing, nothing, nothing)
+                    self._sighting_rows(drone, np.array([now_s]), nothing, nothing, nothing)
                 self._shown = scored
         for i in sorted({s.drone for s in seen}):
             own = [s for s in seen if s.drone == i]
