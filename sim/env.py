@@ -86,7 +86,10 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         n = scenario.fleet.drones
         if n < 2:
             raise ValueError(f"fleet.drones is {n}, must be at least 2 to share")
-        self.scenario, self.render_mode = scenario, None
+        scored = scenario.perception.model_copy(
+            update={"egos": max(n, scenario.perception.egos)}
+        )  # each drone is rewarded for its own boxes
+        self.scenario, self.render_mode = scenario.model_copy(update={"perception": scored}), None
         self.possible_agents = [f"drone_{i}" for i in range(n)]
         self.agents: list[str] = []
         self._spaces = {

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from sortie.perception.classes import TRUCK, vehicle_classes
 from sortie.perception.geometry import FULL, USUAL, Lens, camera_margins
@@ -152,23 +153,26 @@ class Traffic:
         first = len(parked)
         out = np.full(xy.shape, np.inf)
         out[:, :first] = self._next_parked[parked]
-        for at, here, to in zip(xy, there, out, strict=True):
-            moving = np.flatnonzero(here[first:]) + first
-            if not len(moving):
-                continue
-            around, rows = np.concatenate([np.arange(first), moving]), np.arange(len(moving))
-            (x, y), (to_x, to_y) = at[moving].T, at[around].T
-            far, aside = to_x - x[:, None], to_y - y[:, None]
-            far *= far
-            aside *= aside
-            far += aside
-            far[rows, first + rows] = np.inf
-            nearest = far.argmin(axis=1)
-            to[moving] = at[around[nearest]] - at[moving]
-            to[moving[far[rows, nearest] == np.inf]] = np.inf
-            passing = far[:, :first]
-            closer = np.flatnonzero(passing.min(axis=0) < to[:first, 0] ** 2 + to[:first, 1] ** 2)
-            to[closer] = at[moving[passing[:, closer].argmin(axis=0)]] - at[closer]
+        moment, k = np.nonzero(there[:, first:])
+        places = xy[moment, first + k]
+        # moments lie apart along a third axis, so that no car is next to one of another moment
+        moving = cKDTree(np.column_stack([places, 4.0 * NEXT_M * moment]))
+        one, other = moving.query_pairs(NEXT_M + 0.01, output_type="ndarray").T
+        past = cKDTree(places).sparse_distance_matrix(
+            cKDTree(self.parked_xy[parked]), NEXT_M + 0.01, output_type="ndarray"
+        )
+        mover, stands = past["i"], past["j"]
+        passing = _squared(self.parked_xy[parked[stands]] - places[mover])
+        between = _squared(places[other] - places[one])
+        me, around = np.concatenate([mover, one, other]), np.concatenate([stands, first + k[other], first + k[one]])
+        best = _least(me, np.concatenate([passing, between, between]), around)
+        me, around = me[best], around[best]
+        out[moment[me], first + k[me]] = xy[moment[me], around] - places[me]
+        best = _least(moment[mover] * first + stands, passing, mover)
+        mover, stands, passing = mover[best], stands[best], passing[best]
+        closer = passing < _squared(out[moment[mover], stands])
+        mover, stands = mover[closer], stands[closer]
+        out[moment[mover], stands] = places[mover] - self.parked_xy[parked[stands]]
         out[out[..., 0] ** 2 + out[..., 1] ** 2 > NEXT_M**2] = np.inf
         return out
 
@@ -258,6 +262,17 @@ class Eyes:
             here = np.flatnonzero((t_s == now_s) & ~truck)
             seen[here] &= ~behind(self._trucks_at(now_s), xy[here], eye[here], CAR_TOP_M)
         return seen
+
+
+def _squared(xy: Floats) -> Floats:
+    """The squared lengths of vectors [n, 2]."""
+    return np.asarray(xy[:, 0] ** 2 + xy[:, 1] ** 2)
+
+
+def _least(group: Ints, value: Floats, tie: Ints) -> Ints:
+    """The row with the least value in each group; of equal ones that with the least `tie`."""
+    order = np.lexsort((tie, value, group))
+    return np.asarray(order[np.unique(group[order], return_index=True)[1]])
 
 
 def square(turn_rad: Floats) -> Floats:

@@ -102,6 +102,12 @@ class Perception(Section):
         le=10,
         description="How often accuracy is scored, at times that keep time with no rate; traffic runs at context.rate_hz.",
     )
+    egos: int = Field(
+        50,
+        ge=1,
+        le=5000,
+        description="How many drones are scored at each scored moment. A larger fleet takes turns in a random order; it is scored whole where motion_compensation is false or absent_peers is zeros, as a drone's boxes then depend on where all others are.",
+    )
     tracking_rate_hz: float = Field(
         2.0,
         ge=1e-3,

@@ -240,6 +240,24 @@ class Scenario(Section):
         return [period[int(k * GOLDEN_RATIO % 1.0 * len(period))] for k, period in enumerate(self.scoring_periods)]
 
     @property
+    def scorable_drones(self) -> list[int]:
+        """The drones that may be scored: all but ground stations that are not."""
+        unscored = {station.drone for station in self.fleet.ground if not station.scored}
+        return [drone for drone in range(self.fleet.drones) if drone not in unscored]
+
+    @property
+    def scored_drones(self) -> int:
+        """How many of them are scored at each scored moment."""
+        perception, every = self.perception, len(self.scorable_drones)
+        whole = not perception.motion_compensation or perception.absent_peers == "zeros"
+        return every if whole else min(perception.egos, every)
+
+    @property
+    def takes_turns(self) -> bool:
+        """Whether the fleet is too large to score all drones at each scored moment."""
+        return self.scored_drones < len(self.scorable_drones)
+
+    @property
     def tracked_frames(self) -> list[int]:
         """The frames from which trackers take in a look, `perception.tracking_rate_hz` of them a second.
 

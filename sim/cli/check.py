@@ -14,7 +14,7 @@ from sortie.scenarios.reading.campaign import read_any
 from sortie.scenarios.reading.load import ScenarioError, campaigns, condition_sets, library
 from sortie.sim.check.junit import Suite, junit
 from sortie.sim.cli import tables
-from sortie.sim.cli.console import bars, err, out
+from sortie.sim.cli.console import bars, err, out, told_of
 from sortie.sim.cli.options import SetOption, refuse
 from sortie.sim.folders import ensure_files, write_text
 
@@ -40,6 +40,7 @@ def check(
     """Fly scenarios and test the expectations that they state. Exit code 1 if one fails."""
     from sortie.sim.check.checking import flights
     from sortie.sim.check.discovery import scenario_files
+    from sortie.sim.engine.needs import Forecast
 
     if syntax:
         refuse(context, ("update", "junit_file"), "flights, not with --syntax")
@@ -52,7 +53,10 @@ def check(
     for name, flown in loaded:
         try:
             with bars() as bar:
-                watch = bar(flown.name, flown.duration_s * flights(flown))
+                several = flights(flown)
+                watch = Forecast(
+                    flown, told_of(flown.name), bar(flown.name, flown.duration_s * several), flights=several
+                )
                 (checked,) = sortie.check(name, set_ or [], update=update, progress=watch)
         except SortieError as error:
             _write_junit(junit_file, [*suites, Suite(name, None, str(error))])

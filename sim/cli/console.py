@@ -12,6 +12,11 @@ out = Console(emoji=False)  # `mine.py:link:` is a file's name
 err = Console(stderr=True, highlight=False, emoji=False)
 
 
+def told_of(name: str) -> Callable[[str], None]:
+    """Prints lines about a scenario as errors are printed, above a bar if one is shown."""
+    return lambda words: err.print(f"{name}: {words}", soft_wrap=True, markup=False)
+
+
 @contextmanager
 def bars() -> Iterator[Callable[[str, float], Callable[[float], None]]]:
     """A progress display; gives a function that adds a bar and returns its updater. Silent without a terminal."""

@@ -16,10 +16,10 @@ from sortie.scenarios.reading.load import ScenarioError, library, load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
-from sortie.sim.cli.console import bars, err, out
+from sortie.sim.cli.console import bars, out, told_of
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded, refuse
 from sortie.sim.cli.view import view
-from sortie.sim.engine.needs import ensure_room
+from sortie.sim.engine.needs import Forecast, ensure_room, needs
 from sortie.sim.engine.watchers import Watcher, Watchers
 from sortie.sim.folders import RunError, settled
 from sortie.sim.identity import own_files
@@ -96,12 +96,13 @@ def fly(
     run_folder.ensure_writable(path)
     if not replace:
         run_folder.ensure_same(path, flown, drawn, number, files)
-    if words := ensure_room(flown, path, force=force):
-        err.print(f"{flown.name}: {words}", soft_wrap=True)
+    need = needs(flown)
+    if words := ensure_room(flown, need, path, force=force):
+        told_of(flown.name)(words)
     if view_ or recording:
         import_module("sortie.sim.playback.recording")  # a missing Rerun is reported before the flight
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
-        ticker = bar(flown.name, flown.duration_s)
+        ticker = Forecast(flown, told_of(flown.name), bar(flown.name, flown.duration_s), memory=need.memory)
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
     with settled(path):
         other, note = run_folder.in_place_of(path, flight.fingerprint), ""

@@ -1,15 +1,17 @@
-"""What a sortie will need of memory and disk, from counts: drones, frames, links and the width of the record's rows.
+"""What a sortie will need of memory and disk, from counts, and of time, from its first seconds.
 
-Some rows are certain: each drone has a state in each frame. Others depend on what drones hear and send, and have an upper
-bound only: each link may carry a payload in each frame.
+The counts are of drones, frames, links and the width of the record's rows. Some rows are certain: each drone has a state in each frame. Others depend on what drones hear and send, and have an upper
+bound only: each link may carry a payload in each frame. Time cannot be counted beforehand: it depends on the machine, the
+policy and what else is running.
 """
 
 from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from time import perf_counter
 from typing import NamedTuple
 
 import psutil
@@ -44,6 +46,13 @@ OBJECT_FACTOR = 8
 """Rows as Python objects over the same in Arrow."""
 SCORED_FLOATS = 8
 """Of a detection while all of them are sorted by score."""
+START_S = 1.0
+"""Simulated time that is not measured: links begin silent, so it takes less than any other."""
+MEASURED_S, MEASURED_WALL_S = 1.0, 5.0
+"""A flight's time is estimated after at least so much simulated and so much wall-clock time. Fast flights are so measured over
+some scoring, which comes at intervals."""
+LONG_S = 60.0
+"""Flights that take longer are told of."""
 OUTCOME_BYTES = 16
 """Of a drone in a frame while the mission's figures are computed: whether it flew and looked."""
 
@@ -69,7 +78,7 @@ def needs(scenario: Scenario) -> Needs:
         "mission": groups * frames, "people": people * frames, "medium": math.ceil(scenario.duration_s),
     }  # fmt: skip
     links = n * (n - 1)
-    fusions = 0 if scenario.perception.detector == "none" else n * len(scenario.scored_frames)
+    fusions = 0 if scenario.perception.detector == "none" else scenario.scored_drones * len(scenario.scored_frames)
     cars = _cars_in_range(scenario) if fusions else 0
     possible = {
         "ages": links * frames, "transmissions": links * frames, "fusions": fusions,
@@ -138,11 +147,12 @@ def shortage(need: Needs, run: Path) -> tuple[str, bool]:
     return "", False
 
 
-def ensure_room(scenario: Scenario, run: Path, *, force: bool = False) -> str:
+def ensure_room(scenario: Scenario, need: Needs, run: Path, *, force: bool = False) -> str:
     """Refuse a sortie that needs more memory or disk than is free.
 
     Args:
         scenario: what will fly.
+        need: what it needs.
         run: the folder that it is saved in.
         force: fly it all the same.
 
@@ -152,7 +162,7 @@ def ensure_room(scenario: Scenario, run: Path, *, force: bool = False) -> str:
     Raises:
         RunError: what is short, and how much is free.
     """
-    words, sure = shortage(needs(scenario), run)
+    words, sure = shortage(need, run)
     if words and sure and not force:
         raise RunError(f"{scenario.name}: {words}; make room, set TMPDIR to another disk, or fly it with --force")
     return words
@@ -161,3 +171,64 @@ def ensure_room(scenario: Scenario, run: Path, *, force: bool = False) -> str:
 def _text(size: float) -> str:
     """`1.2 GB`"""
     return f"{size / 1e9:.1f} GB" if size >= 1e8 else f"{size / 1e6:.0f} MB"
+
+
+class Forecast:
+    """Measures the first seconds of a flight, and says how long the whole will take where that is long.
+
+    Called with the simulated time once a simulated second, as the `progress` of `run_sortie`.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        say: Callable[[str], None],
+        progress: Callable[[float], None],
+        *,
+        memory: int = 0,
+        flights: int = 1,
+        clock: Callable[[], float] = perf_counter,
+    ) -> None:
+        """Args:
+        scenario: what flies.
+        say: gets one line, once.
+        progress: called with the simulated time as well.
+        memory: what it needs, bytes, said in the same line; 0 leaves it out.
+        flights: so many fly one after the other, and the time goes on from one to the next.
+        clock: the time in seconds.
+        """
+        self._scenario, self._say, self._progress = scenario, say, progress
+        self._memory, self._flights, self._clock = memory, flights, clock
+        self._begun_s, self._since = clock(), (0.0, 0.0)
+        self.takes_s: float | None = None
+        """The estimate, with the time before the first second; None until there is one."""
+        self.measured_s: float | None = None
+        """The simulated time at which it was made."""
+
+    def __call__(self, t_s: float) -> None:
+        self._progress(t_s)
+        if self.takes_s is not None:
+            return
+        now_s, (since_t_s, since_s) = self._clock(), self._since
+        if not since_t_s:
+            self._since = (t_s if t_s >= START_S - 1e-6 else 0.0), now_s
+        elif t_s - since_t_s >= MEASURED_S - 1e-6 and now_s - since_s >= MEASURED_WALL_S:
+            left_s = self._flights * self._scenario.duration_s - t_s
+            takes_s = now_s - self._begun_s + left_s * (now_s - since_s) / (t_s - since_t_s)
+            self.takes_s, self.measured_s = takes_s, t_s
+            if takes_s >= LONG_S:
+                self._say(self._words(takes_s, t_s))
+
+    def _words(self, takes_s: float, t_s: float) -> str:
+        n, times = self._scenario.fleet.drones, f"{self._flights} × " if self._flights > 1 else ""
+        memory = f" and {_text(self._memory)} of memory" if self._memory else ""
+        what = f"{n:,} drones for {times}{self._scenario.duration_s:g} s"
+        return f"{what}: about {_duration(takes_s)}{memory} on this machine, estimated from the first {t_s:.0f} s"
+
+
+def _duration(seconds: float) -> str:
+    """`10 minutes`, `2.5 hours`"""
+    if seconds < 5400.0:
+        minutes = round(seconds / 60.0)
+        return f"{minutes} minute{'s' if minutes != 1 else ''}"
+    return f"{seconds / 3600.0:.1f} hours"

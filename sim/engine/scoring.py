@@ -1,8 +1,11 @@
-"""Fusion and scoring: at each scored frame every drone fuses the payloads it holds, and its boxes are recorded."""
+"""Fusion and scoring: at each scored frame drones fuse the payloads that they hold, and their boxes are recorded.
+
+In a large fleet drones take turns at it (`taking_turns`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,6 +23,7 @@ from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.representation import DETECTED_NAMES, NAME_OF
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.streams import stream
 from sortie.sim.engine.people import People
 from sortie.sim.results.record import Recorder
 
@@ -74,13 +78,27 @@ Moment = tuple[float, list[Ego]]
 """When, and every ego."""
 
 
+def taking_turns(scenario: Scenario, seed: int, replication: int) -> Iterator[list[int]]:
+    """Which drones are scored at each scored moment, by ascending drone: all, or as many as `perception.egos` says.
+
+    They take turns in one random order. Every drone has the same chance at each moment, so the fleet's AP is estimated
+    without bias. Each is scored equally often, so it is estimated more precisely than by drones that are drawn once, or anew
+    at each moment. The order depends on nothing that flies: policies are scored by the same drones at the same moments.
+    """
+    drones, count = scenario.scorable_drones, scenario.scored_drones
+    if scenario.takes_turns:
+        drones = stream(seed, replication, (), "scored drones").permutation(drones).tolist()
+    for k in range(len(scenario.scored_frames)):
+        yield sorted(drones[i % len(drones)] for i in range(k * count, (k + 1) * count))
+
+
 def jobs_of(moment: Moment) -> list[Job]:
     """The detector's jobs at a moment."""
     return [ego.job for ego in moment[1] if ego.job is not None]
 
 
 class Scorer:
-    """Runs the detector over the fleet at the scored frames' fusion times.
+    """Runs the detector over the drones that are scored at the scored frames' fusion times.
 
     A detector that takes many moments together runs when enough of them wait. Any other runs at the moment itself. One that
     works in the background has time until the next moment.
@@ -97,12 +115,14 @@ class Scorer:
         own_tracks: Callable[[int], Tracks],
         people: People,
         region: Callable[[int, float], Disc | None],
+        turns: Iterable[Sequence[int]],
     ) -> None:
         """Args:
         planned: where a drone is in a frame, or would be had it not left the air.
         own_tracks: what a drone's own tracker follows.
         people: finds, joins and records people; the detector has vehicles alone.
         region: a drone's mission region at a time.
+        turns: which drones are scored at each scored moment, ascending.
         """
         self._env, self._scenario, self._detector = env, scenario, detector
         # here and not in each call: a check against a protocol takes longer than a fusion
@@ -112,7 +132,7 @@ class Scorer:
         self._people, self._has_trucks = people, scenario.perception.scene.trucks > 0.0
         self._delays_s = scenario.compute_delays_s
         self._region = region if scenario.perception.serve == "region_first" else None
-        self._unscored = {station.drone for station in scenario.fleet.ground if not station.scored}
+        self._turns = turns
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
         recorder.unfold |= {
@@ -127,17 +147,15 @@ class Scorer:
     def _run(self) -> Generator[simpy.Event, Any, None]:
         env, scenario = self._env, self._scenario
         delay_s = scenario.perception.fusion_delay_s
-        for frame in scenario.scored_frames:
+        for frame, drones in zip(scenario.scored_frames, self._turns, strict=True):
             yield env.timeout(max(0.0, frame * scenario.frame_s + delay_s - env.now))
-            self._score(frame)
+            self._score(frame, [self._agents[drone] for drone in drones])
 
-    def _score(self, frame: int) -> None:
+    def _score(self, frame: int, agents: Sequence[Agent]) -> None:
         now_s = self._env.now
         moment: Moment = now_s, []
         since_s = (frame - 1.5) * self._scenario.frame_s
-        for agent in self._agents:
-            if agent.drone in self._unscored:
-                continue
+        for agent in agents:
             came_back = agent.here is not None and agent.here.t_s < since_s  # and has not sensed yet
             if came_back or not agent.status.airborne:
                 moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))

@@ -47,7 +47,7 @@ from sortie.sim.engine.own_metrics import loaded, own_metrics
 from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
-from sortie.sim.engine.scoring import Scorer
+from sortie.sim.engine.scoring import Scorer, taking_turns
 from sortie.sim.engine.separation import Separation
 from sortie.sim.engine.steering import Steering, area_m
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
@@ -272,7 +272,10 @@ def build(
     ]
     scorer = None
     if detector is not None:
-        scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people, plan.region)
+        turns = taking_turns(scenario, seed, replication)
+        scorer = Scorer(
+            env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people, plan.region, turns
+        )
     own_events = OwnEvents(scenario, world, seed, replication)
     schedule(scenario, world, transport, membership, own_events, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)

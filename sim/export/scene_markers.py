@@ -14,6 +14,7 @@ Each message replaces the one before on its topic, so that a viewer may begin an
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -68,7 +69,15 @@ class SceneMarkers:
 
     def messages(self) -> list[Iterator[Timed]]:
         """Streams of messages, each in order of time."""
-        return [self._town(), self._cars(), self._mission(), self._links(), self._boxes(), self._landed()]
+        return [
+            self._town(),
+            self._cars(),
+            self._mission(),
+            self._links(),
+            self._boxes(),
+            self._waiting(),
+            self._landed(),
+        ]
 
     # --- streams ---------------------------------------------------------------------------------
 
@@ -142,6 +151,17 @@ class SceneMarkers:
             ):  # fmt: skip
                 markers += self._box_markers(name, seen.t_s, boxes, colours)
             yield seen.t_s, f"/drone_{seen.drone}/boxes", self._array(seen.t_s, markers)
+
+    def _waiting(self) -> Iterator[Timed]:
+        """Where drones take turns at being scored, one that waits shows no boxes: they would be of an earlier time."""
+        scored: dict[float, set[int]] = {}
+        if self._record.scenario.takes_turns:
+            fusions = self._record.tables["fusions"]
+            for t_s, drone in zip(fusions["t_s"].to_pylist(), fusions["drone"].to_pylist(), strict=True):
+                scored.setdefault(t_s, set()).add(drone)
+        for before_s, t_s in pairwise(scored):
+            for drone in sorted(scored[before_s] - scored[t_s]):
+                yield t_s, f"/drone_{drone}/boxes", self._array(t_s, [])
 
     def _landed(self) -> Iterator[Timed]:
         """Who comes down sees nothing from then on."""

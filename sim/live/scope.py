@@ -39,6 +39,7 @@ UNUSED = (
     "perception.recorded_fusion",
     "perception.precision",
     "perception.sample_rate_hz",
+    "perception.egos",
     "perception.fusion_delay_s",
     "perception.max_age_s",
     "perception.motion_compensation",

@@ -50,6 +50,9 @@ class Drawing:
         self._canvas, self._scene, self._n = canvas, scene, scenario.fleet.drones
         self._rate_hz, self._targets = scenario.context.rate_hz, len(scenario.mission.targets)
         self._groups = range(len(scenario.mission.phases_of))
+        self._takes_turns = scenario.takes_turns
+        self._shown: set[int] = set()
+        """The drones that were scored last, where drones take turns: the boxes of others are of an earlier time."""
         self._cameras = cameras_of(scenario.fleet)
         self._stations = {station.drone: station for station in scenario.fleet.ground}
         self._flying = vehicles(scenario.fleet)
@@ -285,6 +288,12 @@ class Drawing:
             self._canvas.columns(_target_path(k), t_s, rr.Transform3D.columns(translation=np.reshape(xyz, (-1, 3))))
 
     def _seen(self, seen: list[Sighting]) -> None:
+        if self._takes_turns:
+            for now_s in dict.fromkeys(s.t_s for s in seen):
+                scored, nothing = {s.drone for s in seen if s.t_s == now_s}, [Boxes.empty()]
+                for drone in self._shown - scored:
+                    self._sighting_rows(drone, np.array([now_s]), nothing, nothing, nothing)
+                self._shown = scored
         for i in sorted({s.drone for s in seen}):
             own = [s for s in seen if s.drone == i]
             t_s = np.array([s.t_s for s in own])

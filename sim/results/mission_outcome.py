@@ -191,7 +191,7 @@ def _disc_in_view(disc: Floats, pose: Floats, looking: Bools, cameras: Sequence[
 def _detected(record: SortieRecord, frame_s: Floats, tracked: dict[int, Bools]) -> tuple[float | None, float | None]:
     """Share of the scoring periods in which a drone's boxes hold the target, and the longest time without."""
     scenario = record.scenario
-    if record.detector == "none" or not tracked:
+    if record.detector == "none" or not tracked or scenario.takes_turns:  # then boxes of the others may hold it
         return None, None
     instants = np.array(scenario.scored_frames) * scenario.frame_s + scenario.perception.fusion_delay_s
     periods_s = np.array([period.start for period in scenario.scoring_periods]) * scenario.frame_s

@@ -67,6 +67,8 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             "grounded_blind": scored.grounded_blind(),
             "sample_rate_hz": min(scenario.perception.sample_rate_hz, scenario.context.rate_hz),
             "scored_fusions": tables["fusions"].num_rows,
+            "scored_drones": 0 if record.detector == "none" else scenario.scored_drones,
+            "scorable_drones": len(scenario.scorable_drones),
         },
         "ap_by_class": _by_class(scored, looked_for),
         "tracking": tracking_outcome(record),

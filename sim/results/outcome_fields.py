@@ -50,6 +50,12 @@ class Ap50(Accuracy):
     ]
     sample_rate_hz: Annotated[float, "Accuracy is sampled at this rate while traffic runs at the full one."]
     scored_fusions: Annotated[int, "How many fusions were scored."]
+    scored_drones: Annotated[
+        int,
+        "How many drones are scored at each scored instant (`perception.egos`), 0 without a detector. Where they are fewer than "
+        "`scorable_drones`, drones take turns in a random order, and accuracy is an estimate for the whole fleet.",
+    ]
+    scorable_drones: Annotated[int, "How many drones may be scored: all but ground stations that are not."]
 
 
 class ClassAccuracy(TypedDict):
@@ -74,7 +80,8 @@ class TrackingOutcome(TypedDict):
         float | None,
         "HOTA (higher order tracking accuracy, Luiten et al. 2021), the mean over 19 limits of overlap, 0.05 to 0.95. A "
         "tracker follows each drone's boxes after fusion; its confirmed tracks are judged by rotated IoU on the ground, "
-        "over all cars within range. Null where the detector does not know which car is which.",
+        "over all cars within range. Null where the detector does not know which car is which, and where drones take turns "
+        "at being scored: a tracker needs all boxes of its drone.",
         SHARE,
     ]
     det_a: Annotated[float | None, "DetA, its part that judges detection.", SHARE]
@@ -105,7 +112,8 @@ class MissionOutcome(TypedDict):
     target_detected_share: Annotated[
         float | None,
         "Share of the time of phase `track`, 0 … 1, in which a box of at least one drone overlaps the target with an "
-        "IoU of at least 0.5. Each scored instant stands for its scoring period.",
+        "IoU of at least 0.5. Each scored instant stands for its scoring period. Null where drones take turns at being "
+        "scored: a drone that is not scored may have the target.",
         SHARE,
     ]
     target_longest_undetected_s: Annotated[

@@ -14,7 +14,7 @@ from sortie.sim.results.html_page import figures_html, html_page
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report_figures import colour, figures, moments
-from sortie.sim.results.sentences import decision_in_words, event_in_words, losses_in_words
+from sortie.sim.results.sentences import decision_in_words, event_in_words, losses_in_words, turns_in_words
 from sortie.sim.results.summary import PLURAL
 
 MOST_EVENTS = 30
@@ -79,6 +79,7 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
         notes = [f"AP@0.5, {by}", f"{ap['scored_fusions']} fusions scored"]
         if not whole:
             notes = [f"{number(blind[area])} with grounded drones blind" for area in ("mission", "full_scene")]
+        notes[1] += turns_in_words(ap)
         tiles.append(("Accuracy, mission disc", number(ap["mission"]), notes[0]))
         tiles.append(("Accuracy, full scene", number(ap["full_scene"]), notes[1]))
         for name, of_class in result["ap_by_class"].items():

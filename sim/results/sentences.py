@@ -29,6 +29,12 @@ def losses_in_words(context: dict[str, Any]) -> str:
     return ", ".join(f"{percent(share)} {_LOST_TO[cause]}" for share, cause in parts)
 
 
+def turns_in_words(ap50: dict[str, Any]) -> str:
+    """Which drones were scored where they took turns: `, 50 of 1,000 drones at a time`; empty where all were."""
+    scored, every = ap50["scored_drones"], ap50["scorable_drones"]
+    return f", {scored:,} of {every:,} drones at a time" if 0 < scored < every else ""
+
+
 def event_in_words(row: dict[str, Any]) -> str:
     """An event and the drone that it affects: `drone 2: links of 2 lose 37 dB`."""
     return f"{'fleet' if row['drone'] < 0 else 'drone ' + str(row['drone'])}: {row['text']}"

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sortie.scenarios.report_text import number, percent, size
-from sortie.sim.results.sentences import losses_in_words
+from sortie.sim.results.sentences import losses_in_words, turns_in_words
 
 MAX_TRANSITIONS = 24
 PLURAL = {"car": "cars", "truck": "trucks", "person": "people"}
@@ -49,7 +49,7 @@ def outcome_table(result: dict[str, Any]) -> Table:
         table.add_row("flown", f"{percent(mission['flown_share'])} of drone-seconds")
     if ap["detector"] != "none":
         model = f"; the surrogate {ap['calibration']}, no network" if ap["calibration"] else f"; {ap['detector']}"
-        rate = f"scored at {ap['sample_rate_hz']:g} Hz, {ap['scored_fusions']} fusions{model}"
+        rate = f"scored at {ap['sample_rate_hz']:g} Hz, {ap['scored_fusions']} fusions{turns_in_words(ap)}{model}"
         table.add_row("AP@0.5", f"{number(ap['full_scene'])} full scene, {number(ap['mission'])} mission ({rate})")
         if mission["flown_share"] < 1.0:
             blind = ap["grounded_blind"]

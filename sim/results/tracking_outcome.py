@@ -23,10 +23,11 @@ from sortie.sim.results.spool import InTime, batches
 
 
 def tracking_outcome(record: SortieRecord) -> dict[str, float | None]:
-    """The section `tracking` of the outcome; null without a detector, a car, or a detector that knows which car is which."""
+    """The section `tracking` of the outcome; null without a detector, a car, or a detector that knows
+    which car is which, and where drones take turns at being scored: a tracker needs all of a drone's boxes."""
     nothing: dict[str, float | None] = {"hota": None, "det_a": None, "ass_a": None}
     tables = record.tables
-    if not tables["fusions"].num_rows or not _is_known(tables):
+    if record.scenario.takes_turns or not tables["fusions"].num_rows or not _is_known(tables):
         return nothing
     value = hota_of(_followed(tables, record.scenario.fleet.drones, record.scenario.duration_s))
     return nothing if value is None else value._asdict()

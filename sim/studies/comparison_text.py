@@ -10,6 +10,7 @@ from typing import Any
 from rich.table import Table
 
 from sortie.scenarios.report_text import number, percent, points, size, table
+from sortie.sim.results.sentences import turns_in_words
 from sortie.sim.results.summary import PLURAL
 from sortie.sim.studies.compare import BLOCK_S, BY_BOTH, Compared, Flown, Gain
 from sortie.sim.studies.conditions import mean_of_known
@@ -35,6 +36,7 @@ def comparison_markdown(flown: Flown, command: str, precision: Precision | None 
     head = f"`{command}`: {first['duration_s']:g} s, {len(first['battery'])} drones, {_seeds(flown)}"
     if first["ap50"]["scored_fusions"]:
         head += f", accuracy scored at {first['ap50']['sample_rate_hz']:g} Hz by `{first['ap50']['detector']}`"
+        head += turns_in_words(first["ap50"])
     what = " ".join(filter(None, [f"{head}.", _what_gains_are(flown)]))
     cells = ((name.strip(), *values) for name, values in side_by_side(flown).items())
     told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
@@ -70,7 +72,8 @@ def compare_command(
 
 def heading(flown: Flown) -> str:
     """The scenario, and how many sorties the figures are means of."""
-    return f"{flown.sorties[0].outcome['scenario']} · {_seeds(flown)}"
+    first = flown.sorties[0].outcome
+    return f"{first['scenario']} · {_seeds(flown)}{turns_in_words(first['ap50']).replace(' at', ' scored at')}"
 
 
 def explanations(flown: Flown) -> Iterator[str]:

@@ -405,6 +405,7 @@ MOVES: dict[str, tuple[str, str | float]] = {
     "perception.weights": ("detections", "<"),
     "perception.code_bytes": ("codes' bytes", "<"),
     "perception.sample_rate_hz": ("fusions", ">"),
+    "perception.egos": ("fusions", "<"),
     "perception.fusion_delay_s": ("age at fusion", ">"),
     "perception.max_age_s": ("peers fused", "<"),
     "perception.score_threshold": ("detections", "<"),

@@ -356,6 +356,12 @@ def _half_width() -> Tables:
     return half_width_coverage.tables()
 
 
+def _large_fleets() -> Tables:
+    import large_fleets
+
+    return large_fleets.tables()
+
+
 def _price() -> Tables:
     """From the flown seeds of compare_price.csv; `compare_price.py` flies what it lacks."""
     import compare_price
@@ -767,6 +773,7 @@ FIGURES: dict[str, Figure] = {
     "paper": Figure(8, _paper),
     "conditions_first": Figure(8, _conditions_first, network=True),
     "inference_libraries": Figure(2, _inference_libraries, timed=True, network=True),
+    "large_fleets": Figure(12, _large_fleets, timed=True, network=True),
     "campaign_scale": Figure(10, _campaign_scale, timed=True),
     "speed": Figure(12, _speed, timed=True),
     "pace": Figure(12, _pace, timed=True),

@@ -7,7 +7,7 @@ import pytest
 
 from sortie.perception.scene.height_field import RES_M
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.surrogate.features import LOOK_COVARIATES, NEXT_M, CaptureColumns, Eyes, axes
+from sortie.perception.surrogate.features import LOOK_COVARIATES, NEXT_M, CaptureColumns, Eyes, Traffic, axes
 from sortie.perception.surrogate.kerbs import NEAR_M, Kerbs, next_of
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Scene, Target
@@ -42,6 +42,34 @@ def test_the_next_car_is_the_nearest_of_all_parked_driving_or_the_target(style: 
         if close:
             seen.add((bool(cars.ids[itself] == 0), bool(cars.ids[following] == 0)))
     assert seen == {(False, False), (False, True), (True, False)}  # and the target is next to something
+
+
+def test_the_next_car_is_that_of_plain_loops_to_the_last_bit() -> None:
+    """Also between cars at equal distances, and in the same place."""
+    scene = SceneModel(Scene(parked_density=0.9, moving_cars_per_km=60), TARGET, (-60, -20, 100, 20))
+    traffic, rng = Traffic(scene), np.random.Generator(np.random.PCG64(3))
+    parked = np.flatnonzero(rng.random(traffic.parked) < 0.7)
+    xy, _, there = traffic.at(np.array([0.0, 1.0, 7.3]), parked)
+    first = len(parked)
+    xy[2, first:] = np.round(xy[2, first:] / 4) * 4
+    expected = np.full(xy.shape, np.inf)
+    for at, here, to in zip(xy, there, expected, strict=True):
+        for k in np.flatnonzero(here):
+            away = at - at[k]
+            far = np.where(here, away[:, 0] ** 2 + away[:, 1] ** 2, np.inf)
+            far[k] = np.inf
+            others = [far.argmin()]
+            if k < first:  # of its like all that park count, also those that are not among these
+                to[k] = next_of(traffic.parked_xy)[parked[k]]
+                others = [j for j in [first + far[first:].argmin()] if far[j] < to[k, 0] ** 2 + to[k, 1] ** 2]
+            for j in others:
+                to[k] = away[j]
+            if to[k, 0] ** 2 + to[k, 1] ** 2 > NEXT_M**2:
+                to[k] = np.inf
+    found = traffic.next_to(parked, xy, there)
+    for now, (mine, plain) in enumerate(zip(found, expected, strict=True)):
+        assert np.isfinite(plain[there[now]]).mean() > 0.3
+        np.testing.assert_array_equal(mine[there[now]], plain[there[now]])
 
 
 def test_a_car_that_is_alone_has_none_next_to_it() -> None:

@@ -445,8 +445,8 @@ def _scored(agents: Sequence[Any], *sets: str, region: Any = None, own: Any = No
     env, seer, recorder = simpy.Environment(), Seer(), Recorder()
     env.run(until=1.1)
     planned = lambda drone, frame: capture(drone, 1000.0 + frame)  # noqa: E731
-    scorer = Scorer(env, scenario, seer, agents, recorder, planned, own, Nobody(), region)  # type: ignore[arg-type]
-    scorer._score(10)
+    scorer = Scorer(env, scenario, seer, agents, recorder, planned, own, Nobody(), region, [])  # type: ignore[arg-type]
+    scorer._score(10, agents)
     return seer, recorder
 
 
@@ -553,10 +553,10 @@ def test_a_detector_of_many_moments_waits_until_there_are_enough(monkeypatch: py
     env, recorder = simpy.Environment(), Recorder()
     agents = [_agent(d, 0.0, 0.0, Mind()) for d in (0, 1)]
     scenario = example("perception={detector: surrogate}", "fleet.drones=2")
-    scorer = Scorer(env, scenario, All(), agents, recorder, None, None, Nobody(), None)  # type: ignore[arg-type]
+    scorer = Scorer(env, scenario, All(), agents, recorder, None, None, Nobody(), None, [])  # type: ignore[arg-type]
     rows = []
     for _ in range(4):
-        scorer._score(0)
+        scorer._score(0, agents)
         rows.append(len(recorder.rows["fusions"]))
     scorer.flush()
     assert [*rows, len(recorder.rows["fusions"])] == [0, 0, 6, 6, 8]

@@ -392,6 +392,7 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.common_errors": ("unknown", ("policy.name=uncertain-boxes", "policy.params={}")),
     "perception.precision": ("bfloat16", ()),
     "perception.sample_rate_hz": ("5", ()),
+    "perception.egos": ("2", ()),
     "perception.fusion_delay_s": ("0.2", ()),
     "perception.max_age_s": ("0.05", ()),
     "perception.motion_compensation": ("false", ("perception.fusion_delay_s=0.042",)),

@@ -13,7 +13,7 @@ from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli.app import app
 from sortie.sim.engine import needs as module
-from sortie.sim.engine.needs import Needs, ensure_room, needs
+from sortie.sim.engine.needs import Forecast, Needs, ensure_room, needs
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 
@@ -77,14 +77,13 @@ def test_what_is_short_is_said(
     need: Needs, words: str, sure: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     free(monkeypatch, memory=2e9, disk=4e9)
-    monkeypatch.setattr(module, "needs", lambda _: need)
     assert module.shortage(need, tmp_path / "runs/a") == (words, sure)
-    assert ensure_room(scenario(), tmp_path, force=True) == words
+    assert ensure_room(scenario(), need, tmp_path, force=True) == words
     if not sure:
-        assert ensure_room(scenario(), tmp_path) == words
+        assert ensure_room(scenario(), need, tmp_path) == words
         return
     with pytest.raises(RunError) as error:
-        ensure_room(scenario(), tmp_path)
+        ensure_room(scenario(), need, tmp_path)
     assert str(error.value) == f"track_target: {words}; make room, set TMPDIR to another disk, or fly it with --force"
 
 
@@ -110,3 +109,45 @@ def test_fly_refuses_without_force(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     flown = CliRunner().invoke(app, [*asked, "--force"])
     assert flown.exit_code == 0, flown.output
     assert (tmp_path / "run/outcome.json").is_file()
+
+
+def told(seconds: list[tuple[float, float]], begun_s: float = 100.0, **options: int) -> tuple[list[str], list[float]]:
+    """What a forecast says, and what it passes on; by pairs of simulated time and the clock at that time."""
+    lines: list[str] = []
+    passed: list[float] = []
+    times = iter([begun_s, *(wall_s for _, wall_s in seconds)])
+    forecast = Forecast(scenario(60, 1000), lines.append, passed.append, clock=lambda: next(times), **options)
+    for t_s, _ in seconds:
+        forecast(t_s)
+    return lines, passed
+
+
+def test_how_long_a_flight_takes_is_measured_after_its_first_second() -> None:
+    """4 s to make it ready, a cheap first second, then 10 s for each: 4 + 2 + 59 × 10."""
+    seconds = [(0.0, 104.0), (1.0, 106.0), (2.0, 116.0)]
+    words = "1,000 drones for 60 s: about 10 minutes and 1.2 GB of memory on this machine, estimated from the first 2 s"
+    assert told(seconds, memory=int(1.2e9)) == ([words], [0.0, 1.0, 2.0])
+    (words,), _ = told(seconds, flights=30)
+    assert words == "1,000 drones for 30 × 60 s: about 5.0 hours on this machine, estimated from the first 2 s"
+
+
+def test_a_fast_flight_is_measured_for_some_seconds_and_a_short_one_is_not_told_of() -> None:
+    """1 s each, so it is told after 5 s of the clock; at half of that it ends within a minute."""
+    (words,), passed = told([(float(t), 100.0 + 4.0 + t) for t in range(7)])
+    assert words.endswith("about 1 minute on this machine, estimated from the first 6 s")
+    assert len(passed) == 7, "goes on"
+    assert told([(float(t), 100.0 + 0.5 * t) for t in range(60)])[0] == []
+
+
+def test_fly_and_check_tell_how_long_they_take(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(module, "LONG_S", 0.0)
+    monkeypatch.setattr(module, "MEASURED_WALL_S", 0.0)
+    monkeypatch.chdir(tmp_path)
+    short = ["track_target", "--set", "duration_s=3", "--set", "perception.detector=none"]
+    flown = CliRunner().invoke(app, ["fly", *short, "--no-recording", "--out", "run"])
+    assert flown.exit_code == 0, flown.output
+    memory = module._text(needs(scenario(3)).memory)
+    about = f"track_target: 5 drones for 3 s: about 0 minutes and {memory} of memory on this machine"
+    assert f"{about}, estimated from the first 2 s" in flown.stderr
+    checked = CliRunner().invoke(app, ["check", *short])
+    assert "track_target: 5 drones for 3 s: about 0 minutes on this machine, estimated from" in checked.stderr

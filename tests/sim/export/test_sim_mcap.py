@@ -304,6 +304,21 @@ def test_the_boxes_of_a_drone_that_is_down_are_cleared(tmp_path: Path) -> None:
     assert (shown[-1][0] * 1e-9, len(shown[-1][1].markers)) == (pytest.approx(down_s), 1)
 
 
+def test_the_boxes_of_a_drone_that_waits_for_its_turn_are_cleared(tmp_path: Path) -> None:
+    """Five drones, three at a time: at each scored moment the boxes of two are of an earlier time."""
+    turns = run_sortie(example("duration_s=2.1", "perception.detector=surrogate", "perception.egos=3"))
+    write_bag(turns, tmp_path / "turns", BEGIN_NS)
+    bag = read_bag(tmp_path / "turns" / "turns.mcap")
+    fusions = turns.tables["fusions"].to_pylist()
+    scored = {drone: {f["t_s"] for f in fusions if f["drone"] == drone} for drone in range(5)}
+    for drone, own_s in scored.items():
+        shows = {round(t * 1e-9, 6): len(m.markers) > 1 for t, m in bag.get(f"/drone_{drone}/boxes", [])}
+        last = False
+        for t_s in sorted({f["t_s"] for f in fusions}):
+            last = shows.get(round(t_s, 6), last)
+            assert last == (t_s in own_s), (drone, t_s)
+
+
 def test_the_layout_names_topics_of_the_bag_alone(bag: Bag, path: Path) -> None:
     made = json.loads((path / "foxglove_layout.json").read_text("utf-8"))
     assert made == layout(5)

@@ -333,6 +333,7 @@ CHANGED = {
     "perception.fusion": "late",
     "perception.precision": "bfloat16",
     "perception.sample_rate_hz": "1",
+    "perception.egos": "2",
     "perception.fusion_delay_s": "0.01",
     "perception.max_age_s": "0.2",
     "perception.motion_compensation": "false",

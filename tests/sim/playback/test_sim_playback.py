@@ -460,6 +460,20 @@ def test_every_car_in_range_is_found_or_missed_and_every_box_is_a_car_or_false(
     assert 0.25 * 255 < min(reds) < max(reds) < 0.75 * 255
 
 
+def test_a_drone_that_waits_for_its_turn_shows_no_boxes(tmp_path: Path) -> None:
+    """Five drones, three at a time: at each scored moment the boxes of two are of an earlier time."""
+    turns = run_sortie(example("duration_s=2.1", "perception.detector=surrogate", "perception.egos=3"))
+    save_rrd(turns, tmp_path / "turns.rrd")
+    rows, fusions = read(tmp_path / "turns.rrd"), turns.tables["fusions"].to_pylist()
+    for drone in range(5):
+        own_s = {f["t_s"] for f in fusions if f["drone"] == drone}
+        shown = {round(t_s, 6): v for t_s, _, v in rows[f"/world/seen/{drone}/missed"]["Boxes3D:centers"]}
+        last: list[Any] = []
+        for t_s in sorted({f["t_s"] for f in fusions}):
+            last = shown.get(round(t_s, 6), last)
+            assert bool(last) == (t_s in own_s), (drone, t_s)
+
+
 def test_accuracy_is_the_outcome_s_over_the_same_window(rows: Rows, record: SortieRecord) -> None:
     for name, path in (("full_scene", "/plots/ap/full_scene"), ("mission", "/plots/ap/mission")):
         drawn = dict(series(rows, path))
