@@ -81,9 +81,10 @@ Moment = tuple[float, list[Ego]]
 def taking_turns(scenario: Scenario, seed: int, replication: int) -> Iterator[list[int]]:
     """Which drones are scored at each scored moment, by ascending drone: all, or as many as `perception.egos` says.
 
-    They take turns in one random order. Every drone has the same chance at each moment, so the fleet's AP is estimated
-    without bias. Each is scored equally often, so it is estimated more precisely than by drones that are drawn once, or anew
-    at each moment. The order depends on nothing that flies: policies are scored by the same drones at the same moments.
+    They take turns in one random order. Every drone has the same chance at each moment, so what is found, missed and false
+    is estimated without bias. Each is scored equally often, so the estimate is more precise than by drones that are drawn
+    once, or anew at each moment. The order depends on nothing that flies: policies are scored by the same drones at the
+    same moments.
     """
     drones, count = scenario.scorable_drones, scenario.scored_drones
     if scenario.takes_turns:

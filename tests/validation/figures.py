@@ -773,7 +773,7 @@ FIGURES: dict[str, Figure] = {
     "paper": Figure(8, _paper),
     "conditions_first": Figure(8, _conditions_first, network=True),
     "inference_libraries": Figure(2, _inference_libraries, timed=True, network=True),
-    "large_fleets": Figure(12, _large_fleets, timed=True, network=True),
+    "large_fleets": Figure(25, _large_fleets, timed=True, network=True),
     "campaign_scale": Figure(10, _campaign_scale, timed=True),
     "speed": Figure(12, _speed, timed=True),
     "pace": Figure(12, _pace, timed=True),

@@ -1,6 +1,6 @@
 """What scoring a large fleet costs, how precise its accuracy is where drones take turns, and how well its time is estimated.
 
-make figures FIGURE=large_fleets     # a quarter of an hour; `docs/results/speed.md` has the tables
+make figures FIGURE=large_fleets     # 25 minutes; `docs/results/speed.md` has the tables
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def scoring() -> Table:
             spent += [seconds[0] / SCORED_S, (whole_s - seconds[0]) / SCORED_S]
         rows.append([drones, spent[0], spent[2], spent[3]])
     columns = [
-        Column("drones", ","), Column("scoring all", ".2f", " s"), Column("scoring 50 by turns", ".2f", " s"),
+        Column("drones", ",.0f"), Column("scoring all", ".2f", " s"), Column("scoring 50 by turns", ".2f", " s"),
         Column("all else", ".2f", " s"),
     ]  # fmt: skip
     about = f"Processor time for each simulated second, over {SCORED_S:g} s at two scored moments a second; drones in a square, 40 m apart."
@@ -151,7 +151,7 @@ def forecasts() -> Table:
             [drones, duration_s, forecast.measured_s, forecast.takes_s, took_s, forecast.takes_s / took_s - 1.0]
         )
     columns = [
-        Column("drones", ","), Column("flight", "g", " s"), Column("estimated after", "g", " s"), Column("estimate", ".0f", " s"),
+        Column("drones", ",.0f"), Column("flight", "g", " s"), Column("estimated after", "g", " s"), Column("estimate", ".0f", " s"),
         Column("flown in", ".0f", " s"), Column("error", "+.0f", " %", 100),
     ]  # fmt: skip
     return Table(columns, rows, "Processor time, so that other programs on the machine do not count.")

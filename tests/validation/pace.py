@@ -34,7 +34,7 @@ from sortie.sim.engine.sortie import build, fly, run_sortie
 from sortie.sim.results.outcome import outcome
 
 POLICIES = ("worked", "silence")
-FLEETS = ((0.02, (5, 10, 25, 50, 100)), (None, (5, 25, 100, 300, 1000)))
+FLEETS = ((0.02, (5, 10, 25, 50, 100)), (None, (100, 200, 400, 1000)))
 """Metres between neighbours in a square grid of all sizes; None spreads each fleet over `WIDE_KM`. With the sizes."""
 WIDE_KM = 5.0
 SEARCH = "mission.phases=[{at_s: 0, phase: search}]"
