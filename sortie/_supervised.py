@@ -18,7 +18,7 @@ COMMANDS = ("check", "verify")
 _PIPE = "SORTIE_REPORTS_TO"
 _ENDED = b"error: the process ended before the command did; code that it runs must not end the process\n"
 _LINGERED = b"error: the process did not end after the command; code that it runs must not leave a thread behind\n"
-GRACE_S = 5.0
+GRACE_S = 20.0
 """How long a child may go on after its report, s."""
 _LOOK_S = 0.1
 

@@ -89,7 +89,8 @@ def verify(
 
     The options are for policies. A policy is tested on random views, and its properties (*invariants*) are proved.
     Each verdict says what it covers: *proved* for all views of fleets up to a size, *proved over the reals*, *searched*
-    (some of all views), or *drawn* (random views alone). The exit code is also 1 if a property is refuted.
+    (some of all views), or *drawn* (random views alone). The exit code is also 1 if a property is refuted, and 70 or 152
+    if the policy's code does not return and cannot be interrupted.
 
     Invariants about time (`within 0.5 s: …`, `climbs_in(dwell) <= 1`) are tested on sequences of views. What counts is
     what the gates enforce, after staleness rules and damping.
