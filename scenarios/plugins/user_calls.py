@@ -199,11 +199,14 @@ class _Watch:
         self._return()  # from a call that has no limit
 
     def begin(self) -> None:
+        self._process = os.getpid()
         with self._lock:
             self.calling, self._ticks = True, 0
 
     def end(self) -> bool:
-        """Whether the call was late."""
+        """Whether the call was late. A process that the call forked ends here: it must not go on with what the first one does."""
+        if os.getpid() != self._process:
+            _exit(STUCK)
         with self._lock:
             self.calling = False
         self._return()

@@ -72,6 +72,10 @@ def sleeps(view):
 def compiled(view):
     re.match("(a+)+$", "a" * 60 + "b")
 
+def forks(view):
+    os.fork()
+    return []
+
 def place(view):
     sys.exit(0)
 
@@ -119,6 +123,13 @@ def test_a_file_cannot_as_it_loads(tmp_path: Path, line: str) -> None:
     told = r"mine\.py' does not load: ProgramExitError: exit code 0, must return \(mine\.py, line 2\)$"
     with pytest.raises(PolicyError, match=told):
         resolve(f"{tmp_path / 'mine.py'}:decide")
+
+
+def test_a_process_that_a_policy_forks_ends_with_its_call(file: Path) -> None:
+    """It does not go on with the command as a second one."""
+    script = ENDS.format(path=file, name="forks")
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout == "went on\n"
 
 
 def test_what_is_not_a_users_call_may_end(file: Path) -> None:
