@@ -67,7 +67,7 @@ class PeerMemory:
         self._known: dict[int, Descriptor] = {}  # by ascending id
         self.ids: NDArray[np.int64] = np.empty(0, np.int64)
         """Of whom it has a descriptor, itself included, ascending; another array once there is one more."""
-        self._standings = Standings({}, table.heard_s.shape[1])
+        self._standings = Standings({}, table.heard_s.shape[1] if rules.trust else 0)
         self._doubted: frozenset[int] = frozenset()
         self._arrivals: dict[int, list[Arrival]] = {}
         self._judged_at_s = -math.inf

@@ -36,7 +36,7 @@ class Standing(NamedTuple):
 
 
 UNJUDGED = Standing()
-_ROW = np.dtype(
+ROW = np.dtype(
     [("is_there", "?"), ("fine", "?"), ("strikes", "u1"), ("seconds", "i4"), ("unheard", "i4"), ("first_soc", "f8"), ("least_soc", "f8")]
 )  # fmt: skip
 
@@ -45,25 +45,24 @@ class Standings(Mapping[int, Standing]):
     """Standings by id, ascending."""
 
     __slots__ = ("reasons", "rows")
-
-    def __init__(self, of: Mapping[int, Standing], room: int = 0) -> None:
-        """A copy of others, with room for ids below `room` at least."""
-        if isinstance(of, Standings):
-            self.rows = np.zeros(max(room, len(of.rows)), _ROW)
-            self.rows[: len(of.rows)] = of.rows
-            self.rows["least_soc"][len(of.rows) :] = UNJUDGED.least_soc
-            self.reasons = of.reasons.copy()
-        else:
-            self.rows = np.zeros(max([room, *[i + 1 for i in of]]), _ROW)
-            self.rows["least_soc"] = UNJUDGED.least_soc
-            self.reasons = {i: s.reason for i, s in of.items()}
-            for i, s in of.items():
-                self.rows[i] = (True, s.fine, s.strikes, s.seconds, s.unheard, s.first_soc, s.least_soc)
-
     rows: NDArray[np.void]
     """[ids], all values but the reasons."""
     reasons: dict[int, str]
     """Of those who were ever doubted."""
+
+    def __init__(self, of: Mapping[int, Standing], room: int = 0) -> None:
+        """A copy of others, with room for ids below `room` at least."""
+        if isinstance(of, Standings):
+            self.rows = np.zeros(max(room, len(of.rows)), ROW)
+            self.rows[: len(of.rows)] = of.rows
+            self.rows["least_soc"][len(of.rows) :] = UNJUDGED.least_soc
+            self.reasons = of.reasons.copy()
+        else:
+            self.rows = np.zeros(max([room, *[i + 1 for i in of]]), ROW)
+            self.rows["least_soc"] = UNJUDGED.least_soc
+            self.reasons = {i: s.reason for i, s in of.items()}
+            for i, s in of.items():
+                self.rows[i] = (True, s.fine, s.strikes, s.seconds, s.unheard, s.first_soc, s.least_soc)
 
     def __getitem__(self, drone: int) -> Standing:
         if not 0 <= drone < len(self.rows) or not self.rows["is_there"][drone]:

@@ -119,11 +119,8 @@ def judge(
     """
     claims, ids = list(known.values()), np.array(list(known), np.int64)
     after = Standings(standings, int(ids.max(initial=-1)) + 1)
-    # who was not heard for a while drained on: its fall, once it is heard again, is over this second too
-    claimed_soc, flies = (
-        np.array([d.battery_soc for d in claims]),
-        np.array([i not in stations for i in known], np.bool_),
-    )
+    claimed_soc = np.array([d.battery_soc for d in claims])
+    flies = np.array([i not in stations for i in known], np.bool_)
     false_charge, others_fell = charge_loop()(after.rows, ids, claimed_soc, flies, form.soc_step)
     peers = [i for i in known if i != ego]
     cells = dict.fromkeys(peers, NO_CELLS)
@@ -218,7 +215,7 @@ def _count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[
         for k, (d, its, one) in enumerate(zip(claims, cameras, found, strict=True))
         if one is None or one[0] is not d or one[1] != blur_m or (one[2] is not its and one[2] != its)
     ]
-    if len(_COUNTED) + len(new) > _MOST_COUNTED:
+    if len(_COUNTED) + len(new) > max(_MOST_COUNTED, 2 * len(claims)):
         _COUNTED.clear()
     for kind in dict.fromkeys([cameras[k] for k in new]):
         several = [k for k in new if cameras[k] == kind]

@@ -39,7 +39,7 @@ def watch_charge(rows, ids, claimed_soc, flies, soc_step):
     Returns:
         [K], whether a claim is a doubt; and [K], by how much the charge of the others fell since it was first judged.
     """
-    for i in range(len(rows)):
+    for i in range(len(rows)):  # who was not heard drains on: its fall, once it is heard again, is over this second too
         rows[i].seconds += rows[i].is_there
         rows[i].unheard += rows[i].is_there
     fell_per_s = np.empty(len(ids))

@@ -43,7 +43,7 @@ class Brackets:
         self._exact = [(at, _allowed(self._begins[at], limits.get(at, ()))) for at in sorted(exact)]
 
     def of(self, context: Context, link: Link) -> tuple[object, ...]:
-        """What links have in common that break the same lines, and change alike if counts decide (`nearest`)."""
+        """What links have in common that break the same lines, and take the nearest of the same corrections (`nearest`)."""
         places = tuple(map(bisect_right, self._begins, link))
         if not self._tied:
             return (places,)

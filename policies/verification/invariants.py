@@ -23,6 +23,7 @@ Python's parser reads the text. An allow-list of its nodes becomes a frozen tree
 from __future__ import annotations
 
 import ast
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -262,9 +263,12 @@ def _to_node(tree: ast.expr) -> Node:
     match tree:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             try:
-                return Number(float(value))
+                number = float(value)
             except OverflowError:
-                raise InvariantError(f"the number {str(value)[:9]}… is too large") from None
+                number = math.inf
+            if number == math.inf:
+                raise InvariantError("a number is too large for a float")
+            return Number(number)
         case ast.Name(id=word):
             if word in CONSTANTS:
                 return Number(CONSTANTS[word])

@@ -7,6 +7,7 @@ at objects that are as old as these only when very many new ones have been made.
 from __future__ import annotations
 
 import gc
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from time import perf_counter
@@ -21,14 +22,37 @@ NEW_OBJECTS = 10_000
 def cycles_searched_rarely() -> Iterator[None]:
     """Let Python search for cyclic garbage less often than it does by itself, and spare what was there before the flight:
     mostly modules, which stay for good."""
-    before = gc.get_threshold()
-    gc.freeze()
-    gc.set_threshold(max(NEW_OBJECTS, before[0]) if before[0] else 0, *before[1:])  # 0: somebody turned the search off
+    _FLIGHTS.begin()
     try:
         yield
     finally:
-        gc.set_threshold(*before)
-        gc.unfreeze()
+        _FLIGHTS.end()
+
+
+class _Flights:
+    """Those under way in this process: environments fly side by side. The first to begin sets the search, the last to end
+    puts it back."""
+
+    def __init__(self) -> None:
+        self._lock, self._count, self._before = threading.Lock(), 0, gc.get_threshold()
+
+    def begin(self) -> None:
+        with self._lock:
+            self._count += 1
+            if self._count == 1:
+                self._before = new, *rest = gc.get_threshold()
+                gc.set_threshold(max(NEW_OBJECTS, new) if new else 0, *rest)  # 0: somebody turned the search off
+            gc.freeze()
+
+    def end(self) -> None:
+        with self._lock:
+            self._count -= 1
+            if not self._count:
+                gc.set_threshold(*self._before)
+                gc.unfreeze()
+
+
+_FLIGHTS = _Flights()
 
 
 class Leftovers:

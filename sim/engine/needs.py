@@ -21,6 +21,7 @@ from sortie.fleet.coverage import RANGE_M
 from sortie.fleet.flight.motion import shapes_of
 from sortie.fleet.peers import PeerTable
 from sortie.fleet.probes import window_of
+from sortie.fleet.standings import ROW
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.policies.contract import COVERAGE_BYTES
 from sortie.radio.channel.large_fleet import EPOCH
@@ -94,7 +95,7 @@ def needs(scenario: Scenario) -> Needs:
         + OBJECT_FACTOR * batches
         + OUTCOME_BYTES * n * frames
         + SCORED_FLOATS * FLOAT_BYTES * possible["detections"]
-        + PeerTable(1, window_of(scenario.context.detached_after_periods)).pair_bytes * n * n
+        + (PeerTable(1, window_of(scenario.context.detached_after_periods)).pair_bytes + ROW.itemsize) * n * n
         + (LINK_BYTES * n * _neighbours(scenario) if n > SQUARE else 0)
     )
     return Needs(int(memory), int(motion + sure), int(motion + 2 * (sure + more)))
@@ -216,7 +217,7 @@ class Forecast:
             left_s = self._flights * self._scenario.duration_s - t_s
             takes_s = now_s - self._begun_s + left_s * (now_s - since_s) / (t_s - since_t_s)
             self.takes_s, self.measured_s = takes_s, t_s
-            if takes_s >= LONG_S:
+            if takes_s >= LONG_S and left_s > 0.0:
                 self._say(self._words(takes_s, t_s))
 
     def _words(self, takes_s: float, t_s: float) -> str:

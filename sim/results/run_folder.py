@@ -218,8 +218,13 @@ def _is_of_the_run(page: Path) -> bool:
 
 def _scenario_of(path: Path) -> Scenario:
     """The scenario of a run. Packages that offered its models need not be installed."""
+    text = (path / SCENARIO).read_text("utf-8")
     with models_of_the_past():
-        return loads((path / SCENARIO).read_text("utf-8"), source=str(path / SCENARIO))
+        scenario = loads(text, source=str(path / SCENARIO))
+    if scenario.takes_turns and not re.search("^  egos:", text, re.MULTILINE):  # of a version in which all were scored
+        every = scenario.perception.model_copy(update={"egos": scenario.fleet.drones})
+        scenario = scenario.model_copy(update={"perception": every})
+    return scenario
 
 
 def load(path: Path) -> SortieRecord:

@@ -69,6 +69,7 @@ def test_units_stand_in_names() -> None:
         "seed",
         "drones",
         "drone",
+        "egos",
         "peer",
         "cells",
         "cpu_cores",

@@ -102,7 +102,8 @@ def hour() -> dict[str, float]:
     begin_s = time.process_time()
     packs = f"fleet.battery.capacity_wh={LASTING_WH}"
     record = run_sortie(load("track_target", ["perception.detector=none", "duration_s=3600", packs]))
-    assert record.tables["states"].num_rows == 5 * 36_000, "all fly to the end"
+    if not all(record.tables["states"]["airborne"].to_pylist()):
+        raise ValueError(f"packs of {LASTING_WH} Wh do not last for an hour")
     flown_s = time.process_time() - begin_s
     outcome(record)
     return {"flight": flown_s, "outcome": time.process_time() - begin_s - flown_s, "peak_b": peak_b()}

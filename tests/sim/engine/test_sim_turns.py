@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -13,6 +14,7 @@ from sortie.perception.metrics.ap import average_precision
 from sortie.sim.engine.needs import needs
 from sortie.sim.engine.scoring import taking_turns
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.results import run_folder
 from sortie.sim.results.accuracy import both_matched
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
@@ -157,3 +159,14 @@ def test_fewer_boxes_need_less_memory() -> None:
     fleet = ("fleet.drones=200", "perception.detector=surrogate", "duration_s=60")
     every, some = (needs(example(*fleet, f"perception.egos={n}")).memory for n in (200, 50))
     assert every - some > 50e6
+
+
+def test_a_run_of_a_version_without_turns_keeps_what_it_found(tmp_path: Path) -> None:
+    sets = ("fleet.drones=51", "duration_s=0.6", "perception.detector=surrogate", "fleet.formation={shape: grid, spacing_m: 40}")  # fmt: skip
+    record = run_sortie(example(*sets, "perception.egos=51", "mission.phases=[{at_s: 0, phase: search}]"))
+    saved = run_folder.save(record, tmp_path / "run")
+    file = tmp_path / "run" / run_folder.SCENARIO
+    file.write_text(file.read_text().replace("  egos: 51\n", ""))
+    again = run_folder.load(tmp_path / "run")
+    assert again.scenario == record.scenario
+    assert outcome(again)["ap50"] == saved["ap50"]
