@@ -113,14 +113,14 @@ def test_the_key_comes_from_a_file_of_its_owner_alone(tmp_path: Path, monkeypatc
 
 @pytest.fixture(scope="module")
 def attacked() -> LiveResult:
-    """Two drones for three seconds, and a stranger who writes in drone 0's name."""
+    """Two drones for five seconds, and a stranger who writes in drone 0's name."""
     command = [sys.executable, str(Path(dds_attacker.__file__)), str(domain(__name__))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "CYCLONEDDS_URI": LOOPBACK}) as stranger:  # fmt: skip
         try:
             assert stranger.stdout is not None
             assert stranger.stdout.readline() == "listening\n"
             policy = "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}"
-            return fly_live(example("fleet.drones=2", policy), duration_s=3.0, domain=domain(__name__))
+            return fly_live(example("fleet.drones=2", policy), duration_s=5.0, domain=domain(__name__))
         finally:
             stranger.kill()
 
@@ -133,7 +133,7 @@ def test_a_stranger_does_not_silence_a_drone(attacked: LiveResult) -> None:
     assert receiver.refused["payload replayed"] > 0
     assert receiver.refused["descriptor replayed"] > 0
     each_way = [d.payloads_arrived + d.refused.get("payload late", 0) for d in attacked.each]  # a busy host is late
-    assert min(each_way) > 15  # of about 25
+    assert min(each_way) > 25  # of about 45
     assert max(each_way) - min(each_way) < 10  # it was not thinned out either
     text = "\n".join(describe_changes(attacked))
     assert "drone 0: refused a directive unknown key: for drone 1, key id" in text
