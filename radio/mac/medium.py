@@ -95,6 +95,27 @@ class _State:
         self.table: IntArray | None = None
         """Sizes and addresses for `edca.ahead`; None when one of the arrays has become another."""
 
+    def open(
+        self,
+        row: int,
+        kind: int,
+        station: int,
+        flow: int,
+        frames: tuple[int, int, int],
+        access: int,
+        at_ns: int,
+        air_ns: int,
+    ) -> None:
+        """Write a new job's row, which names the one that entered before it; it is due at its station at `at_ns`.
+
+        Args: `frames`: how many, the bytes of each, and of the last one.
+        """
+        count, full_bytes, last_bytes = frames
+        _write_row(
+            self.rows, row * _ROW_BYTES, kind, station, flow, self.entered, count, full_bytes, last_bytes, 0, 1, access, at_ns,
+            0, 0, 0, 0, 0, 0, air_ns, -1,
+        )  # fmt: skip
+
     def copy(self) -> _State:
         """Another one that is equal."""
         return _State(tuple(a.copy() for a in self.arrays), self.jobs, self.now_ns)
@@ -356,11 +377,8 @@ class Medium(Generic[J, F]):
         self._pushes += 1
         if job.deadline_s < inf:
             heappush(self._deadlines, (round(job.deadline_s * 1e9), job.number, self._pushes, job))
-        settled = self._settled
-        _write_row(
-            settled.rows, row * _ROW_BYTES, _DATA, job.sender, job.flow, settled.entered, job.frames, job.full_bytes, job.last_bytes,
-            0, 1, self._payload_access, round(now_s * 1e9), 0, 0, 0, 0, 0, 0, 0, -1,
-        )  # fmt: skip
+        lengths = job.frames, job.full_bytes, job.last_bytes
+        self._settled.open(row, _DATA, job.sender, job.flow, lengths, self._payload_access, round(now_s * 1e9), 0)
 
     def _new_row(self) -> int:
         """A row for a job when none is free: one of those that are finished, or a row more."""
@@ -460,13 +478,10 @@ class Medium(Generic[J, F]):
         """A group frame comes to its station's queue, `in_s` from now."""
         frame.row = row = self._free.pop() if self._free else self._new_row()
         self._at_row[row] = frame
-        length, at_ns = frame.wire_bytes, round((self._env.now + in_s) * 1e9)
+        length, at_ns, air_ns = frame.wire_bytes, round((self._env.now + in_s) * 1e9), round(frame.airtime_s * 1e9)
         stands = self._timer is not None and at_ns > self._planned.now_ns and not self._is_telling
         for state in (self._settled, self._planned) if stands else (self._settled,):
-            _write_row(
-                state.rows, row * _ROW_BYTES, _GROUP, frame.sender, 0, state.entered, 1, length, length, 0, 1,
-                self._group_access, at_ns, 0, 0, 0, 0, 0, 0, round(frame.airtime_s * 1e9), -1,
-            )  # fmt: skip
+            state.open(row, _GROUP, frame.sender, 0, (1, length, length), self._group_access, at_ns, air_ns)
             state.entered = row
         if not stands:  # else the plan ends before the frame comes
             self.replan()

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sortie.scenarios.schema.base import ModelName, Params, Section, inconsistent
+from sortie.scenarios.schema.base import MOST_DRONES, ModelName, Params, Section, inconsistent
 from sortie.scenarios.schema.mission import Target
 
 
@@ -105,7 +105,7 @@ class Perception(Section):
     egos: int = Field(
         50,
         ge=1,
-        le=5000,
+        le=MOST_DRONES,
         description="How many drones are scored at each scored moment. A larger fleet takes turns in a random order; it is scored whole where motion_compensation is false or absent_peers is zeros, as a drone's boxes then depend on where all others are.",
     )
     tracking_rate_hz: float = Field(

@@ -14,7 +14,7 @@ from sortie.scenarios.reading.campaign import read_any
 from sortie.scenarios.reading.load import ScenarioError, campaigns, condition_sets, library
 from sortie.sim.check.junit import Suite, junit
 from sortie.sim.cli import tables
-from sortie.sim.cli.console import bars, err, out, told_of
+from sortie.sim.cli.console import bars, err, line_printer, out
 from sortie.sim.cli.options import SetOption, refuse
 from sortie.sim.folders import ensure_files, write_text
 
@@ -55,7 +55,7 @@ def check(
             with bars() as bar:
                 several = flights(flown)
                 watch = Forecast(
-                    flown, told_of(flown.name), bar(flown.name, flown.duration_s * several), flights=several
+                    flown, line_printer(flown.name), bar(flown.name, flown.duration_s * several), flights=several
                 )
                 (checked,) = sortie.check(name, set_ or [], update=update, progress=watch)
         except SortieError as error:

@@ -12,7 +12,7 @@ out = Console(emoji=False)  # `mine.py:link:` is a file's name
 err = Console(stderr=True, highlight=False, emoji=False)
 
 
-def told_of(name: str) -> Callable[[str], None]:
+def line_printer(name: str) -> Callable[[str], None]:
     """Prints lines about a scenario as errors are printed, above a bar if one is shown."""
     return lambda words: err.print(f"{name}: {words}", soft_wrap=True, markup=False)
 

@@ -16,7 +16,7 @@ from sortie.scenarios.reading.load import ScenarioError, library, load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
-from sortie.sim.cli.console import bars, out, told_of
+from sortie.sim.cli.console import bars, line_printer, out
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded, refuse
 from sortie.sim.cli.view import view
 from sortie.sim.engine.needs import Forecast, ensure_room, needs
@@ -98,11 +98,11 @@ def fly(
         run_folder.ensure_same(path, flown, drawn, number, files)
     need = needs(flown)
     if words := ensure_room(flown, need, path, force=force):
-        told_of(flown.name)(words)
+        line_printer(flown.name)(words)
     if view_ or recording:
         import_module("sortie.sim.playback.recording")  # a missing Rerun is reported before the flight
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
-        ticker = Forecast(flown, told_of(flown.name), bar(flown.name, flown.duration_s), memory=need.memory)
+        ticker = Forecast(flown, line_printer(flown.name), bar(flown.name, flown.duration_s), memory=need.memory)
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
     with settled(path):
         other, note = run_folder.in_place_of(path, flight.fingerprint), ""

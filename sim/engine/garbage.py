@@ -30,8 +30,8 @@ def cycles_searched_rarely() -> Iterator[None]:
 
 
 class _Flights:
-    """Those under way in this process: environments fly side by side. The first to begin sets the search, the last to end
-    puts it back."""
+    """Those under way in this process: environments fly side by side. The first to begin sets how often
+    Python searches, the last to end puts that back."""
 
     def __init__(self) -> None:
         self._lock, self._count, self._before = threading.Lock(), 0, gc.get_threshold()
@@ -49,7 +49,7 @@ class _Flights:
             self._count -= 1
             if not self._count:
                 gc.set_threshold(*self._before)
-                gc.unfreeze()
+            gc.unfreeze()  # also where others fly on: a flight that was left in the middle never ends
 
 
 _FLIGHTS = _Flights()

@@ -30,9 +30,9 @@ def losses_in_words(context: dict[str, Any]) -> str:
 
 
 def turns_in_words(ap50: dict[str, Any]) -> str:
-    """Which drones were scored where they took turns: `, 50 of 1,000 drones at a time`; empty where all were."""
+    """Which drones were scored where they took turns: `, 50 of 1,000 drones scored at a time`; empty where all were."""
     scored, every = ap50["scored_drones"], ap50["scorable_drones"]
-    return f", {scored:,} of {every:,} drones at a time" if 0 < scored < every else ""
+    return f", {scored:,} of {every:,} drones scored at a time" if 0 < scored < every else ""
 
 
 def event_in_words(row: dict[str, Any]) -> str:

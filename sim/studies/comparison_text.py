@@ -73,7 +73,7 @@ def compare_command(
 def heading(flown: Flown) -> str:
     """The scenario, and how many sorties the figures are means of."""
     first = flown.sorties[0].outcome
-    return f"{first['scenario']} · {_seeds(flown)}{turns_in_words(first['ap50']).replace(' at', ' scored at')}"
+    return f"{first['scenario']} · {_seeds(flown)}{turns_in_words(first['ap50'])}"
 
 
 def explanations(flown: Flown) -> Iterator[str]:

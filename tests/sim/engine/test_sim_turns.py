@@ -136,9 +136,9 @@ def test_what_needs_all_boxes_is_null_and_the_outcome_says_who_was_scored(
     traffic = outcome(run_sortie(example("fleet.drones=60", "duration_s=0.2")))["ap50"]
     assert (traffic["scored_drones"], traffic["scorable_drones"]) == (0, 60)
     assert turns_in_words(traffic) == turns_in_words(everyone["ap50"]) == ""
-    assert turns_in_words(turns["ap50"]) == ", 5 of 12 drones at a time"
+    assert turns_in_words(turns["ap50"]) == ", 5 of 12 drones scored at a time"
     (accuracy,) = [c for c in outcome_table(turns).columns[1].cells if "full scene" in str(c) and "fusions" in str(c)]
-    assert f"{turns['ap50']['scored_fusions']} fusions, 5 of 12 drones at a time; the surrogate" in str(accuracy)
+    assert f"{turns['ap50']['scored_fusions']} fusions, 5 of 12 drones scored at a time; the surrogate" in str(accuracy)
 
 
 def test_policies_are_compared_on_the_same_drones_at_the_same_moments() -> None:
@@ -152,7 +152,7 @@ def test_policies_are_compared_on_the_same_drones_at_the_same_moments() -> None:
     assert all(record is not None for record in records)
     assert len({tuple(keys(record.tables["fusions"])) for record in records if record}) == 1
     assert heading(flown).endswith("in this town, this flight, 5 of 12 drones scored at a time")
-    assert "accuracy scored at 2 Hz by `surrogate`, 5 of 12 drones at a time." in comparison_markdown(flown, "x")
+    assert "accuracy scored at 2 Hz by `surrogate`, 5 of 12 drones scored at a time." in comparison_markdown(flown, "x")
 
 
 def test_fewer_boxes_need_less_memory() -> None:
