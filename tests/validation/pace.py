@@ -227,7 +227,10 @@ def short_table(
             rows.append([f"{p.drones:,} drones {where}, policy `{p.policy}`, without a detector", pace])
     full_s = parts_[SCORED] + parts_["outcome"]
     rows += [
-        ["five drones, policy `worked`, scored by the surrogate", f"{120.0 / full_s:.0f} times real time"],
+        [
+            "five drones, policy `worked`, scored by the surrogate, with the outcome",
+            f"{120.0 / full_s:.0f} times real time",
+        ],
         ["such sorties of 120 s in a campaign, two workers", f"{a_minute:.0f} a minute"],
         [
             f"an hour of five drones with packs of {LASTING_WH:,} Wh, without a detector",
