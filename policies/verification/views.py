@@ -200,9 +200,9 @@ def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
 
 
 def _parts(peers: Sequence[int]) -> Iterator[Sequence[int]]:
-    """All peers, then halves of them, quarters and so on, down to each by itself, but no more than some 200 parts."""
-    size = len(peers)
-    while size * LISTED_IDS >= len(peers) > 0:
+    """All peers, then halves of them, quarters and so on, down to each by itself; of very many, down to some 64 parts."""
+    size, most = len(peers), LISTED_IDS if len(peers) <= LISTED_IDS else 64
+    while size * most >= len(peers) > 0:
         yield from (peers[k : k + size] for k in range(0, len(peers), size))
         if size == 1:
             return
