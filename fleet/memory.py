@@ -14,7 +14,7 @@ from sortie.fleet.clock import PeerClocks
 from sortie.fleet.coverage import LOOK_STANDS_S
 from sortie.fleet.gate import Payload
 from sortie.fleet.messages.auth import Dropped, DropReason, Opened
-from sortie.fleet.messages.extensions import MAX_WIDE_MEMBERS, WIDE_FROM
+from sortie.fleet.messages.extensions import WIDE_FROM
 from sortie.fleet.peers import PeerTable, loops
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.probes import Probes, window_of
@@ -30,6 +30,7 @@ from sortie.fleet.trust import (
 )
 from sortie.perception.types import Capture
 from sortie.policies.contract import ROUNDING_PERIODS, Descriptor, FleetView
+from sortie.scenarios.disc import LISTED_MEMBERS
 from sortie.scenarios.representation import MAPS, Representation
 
 _FEATURES, _CODES = Representation.FEATURES, Representation.CODES  # slow to look up, each time
@@ -175,9 +176,9 @@ class PeerMemory:
         list them all."""
         limit_s = (self._rules.detached_after_periods + ROUNDING_PERIODS) * self._period_s
         found = self.ids[(self.ages(now_s) <= limit_s) & (self.ids != self.drone)]
-        if len(found) >= MAX_WIDE_MEMBERS and found[-1] >= WIDE_FROM:
+        if len(found) >= LISTED_MEMBERS and found[-1] >= WIDE_FROM:
             away_m = np.linalg.norm(np.array([self._known[i].position_m for i in found.tolist()]) - here_m, axis=1)
-            found = found[np.argsort(away_m, kind="stable")[: MAX_WIDE_MEMBERS - 1]]
+            found = found[np.argsort(away_m, kind="stable")[: LISTED_MEMBERS - 1]]
         return tuple(sorted([self.drone, *found.tolist()]))
 
     def believed(self) -> list[Descriptor]:

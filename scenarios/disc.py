@@ -10,6 +10,9 @@ AGENT_IDS = 1 << 16
 """How many drone ids there are: an id is two bytes."""
 LISTED_IDS = 200
 """In fleets up to this size a descriptor lists goodput by id; in larger ones to the members of its roster."""
+LISTED_MEMBERS = 128
+"""So many members a roster may have in a larger fleet: their ids and goodputs fit into a descriptor, with 86 B to spare
+for its other sequences and fields."""
 OVERLAP_STEP = 0.1
 """Overlaps are ranked in steps of a tenth, so that a metre of pose jitter does not reorder the peers."""
 

@@ -49,8 +49,6 @@ WIDE_ID = 255
 MAX_WIDE_ID = (1 << 16) - 2
 WIDE_FROM = LISTED_IDS
 """A roster with this id or a higher one is written by its members' ids."""
-MAX_WIDE_MEMBERS = 128
-"""So many ids and goodputs fit into a descriptor, with 86 B to spare for its other sequences and fields."""
 VERSION = 2
 """Of the descriptors that this code writes with a block. Descriptors without one are version 1, the paper's."""
 _HEAD = struct.Struct("<BH")

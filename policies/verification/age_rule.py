@@ -6,13 +6,23 @@ from collections.abc import Iterable, Iterator
 
 from sortie.policies.contract import Directive, FleetView, Representation
 
+MOST_LISTED = 40
+"""A complaint names so many drones or directives at most."""
 
-def older_views(view: FleetView) -> Iterator[tuple[tuple[int, ...], float, FleetView]]:
-    """Views in which one descriptor, or all, are older: whose age is raised, by how many seconds, and the view."""
+
+def older_views(view: FleetView, *, one_by_one: bool = True) -> Iterator[tuple[tuple[int, ...], float, FleetView]]:
+    """Views in which one descriptor, or all, are older: whose age is raised, by how many seconds, and the view.
+
+    Args:
+        view: with the ages that are raised.
+        one_by_one: also each by itself, besides all together.
+    """
+    everyone = tuple(view.age_s)
     for periods in (1.0, 3.5, 10.5, 1000.0):
         add_s = periods * view.period_s
-        for who in [*((i,) for i in view.age_s), tuple(view.age_s)]:
-            yield who, add_s, view._replace(age_s={i: a + add_s * (i in who) for i, a in view.age_s.items()})
+        for i in everyone if one_by_one else ():
+            yield (i,), add_s, view._replace(age_s={**view.age_s, i: view.age_s[i] + add_s})
+        yield everyone, add_s, view._replace(age_s={i: a + add_s for i, a in view.age_s.items()})
 
 
 def without_detached(view: FleetView, older: FleetView) -> FleetView:
@@ -58,6 +68,18 @@ def _rise(old: Directive | None, d: Directive) -> str | None:
 def _rung(d: Directive) -> Representation:
     """Its representation; plain numbers are not ordered by fidelity."""
     return Representation(d.representation) if type(d.representation) is int else d.representation
+
+
+def listed(items: Iterable[object], between: str = ", ") -> str:
+    """Items as text; of more than `MOST_LISTED` the first, and how many more there are.
+
+    Example:
+        >>> listed([3, 1, 2])
+        '3, 1, 2'
+    """
+    texts = [str(item) for item in items]
+    more = len(texts) - MOST_LISTED
+    return between.join(texts[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def by_peer(directives: Iterable[Directive]) -> dict[int, Directive]:

@@ -14,12 +14,12 @@ import statistics
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 
 from sortie.policies.contract import FleetView, Policy
 from sortie.policies.verification.policy_rules import RULES, NoDirectives, Rule, as_tuples, copied, decide
 from sortie.policies.verification.search import BUDGET_S, LEAST_VIEWS, Budget, drawn_budget
+from sortie.policies.verification.subject import with_function
 from sortie.policies.verification.views import draw_views, shrink
 from sortie.scenarios.plugins.user_calls import Guarded, text_of
 from sortie.scenarios.plugins.user_code import load
@@ -123,7 +123,10 @@ def _keeps_no_memory(policy: Policy, views: Sequence[FleetView], budget: Budget)
             first.append(as_tuples(decide(policy, view)))
         order = list(range(len(first)))
         random.Random(len(first)).shuffle(order)  # noqa: S311
-        for instance, what in ((policy, "after other views"), (_loaded_anew(policy), "from the file loaded anew")):
+        for instance, what in (
+            (policy, "after other views"),
+            (with_function(policy, _loaded_anew), "from the file loaded anew"),
+        ):
             for k in order:
                 if as_tuples(decide(instance, few[k])) != first[k]:
                     return Check(name, False, f"the same view gets other directives {what}", few[k])
@@ -133,13 +136,10 @@ def _keeps_no_memory(policy: Policy, views: Sequence[FleetView], budget: Budget)
     return Check(name, True, f"{len(first)}{of_all} views in two orders, and from the file loaded anew")
 
 
-def _loaded_anew(policy: Policy) -> Policy:
-    if isinstance(policy, partial):
-        return partial(_loaded_anew(policy.func), *policy.args, **policy.keywords)
-    if isinstance(policy, Guarded) and policy.source is not None:
-        fresh: Policy = getattr(load(policy.source.file), policy.source.name)
-        return Guarded(fresh, policy.source)
-    return policy
+def _loaded_anew(function: Guarded) -> Policy:
+    if function.source is None:
+        return function
+    return Guarded(getattr(load(function.source.file), function.source.name), function.source)
 
 
 def _decides_in_time(policy: Policy, budget: Budget) -> Check:

@@ -31,6 +31,7 @@ from functools import lru_cache
 from typing import Any
 
 from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.policies.verification.age_rule import listed
 from sortie.policies.verification.words import (
     CHANGES,
     CONSTANTS,
@@ -402,8 +403,9 @@ def just_heard(view: FleetView) -> FleetView:
 
 def describe_directives(directives: Iterable[Directive]) -> str:
     """A short text for each directive."""
-    return "; ".join(
+    texts = (
         f"→{d.destination} {NAME_OF[Representation(d.representation)]} ρ {d.rho:g} {d.rate_hz:g} Hz "
         f"duty {d.duty_percent} % ({d.reason})"
         for d in directives
     )
+    return listed(texts, "; ")

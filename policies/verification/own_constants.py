@@ -15,7 +15,7 @@ from sortie.policies.contract import FleetView
 from sortie.policies.verification.views import LARGEST, LONGEST_S, MAX_DRONES, draw_view
 from sortie.scenarios.streams import stream
 
-MOST_SIZES = 12
+MOST_SIZES = 24
 _SHARES = ("battery_soc", "cpu_headroom", "gpu_headroom")
 _APART = 1_000_000
 """These views are numbered from here on, so that they are others than the drawn ones."""
@@ -37,7 +37,7 @@ def views_at(constants: Iterable[float], seed: int, count: int) -> Iterator[Flee
     whole = [int(c) for c in known if c == int(c)]
     sizes = sorted({size for c in whole for size in (c, c + 1, c + 2) if MAX_DRONES < size <= LARGEST})
     for number, size in enumerate(sizes[:MOST_SIZES]):
-        view = draw_view(seed, _APART + count + number, size)
+        view = draw_view(seed, _APART + count + number, size, 1.0)
         yield view
         ego = next((c for c in whole if c in view.descriptors and c > MAX_DRONES), view.ego)
         if ego != view.ego:

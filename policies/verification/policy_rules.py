@@ -12,7 +12,7 @@ from typing import Any
 from sortie.policies.checks import check_directives, check_reposition, find_wrong_type
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy, PolicyError, Representation
 from sortie.policies.registry import parameters, viewpoint_of
-from sortie.policies.verification.age_rule import by_peer, older_views, raised_part, without_detached
+from sortie.policies.verification.age_rule import by_peer, listed, older_views, raised_part, without_detached
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.invariants import just_heard
 from sortie.policies.verification.subject import searchable
@@ -80,7 +80,7 @@ def _one_directive_per_link(policy: Policy, view: FleetView) -> str | None:
 def missing_links(directives: Iterable[Directive], view: FleetView) -> str | None:
     """A complaint if the directives are not exactly one for each peer."""
     decided, peers = sorted(d.destination for d in directives), list(view.peers)
-    return None if decided == peers else f"directives for {decided}, must be for each of {peers}"
+    return None if decided == peers else f"directives for [{listed(decided)}], must be for each of [{listed(peers)}]"
 
 
 def _gives_reasons(policy: Policy, view: FleetView) -> str | None:

@@ -43,15 +43,34 @@ def with_notes(policy: Policy) -> Policy:
     Raises:
         Exception: what its file raises.
     """
+
+    def noted(function: Guarded) -> Policy:
+        if function.source is None:
+            return function
+        loaded = getattr(load_with_notes(function.source.file), function.source.name)
+        return Guarded(loaded, function.source, shares_lateness=False)
+
+    return with_function(policy, noted)
+
+
+def apart(policy: Policy) -> Policy:
+    """The policy with a limit of time of its own: where it is late, the policy itself does not count as late."""
+    return Guarded(with_function(policy, lambda function: function.__wrapped__), shares_lateness=False)
+
+
+def with_function(policy: Policy, change: Callable[[Guarded], Policy]) -> Policy:
+    """The policy with another function in place of a user's, within its bound parameters and its shield.
+
+    Args:
+        policy: the policy; one of Sortie's own stays as it is.
+        change: from the user's function to the other one.
+    """
     found: Any = policy
     if isinstance(found, functools.partial):
-        return functools.partial(with_notes(found.func), *found.args, **found.keywords)
+        return functools.partial(with_function(found.func, change), *found.args, **found.keywords)
     if isinstance(found, Shielded):
-        return Shielded(with_notes(found.policy), found.rules)
-    if isinstance(found, Guarded) and found.source is not None:
-        function = getattr(load_with_notes(found.source.file), found.source.name)
-        return Guarded(function, found.source, shares_lateness=False)
-    return policy
+        return Shielded(with_function(found.policy, change), found.rules)
+    return change(found) if isinstance(found, Guarded) else policy
 
 
 def _with_checks(source: Source) -> Policy:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sortie.policies.contract import (
+    AGENT_IDS,
     COVERAGE_BYTES,
     DETACHED_AFTER_PERIODS,
     PHASE_NAMES,
@@ -20,10 +21,11 @@ from sortie.policies.contract import (
     Roster,
     TaskPhase,
 )
-from sortie.scenarios.disc import LISTED_IDS
+from sortie.scenarios.disc import LISTED_IDS, LISTED_MEMBERS
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS
 from sortie.scenarios.schema import Scenario, Section
+from sortie.scenarios.schema.base import MOST_DRONES
 from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
@@ -34,8 +36,8 @@ def _most(section: type[Section], field: str) -> Any:
     return next(bound.le for bound in section.model_fields[field].metadata if hasattr(bound, "le"))
 
 
-LARGEST = LISTED_IDS
-"""The largest fleet whose descriptors list goodput to everyone. In larger ones a drone hears its neighbours alone."""
+LARGEST = MOST_DRONES
+"""The largest fleet of a scenario."""
 LONGEST_S = float(_most(Scenario, "duration_s"))
 """The longest sortie."""
 GONE = "detached_after_periods"
@@ -56,7 +58,7 @@ class ViewError(SortieError):
 # --- drawing -------------------------------------------------------------------------------------
 
 
-def draw_view(seed: int, number: int, drones: int | None = None) -> FleetView:
+def draw_view(seed: int, number: int, drones: int | None = None, reach: float | None = None) -> FleetView:
     """View `number` of a seed: 1 to 20 drones, some never heard, some stale, anywhere, in any state.
 
     Half of all numbers are drawn uniformly. The other half are values at which rules often change their decision.
@@ -64,22 +66,27 @@ def draw_view(seed: int, number: int, drones: int | None = None) -> FleetView:
     Args:
         seed: of all its views.
         number: which one.
-        drones: the size of the fleet; left out, it is drawn.
+        drones: the size of the fleet; left out, it is drawn. In one of more than `LISTED_IDS` every drone has a roster.
+        reach: the share of the other drones that the ego has heard, 0 … 1; left out, it is drawn.
     """
     rng = stream(seed, number, (), "verify.view")
     n = int(rng.integers(1, MAX_DRONES + 1)) if rng.random() < 0.5 else int(rng.integers(1, 6))
     n = n if drones is None else drones
     ego = int(rng.integers(n))
-    reach = _one_of(rng, (1.0, 0.7))
+    drawn_reach = _one_of(rng, (1.0, 0.7))
+    reach = drawn_reach if reach is None else reach
     heard = [i for i in range(n) if i == ego or rng.random() < reach]
     rng.shuffle(heard)
     period_s = _one_of(rng, _PERIODS_S)
     spread_m = _one_of(rng, (0.0, 30.0, 100.0, 2000.0))
-    descriptors = {i: _draw_descriptor(rng, i, n, spread_m) for i in heard}
+    listed = n if n <= LISTED_IDS else 1
+    descriptors = {i: _draw_descriptor(rng, i, listed, spread_m) for i in heard}
     age_s = {i: period_s * _mixed(rng, 0.0, 15.0, _SPECIAL_AGE_PERIODS) for i in heard}
     if rng.random() < 0.25:  # two makes of drone in one fleet
         descriptors = {i: d._replace(feature_space=_one_of(rng, ("", "other"))) for i, d in descriptors.items()}
-    if rng.random() < 0.25:  # all agree who is a member, heard by the ego or not
+    if n > LISTED_IDS:
+        descriptors = {i: _with_members(rng, d, heard, n) for i, d in descriptors.items()}
+    elif rng.random() < 0.25:  # all agree who is a member, heard by the ego or not
         members = tuple(i for i in range(n) if i in descriptors or rng.random() < 0.5)
         descriptors = {i: d.with_roster(Roster(int(rng.integers(9)), members)) for i, d in descriptors.items()}
     if rng.random() < 0.25:  # and some codes are of another codebook
@@ -118,6 +125,18 @@ def _draw_descriptor(rng: np.random.Generator, agent_id: int, drones: int, sprea
     )
 
 
+def _with_members(rng: np.random.Generator, d: Descriptor, heard: Sequence[int], drones: int) -> Descriptor:
+    """As in a large fleet: with a roster of those in its own earshot, which the ego may not have heard, and their goodputs."""
+    most = LISTED_MEMBERS - 1
+    others = {heard[k] for k in rng.integers(0, len(heard), _one_of(rng, (0, 8, most))).tolist()}
+    others |= set(rng.integers(0, drones, min(most - len(others), 4)).tolist())
+    members = tuple(sorted({d.agent_id, *others}))
+    count = len(members) - 1
+    special = np.array(_SPECIAL_GOODPUT_MBPS)[rng.integers(0, len(_SPECIAL_GOODPUT_MBPS), count)]
+    goodput_mbps = np.where(rng.random(count) < 0.5, rng.uniform(0.0, 600.0, count), special)
+    return d._replace(peer_goodput_mbps=tuple(goodput_mbps.tolist()), roster=Roster(int(rng.integers(9)), members))
+
+
 def _one_of(rng: np.random.Generator, values: Sequence[Drawn]) -> Drawn:
     """What `rng.choice` draws, without its array."""
     return values[int(rng.integers(len(values)))]
@@ -154,7 +173,7 @@ def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
 
     Args:
         view: a view that fails.
-        fails: whether a view fails; called about twenty times for each drone.
+        fails: whether a view fails; called about twenty times for each drone that is left.
     """
 
     def kept(candidate: FleetView) -> bool:
@@ -165,19 +184,38 @@ def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
         return False
 
     kept(view._replace(detached_after_periods=DETACHED_AFTER_PERIODS))
-    for peer in view.peers:
-        kept(view._replace(descriptors=_without(view.descriptors, peer), age_s=_without(view.age_s, peer)))
-    for i in list(view.descriptors):
-        kept(view._replace(age_s={**view.age_s, i: 0.0}))
+    for _ in range(1 if len(view.peers) <= LISTED_IDS else 2):  # of many peers, parts are left out before single ones
+        for few in _parts(view.peers):
+            kept(view._replace(descriptors=_without(view.descriptors, few), age_s=_without(view.age_s, few)))
+    drones = tuple(view.descriptors)
+    each = [(i,) for i in drones] if len(drones) <= LISTED_IDS else []
+    for few in (drones, *each):  # all at once, which is often enough, then each
+        kept(view._replace(age_s={**view.age_s, **dict.fromkeys(few, 0.0)}))
         for field, plain in _PLAIN.items():
-            kept(view._replace(descriptors={**view.descriptors, i: view.descriptors[i]._replace(**{field: plain})}))
-        flat = (100.0,) * len(view.descriptors[i].peer_goodput_mbps)
-        kept(view._replace(descriptors={**view.descriptors, i: view.descriptors[i]._replace(peer_goodput_mbps=flat)}))
+            if field != "roster" or max(drones) < LISTED_IDS:
+                kept(_with(view, {i: view.descriptors[i]._replace(**{field: plain}) for i in few}))
+        flat = {i: (100.0,) * len(view.descriptors[i].peer_goodput_mbps) for i in few}
+        kept(_with(view, {i: view.descriptors[i]._replace(peer_goodput_mbps=flat[i]) for i in few}))
     return view
 
 
-def _without(mapping: Mapping[int, Any], key: int) -> dict[int, Any]:
-    return {k: v for k, v in mapping.items() if k != key}
+def _parts(peers: Sequence[int]) -> Iterator[Sequence[int]]:
+    """All peers, then halves of them, quarters and so on, down to each by itself; of very many, down to some 64 parts."""
+    size, most = len(peers), LISTED_IDS if len(peers) <= LISTED_IDS else 64
+    while size * most >= len(peers) > 0:
+        yield from (peers[k : k + size] for k in range(0, len(peers), size))
+        if size == 1:
+            return
+        size = (size + 1) // 2
+
+
+def _with(view: FleetView, changed: Mapping[int, Descriptor]) -> FleetView:
+    return view._replace(descriptors={**view.descriptors, **changed})
+
+
+def _without(mapping: Mapping[int, Any], keys: Sequence[int]) -> dict[int, Any]:
+    gone = set(keys)
+    return {k: v for k, v in mapping.items() if k not in gone}
 
 
 # --- JSON ----------------------------------------------------------------------------------------
@@ -228,7 +266,7 @@ def from_json(text: str) -> FleetView:
             raise ViewError(f"drones[{k}].agent_id is {descriptor.agent_id}, which another drone has already")
         descriptors[descriptor.agent_id] = descriptor
         age_s[descriptor.agent_id] = _number(entry, "age_s", f"drones[{k}]", 0.0)
-    ego = _number(data, "ego", "view", 0, 255)
+    ego = _number(data, "ego", "view", 0, AGENT_IDS - 1)
     period_s = _number(data, "period_s", "view", 0.0)
     if period_s == 0:
         raise ViewError("view.period_s is 0, must be above 0")
@@ -254,7 +292,7 @@ def _descriptor(entry: dict[str, Any], where: str) -> Descriptor:
     qx, qy, qz, qw = _numbers(entry, "orientation_xyzw", where, 4)
     return Descriptor(
         stamp_ns=int(_number(entry, "stamp_ns", where)),
-        agent_id=int(_number(entry, "agent_id", where, 0, 255)),
+        agent_id=int(_number(entry, "agent_id", where, 0, AGENT_IDS - 1)),
         position_m=(x_m, y_m, z_m),
         orientation_xyzw=(qx, qy, qz, qw),
         velocity_mps=(vx_mps, vy_mps, vz_mps),

@@ -20,10 +20,11 @@ from sortie.policies.contract import FleetView, Policy
 from sortie.policies.registry import resolve
 from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
 from sortie.policies.verification.invariants import Invariant, InvariantError, parse
-from sortie.policies.verification.proof import DRONES, PLANE, ProofVerdict, prove
+from sortie.policies.verification.proof import DRONES, ProofVerdict, prove
 from sortie.policies.verification.properties import PROMISES
 from sortie.policies.verification.search import BUDGET_S, LEAST_DRAWN_S
 from sortie.policies.verification.shield import check_shieldable
+from sortie.policies.verification.single_view import PLANE
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
 from sortie.policies.verification.views import to_json
 from sortie.scenarios.plugins.reference import Params
@@ -95,7 +96,8 @@ def verify(
     Invariants about time (`within 0.5 s: …`, `climbs_in(dwell) <= 1`) are tested on sequences of views. What counts is
     what the gates enforce, after staleness rules and damping.
 
-    A counterexample is written as a view (JSON), and as a scenario in which the policy meets that view in flight.
+    A counterexample is written as a view (JSON), and as a scenario in which the policy meets that view in flight, if its
+    fleet has at most 200 drones.
     `sortie check` on this scenario fails until the policy is corrected.
     """
     kind, reference = model if len(model) == 2 else ("policy", model[0])

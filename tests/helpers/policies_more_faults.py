@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from random import Random
 
 from policies_corpus import source
@@ -37,9 +38,13 @@ SIZE_LINES = (
 )
 
 
-def size(draw: Random) -> tuple[str, str]:
+FEW = (4, 5, 6, 7, 8, 10, 11, 13, 15, 17, 19, 25, 40, 60, 90)
+MANY = (210, 333, 777, 1500, 2400, 3000, 4100, 4900)
+
+
+def size(draw: Random, sizes: Sequence[int] = FEW) -> tuple[str, str]:
     """A fault that needs more drones than are searched by default; the policy and its line."""
-    n = draw.choice([4, 5, 6, 7, 8, 10, 11, 13, 15, 17, 19, 25, 40, 60, 90])
+    n = draw.choice(sizes)
     if draw.random() < 0.2:
         line, body = draw.choice(SIZE_LINES)
         return source(body), line.replace("N", str(n))

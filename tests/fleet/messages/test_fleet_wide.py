@@ -18,7 +18,6 @@ from sortie.fleet.messages.compact import FULL, Form, encode_compact
 from sortie.fleet.messages.extensions import (
     MAX_DESCRIPTOR_BYTES,
     MAX_WIDE_ID,
-    MAX_WIDE_MEMBERS,
     WIDE_FIELD,
     WIDE_FROM,
     WIDE_ID,
@@ -32,6 +31,7 @@ from sortie.fleet.messages.wire import (
     encode_directive,
 )
 from sortie.policies.contract import Descriptor, Representation, Roster
+from sortie.scenarios.disc import LISTED_MEMBERS
 
 Encode = Callable[[Descriptor], bytes]
 ENCODERS: list[Encode] = [
@@ -49,9 +49,7 @@ AGENT_AT = 12
 @st.composite
 def wide_descriptors(draw: st.DrawFn) -> Descriptor:
     members = draw(
-        st.sets(st.integers(0, MAX_WIDE_ID), min_size=1, max_size=MAX_WIDE_MEMBERS).filter(
-            lambda m: max(m) >= WIDE_FROM
-        )
+        st.sets(st.integers(0, MAX_WIDE_ID), min_size=1, max_size=LISTED_MEMBERS).filter(lambda m: max(m) >= WIDE_FROM)
     )
     goodput = draw(st.lists(st.floats(0, 1000, width=32), min_size=len(members) - 1, max_size=len(members) - 1))
     roster = Roster(draw(st.integers(0, 2**32 - 1)), tuple(sorted(members)))
@@ -88,9 +86,9 @@ def test_a_reader_that_does_not_know_the_field_takes_the_drone_for_no_other(
 
 
 def test_the_largest_list_leaves_room_for_the_other_fields() -> None:
-    members = tuple(range(1000, 1000 + MAX_WIDE_MEMBERS))
+    members = tuple(range(1000, 1000 + LISTED_MEMBERS))
     d = WIDE._replace(
-        agent_id=1000, roster=Roster(2**32 - 1, members), peer_goodput_mbps=(1.0,) * (MAX_WIDE_MEMBERS - 1),
+        agent_id=1000, roster=Roster(2**32 - 1, members), peer_goodput_mbps=(1.0,) * (LISTED_MEMBERS - 1),
         feature_space="n" * 32, codebook="ab" * extensions._DIGEST_BYTES, priority_target_ids=(1, 2, 3),
     )  # fmt: skip
     data = encode_descriptor(d)

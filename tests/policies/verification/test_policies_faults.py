@@ -12,13 +12,15 @@ from random import Random
 import pytest
 from policies_corpus import LINE
 from policies_faults import sliver, unreached, whole
-from policies_more_faults import KEEPERS, kept, memory, returned, size, stand_in
+from policies_more_faults import KEEPERS, MANY, kept, memory, returned, size, stand_in
 
 from sortie.policies.contract import FleetView
 from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.own_constants import views_at
 from sortie.policies.verification.proof import PROVED, ProofVerdict, prove
+from sortie.policies.verification.single_view import check_property, property_of
+from sortie.policies.verification.views import LARGEST, draw_view
 from sortie.scenarios.plugins.user_calls import ProgramExitError
 
 pytestmark = [
@@ -94,6 +96,22 @@ def test_every_memory_is_noticed(tmp_path: Path) -> None:
 def test_faults_of_large_fleets_are_found_by_drawn_views(tmp_path: Path) -> None:
     for seed in ALL:
         check_size(tmp_path, seed)
+
+
+@pytest.mark.slow
+def test_faults_beyond_200_drones_are_found_by_drawn_views(tmp_path: Path) -> None:
+    """Of generated ones that show where 5,000 drones all hear each other."""
+    everyone = draw_view(8, 0, LARGEST, 1.0).frozen
+    found = 0
+    for seed in ALL[:12]:
+        text, line = size(Random(seed), MANY)
+        path = tmp_path / "policy.py"
+        path.write_text(text)
+        property_ = property_of(parse(line)[0])
+        if check_property(property_, resolve(f"{path}:decide"), everyone) is not None:
+            assert verdicts(tmp_path, text, line, views=20)[-1].outcome == "refuted", f"{line}\n{text}"
+            found += 1
+    assert found > 5
 
 
 def test_a_fault_of_one_drone_among_many_is_found(tmp_path: Path) -> None:

@@ -111,8 +111,8 @@ def test_a_policy_that_reads_the_text_of_its_numbers_is_not_proved(name: str) ->
     assert verdict.outcome == "drawn"
     assert verdict.what == (
         "Cannot analyse: it uses the text of battery_soc of drone 0 for more than a reason. To make it provable: put "
-        "numbers into the reason alone; 20 drawn views of up to 20 drones, 25 at the policy's own constants and 2 views "
-        "of 200 drones keep it"
+        "numbers into the reason alone; 20 drawn views of up to 20 drones, 25 at the policy's own constants, 2 of 200 "
+        "drones and 2 of 5,000 keep it"
     )
 
 

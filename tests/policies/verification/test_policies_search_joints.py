@@ -38,11 +38,12 @@ from sortie.policies.verification.invariants import WORDS, Scope
 from sortie.policies.verification.kept import fingerprint
 from sortie.policies.verification.notes import are_alike, load_with_notes, noted, taking_notes
 from sortie.policies.verification.outside import Outside
-from sortie.policies.verification.proof import PLANE, RepeatableView, check_property, prove
+from sortie.policies.verification.proof import prove
 from sortie.policies.verification.ranges import FleetOfRanges
 from sortie.policies.verification.search import Run as OneRun
 from sortie.policies.verification.search import rosters
 from sortie.policies.verification.shield import Shielded, shield
+from sortie.policies.verification.single_view import PLANE, RepeatableView, check_property
 from sortie.policies.verification.solver import solver_paths
 from sortie.policies.verification.subject import own_invariants, searchable, with_notes
 from sortie.policies.verification.symbols import Path as Run

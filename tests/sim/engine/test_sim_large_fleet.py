@@ -10,12 +10,11 @@ from sim_examples import example
 
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import DropReason, Opened
-from sortie.fleet.messages.extensions import MAX_WIDE_MEMBERS
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
 from sortie.fleet.peers import PeerTable
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.policies.contract import Descriptor, Roster
-from sortie.scenarios.disc import LISTED_IDS
+from sortie.scenarios.disc import LISTED_IDS, LISTED_MEMBERS
 from sortie.scenarios.errors import SortieError
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.messages import descriptors
@@ -101,9 +100,9 @@ def test_who_hears_more_than_a_descriptor_can_list_lists_the_nearest() -> None:
         return memory.members(0.1, here_m)
 
     many = members(range(100, 400), 300)
-    half = (MAX_WIDE_MEMBERS - 1) // 2
-    assert many[:-1] == tuple(range(300 - half - 1, 300 + half + 1))[: MAX_WIDE_MEMBERS - 1]
-    assert len(many) == MAX_WIDE_MEMBERS
+    half = (LISTED_MEMBERS - 1) // 2
+    assert many[:-1] == tuple(range(300 - half - 1, 300 + half + 1))[: LISTED_MEMBERS - 1]
+    assert len(many) == LISTED_MEMBERS
     assert 300 in many
     assert members(range(LISTED_IDS), 30) == tuple(range(LISTED_IDS))
 

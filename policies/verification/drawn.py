@@ -1,0 +1,123 @@
+"""Drawn views on which every property is tried that no search refuted, up to the largest fleet that a scenario may have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+from sortie.policies.contract import FleetView, Policy
+from sortie.policies.verification.courses import constants_of
+from sortie.policies.verification.invariants import Invariant
+from sortie.policies.verification.own_constants import views_at
+from sortie.policies.verification.search import LEAST_VIEWS, Budget, Stopped, drawn_budget
+from sortie.policies.verification.single_view import PLANE, Property, RepeatableView, check_property, complaint_of
+from sortie.policies.verification.subject import apart
+from sortie.policies.verification.views import LARGEST, MAX_DRONES, draw_view, shrink
+from sortie.scenarios.disc import LISTED_IDS
+from sortie.scenarios.plugins.user_calls import TookTooLongError, watched
+
+TRIED_VIEWS = 1000
+TRIED_AT_CONSTANTS = 200
+"""At most so many views more have the numbers of the policy's own code."""
+TRIED_LISTED = 2
+"""Drawn views of the largest fleet in which descriptors list goodput to everyone."""
+TRIED_LARGEST = (0.02, 1.0)
+"""Drawn views of the largest fleet, each with the share of the others that the ego hears."""
+LARGE_S = 3.0
+"""A policy that takes longer for a decision in a fleet that large is not tried there. A flight would take hours."""
+
+
+class Drawn:
+    """Drawn views and what the policy decides on them, each decision made once."""
+
+    def __init__(self, policy: Policy, rules: Sequence[Invariant], seed: int, count: int) -> None:
+        self._policy, self._apart, self._count = policy, apart(policy), count
+        own = list(views_at(constants_of(policy, rules), seed, min(count, TRIED_AT_CONSTANTS)))
+        self._own = len(own)
+        views = [
+            *(draw_view(seed, number) for number in range(count)),
+            *(draw_view(seed, count + number, LISTED_IDS) for number in range(TRIED_LISTED if count else 0)),
+            *own,
+            *(
+                _largest(seed, count + TRIED_LISTED + k, heard)
+                for k, heard in enumerate(TRIED_LARGEST if count else ())
+            ),
+        ]
+        # large ones by size: where a policy is too slow, it was tried on the smaller ones
+        self._views = sorted(views, key=lambda view: max(len(view.descriptors), LISTED_IDS))
+        self._answers: dict[int, Any] = {}
+        self._late = 0
+        """The size of the first large fleet in which the policy gave no answer in time."""
+
+    def _text(self, tried: int) -> str:
+        """How many views were tried, in words."""
+        if tried < len(self._views):
+            late = f"; no answer within {LARGE_S:g} s where {self._late} drones are heard" if self._late else ""
+            return f"{tried} of {len(self._views)} drawn views keep it{late}"
+        if not self._views:
+            return "no drawn views"
+        own = f", {self._own} at the policy's own constants" if self._own else ""
+        return (
+            f"{self._count} drawn views of up to {MAX_DRONES} drones{own}, {TRIED_LISTED} of {LISTED_IDS} drones and "
+            f"{len(TRIED_LARGEST)} of {LARGEST:,} keep it"
+        )
+
+    def first_faults(
+        self, properties: Sequence[Property], budget_s: float
+    ) -> dict[Property, tuple[FleetView | None, str]]:
+        """Of each property the first view on which it fails, made smaller, or None, and how many views keep it, in words."""
+        ordered = sorted(
+            properties, key=lambda p: p is PLANE[1]
+        )  # raised ages cost most: last, they get what others leave
+        shares = drawn_budget(budget_s).shares(len(ordered))
+        return {prop: self._first_fault(prop, share) for prop, share in zip(ordered, shares, strict=True)}
+
+    def _first_fault(self, prop: Property, budget: Budget) -> tuple[FleetView | None, str]:
+        for number, view in enumerate(self._views):
+            if number >= LEAST_VIEWS and budget.is_spent:
+                return None, self._text(number)
+            shown = RepeatableView(view)
+            now = shown.now()
+
+            has_end = number >= LEAST_VIEWS
+            cut = list[FleetView]()  # a view with many ages takes many decisions
+
+            def ask(other: FleetView, /, has_end: bool = has_end, cut: list[FleetView] = cut) -> Any:
+                if has_end and budget.is_spent:
+                    cut.append(other)
+                    raise Stopped
+                if len(other.descriptors) <= LISTED_IDS:
+                    return self._policy(other)
+                try:
+                    with watched(LARGE_S):
+                        return self._apart(other)
+                except TookTooLongError as late:
+                    self._late = self._late or len(other.descriptors)
+                    cut.append(other)
+                    raise Stopped from late
+
+            def fails(other: FleetView, ask: Policy = ask, cut: list[FleetView] = cut) -> bool:
+                return not budget.is_spent and check_property(prop, ask, other) is not None and not cut
+
+            def decide(other: FleetView, /, now: FleetView = now, number: int = number, ask: Policy = ask) -> Any:
+                if other is not now:
+                    return ask(other)
+                if number not in self._answers:
+                    self._answers[number] = ask(now)
+                return self._answers[number]
+
+            complaint = complaint_of(prop, decide, shown)
+            if cut:
+                return None, self._text(number)
+            if complaint is not None:
+                if check_property(prop, self._policy, view) is None:
+                    return view.frozen, ""  # it fails only sometimes: it is not the same for the same view
+                return shrink(view, fails), ""
+        return None, self._text(len(self._views))
+
+
+@lru_cache(maxsize=len(TRIED_LARGEST))
+def _largest(seed: int, number: int, heard: float) -> FleetView:
+    """A view of the largest fleet, frozen: each policy is tried on the same one."""
+    return draw_view(seed, number, LARGEST, heard).frozen

@@ -1,0 +1,126 @@
+"""The properties that a single view decides: the plane's two, and those that invariants state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sortie.policies.checks import check_directives, find_inexact, find_wrong_type
+from sortie.policies.contract import Directive, FleetView, Policy, PolicyError
+from sortie.policies.verification.age_rule import listed, older_views, raised_part, without_detached
+from sortie.policies.verification.invariants import Invariant, describe_directives, just_heard, violations
+from sortie.policies.verification.policy_rules import missing_links
+from sortie.policies.verification.views import MAX_DRONES
+from sortie.scenarios.plugins.user_calls import text_of
+
+
+@dataclass(frozen=True, slots=True)
+class Property:
+    """A property to prove: a function that returns a complaint about a policy on a view, or None."""
+
+    name: str
+    complaint: Callable[[Policy, Any], str | None]
+
+
+class RepeatableView:
+    """Produces a plain view any number of times: as it is, at age 0, or older."""
+
+    def __init__(self, plain: FleetView, raised: Mapping[int, float] | None = None) -> None:
+        self._plain, self._raised = plain.frozen, raised
+
+    def now(self) -> FleetView:
+        """The view itself, which can only be read."""
+        return self._plain
+
+    def just_heard(self) -> FleetView:
+        """The view with every age 0."""
+        return just_heard(self._plain).frozen
+
+    def older(self) -> Iterator[FleetView]:
+        """The view with raised ages, a few of all raises; in a large fleet of all drones at once alone."""
+        if self._raised is not None:
+            yield self._plain._replace(age_s=dict(self._raised)).frozen
+        for _, _, older in older_views(self._plain, one_by_one=len(self._plain.age_s) <= MAX_DRONES):
+            yield older.frozen
+
+
+def keeps_contract(policy: Policy, view: Any) -> str | None:
+    """Bounds, and one directive per link."""
+    directives = policy(view.now())
+    try:
+        check_directives(directives, view.now())
+    except PolicyError as error:
+        return str(error)
+    return missing_links(directives, view.now())
+
+
+def only_falls_with_age(policy: Policy, view: Any) -> str | None:
+    """Raising any ages raises no directive's representation, budget or rate (`policy_rules.age_monotone`)."""
+    before = _exactly(policy(view.now()))
+    for older in view.older():
+        after = policy(older)
+        if raised_part(before, after) is None:
+            continue
+        raised = raised_part(before, after, policy(without_detached(view.now(), older)))
+        if raised is not None:
+            ages = listed(f"{i}: {a!r}" for i, a in sorted(older.age_s.items()))
+            return f"with ages raised to {ages} s, {raised}"
+    return None
+
+
+def _exactly(answer: Any) -> list[Directive]:
+    """An answer whose directives cannot read differently than they are.
+
+    Raises:
+        PolicyError: it is no list or tuple of exactly `Directive`, or a field is of a type of the policy's own.
+    """
+    wrong = find_inexact(answer)
+    if wrong is not None:
+        raise PolicyError(wrong)
+    return list(answer)
+
+
+def property_of(invariant: Invariant) -> Property:
+    """An invariant as a property to prove."""
+
+    def complaint(policy: Policy, view: Any) -> str | None:
+        directives = _exactly(policy(view.now()))
+        fresh = _exactly(policy(view.just_heard())) if invariant.needs_fresh else []
+        for broken in violations(invariant, view.now(), directives, fresh):
+            return f"decided {describe_directives(directives if broken is None else [broken])}"
+        return None
+
+    return Property(invariant.text, complaint)
+
+
+PLANE: tuple[Property, ...] = (
+    Property("contract: bounds, one directive per link", keeps_contract),
+    Property("age-monotone: older descriptors raise no representation, budget or rate", only_falls_with_age),
+)
+"""The properties that every policy must have, besides its invariants."""
+
+
+def check_property(
+    prop: Property, policy: Policy, view: FleetView, raised: Mapping[int, float] | None = None
+) -> str | None:
+    """The complaint of a property about a policy on one plain view. An exception is a complaint."""
+    return complaint_of(prop, policy, RepeatableView(view, raised))
+
+
+def complaint_of(prop: Property, policy: Policy, view: RepeatableView) -> str | None:
+    try:
+        return prop.complaint(policy, view)
+    except Exception as error:
+        return _invalid_directive(policy, view.now()) or f"raises {type(error).__name__}: {text_of(error, str)}"
+
+
+def _invalid_directive(policy: Policy, view: FleetView) -> str | None:
+    """The first invalid directive in the policy's output, as text; None if that is not the cause of an exception."""
+    try:
+        answer = policy(view)
+        if type(answer) not in (list, tuple):  # others may never end
+            return find_inexact(answer)
+        return next((wrong for d in answer if (wrong := find_wrong_type(d)) is not None), None)
+    except Exception:
+        return None

@@ -1,0 +1,172 @@
+"""Drawn views of fleets of up to 5,000 drones: what is in them, faults that only they show, and policies that are slow there."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
+from sortie.policies.contract import Directive, FleetView
+from sortie.policies.registry import resolve
+from sortie.policies.verification import drawn
+from sortie.policies.verification.age_rule import MOST_LISTED, listed
+from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.own_constants import views_at
+from sortie.policies.verification.proof import ProofVerdict, prove
+from sortie.policies.verification.views import LARGEST, draw_view, from_json, shrink, to_json
+from sortie.scenarios.disc import LISTED_IDS, LISTED_MEMBERS
+from sortie.scenarios.plugins.user_calls import TookTooLongError, watched
+from sortie.scenarios.schema.base import MOST_DRONES
+
+ALL = draw_view(3, 0, LARGEST, 1.0)
+FEW = draw_view(3, 1, LARGEST, 0.02)
+
+
+def verdicts(folder: Path, code: str, line: str = "rate_hz <= 10") -> list[ProofVerdict]:
+    """Of a policy that computes `rate_hz` by some lines of code."""
+    path = folder / "policy.py"
+    path.write_text(
+        "from sortie import Directive\n"
+        "def decide(view):\n"
+        f"    {code}\n"
+        "    return [Directive(view.ego, p, rate_hz=rate_hz, reason='r') for p in view.peers]\n"
+    )
+    return prove(resolve(f"{path}:decide"), parse(line), max_drones=2, views=10)
+
+
+def test_the_largest_views_are_of_the_largest_fleet_that_a_scenario_may_have() -> None:
+    assert LARGEST == MOST_DRONES == len(ALL.descriptors)
+    assert 50 < len(FEW.descriptors) < 150
+    assert max(FEW.descriptors) > 4500
+
+
+@pytest.mark.parametrize("view", [ALL, FEW])
+def test_drones_of_a_large_fleet_have_rosters_as_in_flight(view: FleetView) -> None:
+    """They fit into a descriptor, and are read again from it."""
+    sizes = set()
+    for i, d in list(view.descriptors.items())[:200]:
+        assert d.roster is not None
+        assert i in d.roster.members
+        assert len(d.peer_goodput_mbps) == len(d.roster.members) - 1
+        sizes.add(len(d.roster.members))
+        again = decode_descriptor(encode_descriptor(d._replace(priority_target_ids=())))
+        assert (again.agent_id, again.roster) == (i, d.roster)
+    assert min(sizes) < 8
+    assert max(sizes) <= LISTED_MEMBERS
+    rosters = [d.roster for d in view.descriptors.values() if d.roster is not None]
+    assert any(set(r.members) - view.descriptors.keys() for r in rosters) or view is ALL
+    assert any(len(view.descriptors.keys() & set(r.members)) > 30 for r in rosters)
+
+
+def test_a_view_of_high_ids_survives_json() -> None:
+    assert from_json(to_json(FEW)) == FEW
+
+
+def test_a_large_view_is_shrunk_by_halves() -> None:
+    tried = []
+
+    def fails(view: FleetView) -> bool:
+        tried.append(len(view.descriptors))
+        return 4321 in view.descriptors
+
+    small = shrink(ALL, fails)
+    assert set(small.descriptors) == {ALL.ego, 4321}
+    assert len(tried) < 300
+    assert small.descriptors[4321].roster == ALL.descriptors[4321].roster, "without it such an id would not be listed"
+    large = shrink(ALL, lambda view: len(view.peers) >= 1234)
+    assert 1234 <= len(large.peers) < 1300, "of thousands that matter, not each is tried by itself"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "rate_hz = 20.0 if len(view.peers) > 3000 else 2.0",
+        "rate_hz = 20.0 if any(p > 4000 for p in view.peers) else 2.0",
+        "rate_hz = 20.0 if len(view.peers) == 777 else 2.0",
+        "rate_hz = 20.0 if view.me and view.me.roster and len(view.me.roster.members) < 60 < len(view.peers) else 2.0",
+    ],
+)
+def test_faults_of_fleets_beyond_200_drones_are_found(tmp_path: Path, code: str) -> None:
+    verdict = verdicts(tmp_path, code)[-1]
+    assert verdict.outcome == "refuted"
+    assert verdict.counterexample is not None
+    assert len(verdict.what) < 100
+
+
+def test_a_complaint_about_thousands_of_links_names_the_first(tmp_path: Path) -> None:
+    path = tmp_path / "policy.py"
+    path.write_text(
+        "from sortie import Directive\n"
+        "def decide(view):\n"
+        "    said = [Directive(view.ego, p, rate_hz=1.0, reason='r') for p in view.peers]\n"
+        "    return said[: len(said) // 1000 * 1000] if len(said) >= 1000 else said\n"
+    )
+    contract = prove(resolve(f"{path}:decide"), max_drones=2, views=10)[0]
+    assert contract.outcome == "refuted"
+    assert contract.what.startswith("directives for [")
+    assert " more], must be for each of [" in contract.what
+    assert len(contract.what) < 1000
+    assert listed(range(MOST_LISTED + 2)).endswith(f"{MOST_LISTED - 1} and 2 more")
+
+
+def test_views_at_constants_reach_the_largest_fleet() -> None:
+    sizes = {len(view.descriptors) for view in views_at({0.5, 1000.0, LARGEST - 1.0, 1e6}, 0, 4)}
+    assert sizes >= {1000, 1001, 1002, LARGEST - 1, LARGEST}
+    assert max(sizes) == LARGEST
+
+
+def test_slowness_in_a_large_fleet_is_no_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The verdict says where there was no answer, and the policy can still be asked about other views."""
+    monkeypatch.setattr(drawn, "LARGE_S", 0.2)
+    path = tmp_path / "policy.py"
+    path.write_text(
+        "import time\n"
+        "from sortie import Directive\n"
+        "def decide(view):\n"
+        "    while len(view.peers) > 400:\n"
+        "        time.sleep(0.01)\n"
+        "    return [Directive(view.ego, p, rate_hz=2.0, reason='r') for p in view.peers]\n"
+    )
+    policy = resolve(f"{path}:decide")
+    with watched(5.0):
+        found = prove(policy, parse("rate_hz <= 10"), max_drones=1, views=10)
+        assert len(policy(FEW.frozen)) == len(FEW.peers)
+    for verdict in found:
+        assert verdict.outcome != "refuted"
+        assert "views keep it; no answer within 0.2 s where 40" in verdict.what
+
+
+def test_slowness_up_to_200_drones_is_one(tmp_path: Path) -> None:
+    path = tmp_path / "policy.py"
+    path.write_text(
+        "import time\n"
+        "def decide(view):\n"
+        f"    while len(view.peers) > {LISTED_IDS // 2}:\n"
+        "        time.sleep(0.01)\n"
+        "    return []\n"
+    )
+    policy = resolve(f"{path}:decide")
+    with watched(0.3), pytest.raises(TookTooLongError):
+        policy(draw_view(1, 1, LISTED_IDS, 1.0).frozen)
+
+
+def test_a_registered_policy_is_interrupted_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawn, "LARGE_S", 0.3)
+    begin_s = time.monotonic()
+    contract = prove(resolve("deputies"), max_drones=1, views=2)[0]
+    assert contract.outcome == "proved"
+    assert "no answer within 0.3 s where 5000 drones are heard" in contract.what
+    assert time.monotonic() - begin_s < 60
+
+
+def decide(view: FleetView) -> list[Directive]:
+    return [Directive(view.ego, p, rate_hz=2.0, reason="r") for p in view.peers]
+
+
+def test_a_verdict_names_the_sizes() -> None:
+    assert prove(decide, max_drones=1, views=5)[0].what.endswith(
+        "5 drawn views of up to 20 drones, 5 at the policy's own constants, 2 of 200 drones and 2 of 5,000 keep it"
+    )
+    assert prove(decide, max_drones=1, views=0)[0].what.endswith("; no drawn views")
