@@ -11,10 +11,11 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, Representation
-from sortie.policies.verification import shield as shield_module
+from sortie.policies.verification import shield_together
 from sortie.policies.verification.invariants import parse, violations
 from sortie.policies.verification.nearest import nearest
-from sortie.policies.verification.shield import MARK, MOST_CHANGES, enforce
+from sortie.policies.verification.shield import MARK, enforce
+from sortie.policies.verification.shield_together import MOST_CHANGES
 
 RUNGS, RATES_HZ, WEIGHTS = (0, 1, 2), (0.0, 2.0, 5.0, 10.0), (0.2, 1.0)
 CANNOT = f"{MARK}cannot keep "
@@ -171,7 +172,7 @@ def test_lines_that_exclude_each_other_on_a_link_are_kept_by_one_link_each(monke
         tries.append(args)
         return nearest(*args)
 
-    monkeypatch.setattr(shield_module, "nearest", counted)
+    monkeypatch.setattr(shield_together, "nearest", counted)
     decided = [link(peer, 2, 10.0 + 0.5 * peer) for peer in range(1, 20)]
     directives = shielded([f"any_link(rate_hz == {hz})" for hz in range(1, 11)], decided)
     changed = [d for d, before in zip(directives, decided, strict=True) if d != before]
