@@ -52,7 +52,7 @@ class Air:
     """The channel that a fleet shares: takes bytes and positions, returns what happened to each sample.
 
     Args:
-        env: the clock.
+        env: the clock; on an `EventLoop` (`sortie.radio.event_loop`) it is fastest.
         settings: see `sortie.radio.settings.AirSettings`.
         positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
         seed, replication: as in `sortie.scenarios.streams.stream`.
