@@ -44,4 +44,4 @@ class EventLoop(simpy.Environment):
 
 
 # the time is read several times an event, and a slot is read faster than SimPy's property
-EventLoop.now = EventLoop.__dict__["_now"]  # type: ignore[misc]
+EventLoop.now = EventLoop.__dict__["_now"]  # type: ignore[method-assign]

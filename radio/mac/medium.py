@@ -16,7 +16,7 @@ from functools import cache
 from heapq import heappop, heappush
 from math import inf, nan
 from struct import Struct
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import simpy
@@ -43,8 +43,8 @@ ENERGY_OVER_PREAMBLE_DB = 20.0
 """A frame of which a station has missed the begin is sensed by its energy, if it is so much above the weakest preamble."""
 FAINT_DB = 3.0
 """A link is faint if its highest fade stays so far below the weakest preamble."""
-_NS = 1e-9
-_AHEAD_NS = 100_000_000
+_NS: Final = 1e-9
+_AHEAD_NS: Final = 100_000_000
 """A plan goes no further than this; frames of the flight change the links as often."""
 _LAST = EventPriority(2)
 """After everything else of the same instant."""
@@ -164,6 +164,7 @@ class Medium(Generic[J, F]):
         self._deadlines: list[tuple[int, int, int, J]] = []
         self._pushes = 0
         self._e = e = _edca()
+        self._ahead = e.ahead
         self._begin_s = env.now
         self._timer: simpy.Event | None = None
         self._skip_to = env.skip_to if isinstance(env, EventLoop) else None
@@ -573,7 +574,7 @@ class Medium(Generic[J, F]):
         until = since + _AHEAD_NS
         if deadlines and deadlines[0][0] < until:
             until = deadlines[0][0] if deadlines[0][0] > since else since
-        ahead = self._e.ahead
+        ahead = self._ahead
         table = self._make_table() if settled.table is None else settled.table
         reached, told = ahead(table, settled.entered, since, until)
         settled.entered = self._planned.entered = -1
@@ -654,12 +655,14 @@ class Medium(Generic[J, F]):
         return min(1.0, plain_sum(self._busy_s()) / elapsed) if elapsed > 0 else 0.0
 
 
-_T_GROUP = 0
+_T_GROUP: Final = 0
 """As `edca.T_GROUP`."""
-_GROUP, _DATA = 1, 2
+_GROUP: Final = 1
+_DATA: Final = 2
 """As in `edca`."""
 _write_row, _read_figures = Struct("19q").pack_into, Struct("5q").unpack_from
-_ROW_BYTES, _FIGURES_AT = 8 * 19, 8 * 14
+_ROW_BYTES: Final = 8 * 19
+_FIGURES_AT: Final = 8 * 14
 """A row of `edca.JOB_COLUMNS`, and the columns from `edca.LOW` on."""
 _ENDS = (None, End.ARRIVED, End.OVER, End.UNREACHABLE)
 

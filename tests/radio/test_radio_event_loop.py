@@ -51,7 +51,7 @@ def test_a_flight_is_the_same_on_both_clocks_and_takes_fewer_events() -> None:
     plain, skipping = simpy.Environment(), EventLoop()
     told = flight(plain)
     assert {row.status.value for _, row in told if isinstance(row, Transmission)} >= {"delivered", "expired"}
-    assert flight(skipping) == told
+    assert repr(flight(skipping)) == repr(told)  # a NaN equals no other
     assert next(skipping._eid) < 0.9 * next(plain._eid)
 
 
