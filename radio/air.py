@@ -39,9 +39,12 @@ from sortie.scenarios.link_state import SILENT_MBPS, WAITING_MBPS
 from sortie.scenarios.plain_sum import plain_sum
 
 # an enumeration's member costs a quarter of a microsecond to look up, and each sample needs some ten look-ups
-_DEADLINE_QUEUED, _DEADLINE_IN_SERVICE = End.DEADLINE_QUEUED, End.DEADLINE_IN_SERVICE
-_UNREACHABLE = End.UNREACHABLE
-_DELIVERED, _LOST, _EXPIRED = Status.DELIVERED, Status.LOST, Status.EXPIRED
+_DEADLINE_QUEUED: Final = End.DEADLINE_QUEUED
+_DEADLINE_IN_SERVICE: Final = End.DEADLINE_IN_SERVICE
+_UNREACHABLE: Final = End.UNREACHABLE
+_DELIVERED: Final = Status.DELIVERED
+_LOST: Final = Status.LOST
+_EXPIRED: Final = Status.EXPIRED
 HEARD_DB = 40.0
 """SNR with which a link that is traced by its loss or goodput is heard, and its answers."""
 _WINDOW_S: Final = 1e-3

@@ -46,7 +46,7 @@ FAINT_DB = 3.0
 _NS: Final = 1e-9
 _AHEAD_NS: Final = 100_000_000
 """A plan goes no further than this; frames of the flight change the links as often."""
-_LAST = EventPriority(2)
+_LAST: Final = EventPriority(2)
 """After everything else of the same instant."""
 
 
@@ -660,11 +660,12 @@ _T_GROUP: Final = 0
 _GROUP: Final = 1
 _DATA: Final = 2
 """As in `edca`."""
-_write_row, _read_figures = Struct("19q").pack_into, Struct("5q").unpack_from
+_write_row: Final = Struct("19q").pack_into
+_read_figures: Final = Struct("5q").unpack_from
 _ROW_BYTES: Final = 8 * 19
 _FIGURES_AT: Final = 8 * 14
 """A row of `edca.JOB_COLUMNS`, and the columns from `edca.LOW` on."""
-_ENDS = (None, End.ARRIVED, End.OVER, End.UNREACHABLE)
+_ENDS: Final = (None, End.ARRIVED, End.OVER, End.UNREACHABLE)
 
 
 @cache
