@@ -5,9 +5,11 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
+COMPILED := .venv-compiled
+SOURCES := $(shell find -L sortie -type f -not -name "*.pyc")
 
 
-.PHONY: help sortie screenshot test test-all lint check format bench bench-all figures validate-ns3 ns3 mavproxy mutate clean scenarios notebooks outputs fuzz docs test-lowest
+.PHONY: help sortie screenshot test test-all lint check format bench bench-all figures validate-ns3 ns3 mavproxy mutate clean scenarios notebooks outputs fuzz docs test-lowest compiled test-compiled
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -42,6 +44,24 @@ test-lowest: ## test the lowest versions that pyproject.toml allows, without tor
 	.venv-lowest/bin/sortie fly track_target --set perception.detector=surrogate --set duration_s=5 --out .venv-lowest/run
 	@# the one left out counts the operations of the torch network
 	.venv-lowest/bin/python -m pytest -m 'not slow' tests/scenarios tests/policies tests/radio tests/fleet --ignore tests/fleet/test_fleet_computer.py
+
+# A copy of the tree is compiled, so that nothing is left in the tree; the libraries are those of .venv.
+$(COMPILED)/.installed: $(STAMP) setup.py $(SOURCES)
+	$(BIN)/python -m venv --clear $(COMPILED)
+	@mkdir $(COMPILED)/tree
+	@cp -rL sortie setup.py pyproject.toml README.md LICENSE $(COMPILED)/tree
+	SORTIE_COMPILE=1 PIP_CONSTRAINT=$(CURDIR)/constraints.txt $(COMPILED)/bin/python -m pip install --quiet --no-deps $(COMPILED)/tree
+	@rm -r $(COMPILED)/tree
+	@$(BIN)/python -c 'import sys; print(*[p for p in sys.path if p.endswith("site-packages")], sep="\n")' > $$($(COMPILED)/bin/python -c 'import site; print(site.getsitepackages()[0])')/of_venv.pth
+	@touch $@
+
+compiled: $(COMPILED)/.installed ## install Sortie with its radio compiled by mypyc into .venv-compiled (needs a C compiler)
+
+test-compiled: compiled ## test that the compiled radio makes equal records, and run the tests of the radio with it
+	$(BIN)/python -m pytest tests/test_compiled.py
+	@# from a copy of the tests: beside the tree its sources would be imported
+	@rm -rf $(COMPILED)/tests && cp -r tests pyproject.toml $(COMPILED)
+	cd $(COMPILED) && bin/python -m pytest -n auto -m 'not slow' tests/radio tests/sim/engine/test_sim_transport.py
 
 lint: $(STAMP) ## style and types
 	$(BIN)/ruff check .

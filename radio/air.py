@@ -13,9 +13,9 @@ sender, receiver and kind replaces an older one that is not through (history dep
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
+from itertools import pairwise, repeat
 from math import nan
-from typing import cast
+from typing import Final, cast
 
 import numpy as np
 import simpy
@@ -39,12 +39,15 @@ from sortie.scenarios.link_state import SILENT_MBPS, WAITING_MBPS
 from sortie.scenarios.plain_sum import plain_sum
 
 # an enumeration's member costs a quarter of a microsecond to look up, and each sample needs some ten look-ups
-_DEADLINE_QUEUED, _DEADLINE_IN_SERVICE = End.DEADLINE_QUEUED, End.DEADLINE_IN_SERVICE
-_UNREACHABLE = End.UNREACHABLE
-_DELIVERED, _LOST, _EXPIRED = Status.DELIVERED, Status.LOST, Status.EXPIRED
+_DEADLINE_QUEUED: Final = End.DEADLINE_QUEUED
+_DEADLINE_IN_SERVICE: Final = End.DEADLINE_IN_SERVICE
+_UNREACHABLE: Final = End.UNREACHABLE
+_DELIVERED: Final = Status.DELIVERED
+_LOST: Final = Status.LOST
+_EXPIRED: Final = Status.EXPIRED
 HEARD_DB = 40.0
 """SNR with which a link that is traced by its loss or goodput is heard, and its answers."""
-_WINDOW_S = 1e-3
+_WINDOW_S: Final = 1e-3
 """A goodput measurement that is still going on counts once it is this old."""
 
 
@@ -52,7 +55,7 @@ class Air:
     """The channel that a fleet shares: takes bytes and positions, returns what happened to each sample.
 
     Args:
-        env: the clock.
+        env: the clock; on an `EventLoop` (`sortie.radio.event_loop`) it is fastest.
         settings: see `sortie.radio.settings.AirSettings`.
         positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
         seed, replication: as in `sortie.scenarios.streams.stream`.
@@ -86,8 +89,8 @@ class Air:
         positions_m: ArrayLike,
         *,
         seed: int,
-        replication: int = 0,
         frame_s: float,
+        replication: int = 0,
         publish_spread: float = 0.8,
         up: ArrayLike | None = None,
     ) -> None:
@@ -454,7 +457,7 @@ class Air:
         payload would go over others, it is the goodput of its hops in sequence.
         """
         known = self._known_mbps(sender)
-        targets = [i for i in range(self._n) if i != sender] if to is None else to
+        targets = (*range(sender), *range(sender + 1, self._n)) if to is None else to
         if self._routes is not None:
             rows: dict[int, dict[int, float]] = {sender: known.copy()}
             for target in targets:
@@ -464,7 +467,7 @@ class Air:
                     known[target] = 1.0 / plain_sum(1.0 / mbps for mbps in hops) if min(hops) > 0.0 else 0.0
         if not known:
             return (0.0,) * len(targets)
-        return tuple([known.get(i, 0.0) for i in targets])
+        return tuple(map(known.get, targets, repeat(0.0)))
 
     def _known_mbps(self, sender: int) -> dict[int, float]:
         """Goodput over the direct link, by receiver, where something was measured lately."""

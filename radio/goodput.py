@@ -19,9 +19,11 @@ shadowing, because falling is quicker than rising; a drop shows in the next fram
 
 from __future__ import annotations
 
+from typing import Final
+
 from sortie.scenarios.link_state import MEASURED_FOR_S, SILENT_MBPS, WAITING_MBPS
 
-RISE = 0.3
+RISE: Final = 0.3
 
 
 class Goodput:

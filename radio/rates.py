@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import exp, expm1, log, log1p
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,8 +120,9 @@ REFERENCE_BYTES = 1458
 NO_LINK_PER = 0.9
 """Above this mean PER at MCS 0 there is no link."""
 
-_STEP_DB = 0.05
-_LOW_DB, _HIGH_DB = -20.0, 60.0
+_STEP_DB: Final = 0.05
+_LOW_DB: Final = -20.0
+_HIGH_DB = 60.0
 _GRID_DB = np.arange(_LOW_DB, _HIGH_DB + _STEP_DB / 2, _STEP_DB)
 _FADE_LOW_DB, _FADE_HIGH_DB = -40.0, 15.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from math import isnan, nan
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ from sortie.radio.transmission import Status, Transmission
 
 IntArray = NDArray[np.intp]
 FloatArray = NDArray[np.float64]
-_DELIVERED = Status.DELIVERED  # members of an enumeration are slow to look up
+_DELIVERED: Final = Status.DELIVERED  # members of an enumeration are slow to look up
 _MAX_KEPT = 20_000
 
 
@@ -50,7 +50,7 @@ class Use(NamedTuple):
 
 UseNow = tuple[int, Use, float, int]
 """A link in this frame: the medium's number for it, its use, its mean SNR as it is, and which time this was found out."""
-UNUSED = Use(Link(-1, dead=True), "", 0.0)
+UNUSED: Final = Use(Link(-1, dead=True), "", 0.0)
 
 
 class Sample(AirJob):

@@ -27,7 +27,7 @@ MAY_IMPORT = {
 """sim → fleet → radio | policies | perception → scenarios; the three middle rooms do not know each other."""
 
 HOMES = {
-    "simpy": ("sim/*", "fleet/agent.py", "radio/mac/medium.py", "radio/air.py"),
+    "simpy": ("sim/*", "fleet/agent.py", "radio/mac/medium.py", "radio/air.py", "radio/event_loop.py"),
     "torch": ("perception/*",),
     "rerun": ("sim/playback/*",),
     "pymavlink": ("fleet/logs/ground_station.py", "fleet/logs/mavlink.py", "fleet/logs/tlog.py"),
@@ -168,7 +168,7 @@ def test_every_package_at_the_root_is_a_room() -> None:
         (
             "fleet/flight/motion.py",
             "import simpy",
-            "simpy is at home in sim/*, fleet/agent.py, radio/mac/medium.py, radio/air.py",
+            "simpy is at home in sim/*, fleet/agent.py, radio/mac/medium.py, radio/air.py, radio/event_loop.py",
         ),
         ("policies/catalogue/worked.py", "import torch", "torch is at home in perception/*"),
         ("sim/engine/sortie.py", "from torch import nn", "torch is at home in perception/*"),

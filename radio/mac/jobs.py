@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 from math import nan
+from typing import Final
 
 import numpy as np
 
@@ -21,8 +22,8 @@ class End(Enum):
     DEADLINE_IN_SERVICE = "deadline_in_service"
 
 
-NO_FRAMES = np.arange(0)
-NONE_DROPPED: frozenset[int] = frozenset()
+NO_FRAMES: Final = np.arange(0)
+NONE_DROPPED: Final[frozenset[int]] = frozenset()
 
 
 class AirJob:

@@ -16,7 +16,7 @@ from functools import cache
 from heapq import heappop, heappush
 from math import inf, nan
 from struct import Struct
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import simpy
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from simpy.events import NORMAL, EventPriority
 
 from sortie.radio.channel.draws import fade_table
+from sortie.radio.event_loop import EventLoop
 from sortie.radio.mac.airtime import CONTROL_MBPS, ampdu_frames, frame_bytes
 from sortie.radio.mac.jobs import NONE_DROPPED, AirJob, End, GroupFrame
 from sortie.radio.rates import CURVES, LEGACY_CURVES, STANDARDS, group_curve
@@ -42,10 +43,10 @@ ENERGY_OVER_PREAMBLE_DB = 20.0
 """A frame of which a station has missed the begin is sensed by its energy, if it is so much above the weakest preamble."""
 FAINT_DB = 3.0
 """A link is faint if its highest fade stays so far below the weakest preamble."""
-_NS = 1e-9
-_AHEAD_NS = 100_000_000
+_NS: Final = 1e-9
+_AHEAD_NS: Final = 100_000_000
 """A plan goes no further than this; frames of the flight change the links as often."""
-_LAST = EventPriority(2)
+_LAST: Final = EventPriority(2)
 """After everything else of the same instant."""
 
 
@@ -163,8 +164,10 @@ class Medium(Generic[J, F]):
         self._deadlines: list[tuple[int, int, int, J]] = []
         self._pushes = 0
         self._e = e = _edca()
+        self._ahead = e.ahead
         self._begin_s = env.now
         self._timer: simpy.Event | None = None
+        self._skip_to = env.skip_to if isinstance(env, EventLoop) else None
         self._is_replanning = False
         self._last = self._event()
         self._on_last: list[Callable[[simpy.Event], None]] = [self._replan]
@@ -538,21 +541,40 @@ class Medium(Generic[J, F]):
 
     def _replan(self, _: simpy.Event) -> None:
         self._is_replanning = False
-        now_s = self._env.now
-        self._plan(self._event(), now_s, max(round(now_s * 1e9) - 1, self._settled.now_ns))
+        self._go_on(None, max(round(self._env.now * 1e9) - 1, self._settled.now_ns))
 
-    def _plan(self, timer: simpy.Event, now_s: float, since: int) -> None:
-        """Bring the settled state up to `since`, run a copy ahead to whatever must be told next, and set the timer there."""
+    def _on_timer(self, event: simpy.Event) -> None:
+        if event is self._timer:  # else something came earlier
+            self._tell()
+            self._go_on(event, self._settled.now_ns)
+
+    def _go_on(self, timer: simpy.Event | None, since: int) -> None:
+        """Plan from `since`, and tell what comes of it at its time; a timer is set only if others have something to do first."""
+        env, skip_to = self._env, self._skip_to
         self._timer = None
-        if not self._at_row:
-            return
+        while self._at_row:
+            now_s = env.now
+            delay_s = self._plan(since) * _NS - now_s
+            if delay_s < 0.0:
+                delay_s = 0.0
+            if skip_to is None or not skip_to(now_s + delay_s):
+                self._timer = timer = timer or self._event()
+                timer.callbacks = self._on_time
+                env.schedule(timer, NORMAL, delay_s)
+                return
+            self._tell()
+            self._timer = None
+            since = self._settled.now_ns
+
+    def _plan(self, since: int) -> int:
+        """Bring the settled state up to `since`, and run a copy ahead to whatever must be told next; returns when that is."""
         settled, deadlines = self._settled, self._deadlines
         while deadlines and not deadlines[0][3].live:
             heappop(deadlines)
         until = since + _AHEAD_NS
         if deadlines and deadlines[0][0] < until:
             until = deadlines[0][0] if deadlines[0][0] > since else since
-        ahead = self._e.ahead
+        ahead = self._ahead
         table = self._make_table() if settled.table is None else settled.table
         reached, told = ahead(table, settled.entered, since, until)
         settled.entered = self._planned.entered = -1
@@ -561,14 +583,11 @@ class Medium(Generic[J, F]):
             reached, told = ahead(table, -1, since, until)
         settled.now_ns, self._planned.now_ns = since, reached
         self._told = self._out_rows[: 2 * told].tolist() if told > 0 else []
-        timer.callbacks = self._on_time
-        self._timer = timer
-        delay_s = reached * _NS - now_s
-        self._env.schedule(timer, NORMAL, delay_s if delay_s > 0.0 else 0.0)
+        found: int = reached
+        return found
 
-    def _on_timer(self, event: simpy.Event) -> None:
-        if event is not self._timer:
-            return  # something came earlier
+    def _tell(self) -> None:
+        """The plan has come about: it is the settled state now, and who waits for a part of it is called."""
         self._settled, self._planned = self._planned, self._settled
         now, settled = self._env.now, self._settled
         if settled.drops[0]:
@@ -595,7 +614,6 @@ class Medium(Generic[J, F]):
                 is_served = is_head and job.t_start_s < now - _NS
                 self._on_end(job, End.DEADLINE_IN_SERVICE if is_served else End.DEADLINE_QUEUED, now)
         self._is_telling = False
-        self._plan(event, now, self._settled.now_ns)
 
     def _end_group(self, frame: F, row: int) -> None:
         first, last = self._first[frame.sender : frame.sender + 2]
@@ -637,14 +655,17 @@ class Medium(Generic[J, F]):
         return min(1.0, plain_sum(self._busy_s()) / elapsed) if elapsed > 0 else 0.0
 
 
-_T_GROUP = 0
+_T_GROUP: Final = 0
 """As `edca.T_GROUP`."""
-_GROUP, _DATA = 1, 2
+_GROUP: Final = 1
+_DATA: Final = 2
 """As in `edca`."""
-_write_row, _read_figures = Struct("19q").pack_into, Struct("5q").unpack_from
-_ROW_BYTES, _FIGURES_AT = 8 * 19, 8 * 14
+_write_row: Final = Struct("19q").pack_into
+_read_figures: Final = Struct("5q").unpack_from
+_ROW_BYTES: Final = 8 * 19
+_FIGURES_AT: Final = 8 * 14
 """A row of `edca.JOB_COLUMNS`, and the columns from `edca.LOW` on."""
-_ENDS = (None, End.ARRIVED, End.OVER, End.UNREACHABLE)
+_ENDS: Final = (None, End.ARRIVED, End.OVER, End.UNREACHABLE)
 
 
 @cache

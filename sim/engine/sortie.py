@@ -29,6 +29,7 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.contract import Policy
 from sortie.radio import Air
+from sortie.radio.event_loop import EventLoop
 from sortie.radio.rates import STANDARDS
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plugins.user_calls import guarded, watched
@@ -186,7 +187,7 @@ def build(
     detector_of: DetectorMaker = make_detector,
 ) -> Parts:
     """Wire the parts of a sortie, and put the scenario's events and changes of policy on its clock."""
-    env, recorder = simpy.Environment(), Recorder(classes=len(scenario.perception.classes) > 1)
+    env, recorder = EventLoop(), Recorder(classes=len(scenario.perception.classes) > 1)
     drones, rules = range(scenario.fleet.drones), _rules(scenario)
     statuses = [
         DroneStatus(space, looks=not blind, codebook=codebook)

@@ -470,8 +470,8 @@ def test_arguments_out_of_bounds_are_refused() -> None:
         f.air.broadcast(0, 3000, print)
     with pytest.raises(ValueError, match=r"in_s is -0.1, must be at least 0"):
         f.air.broadcast(0, 10, print, -0.1)
-    with pytest.raises(ValueError, match=r"publish_spread is 2, must be in \[0, 1\]"):
-        Flight(STILL, 2, spread=2)
+    with pytest.raises(ValueError, match=r"publish_spread is 2\.0, must be in \[0, 1\]"):
+        Flight(STILL, 2, spread=2.0)
 
 
 def test_a_link_whose_payloads_only_waited_is_not_silent() -> None:

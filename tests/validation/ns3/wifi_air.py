@@ -14,6 +14,7 @@ from wifi_plan import FRAGMENT_BYTES, FRAME_S, FloatArray, Plan
 
 from sortie.radio import Air, AirSettings
 from sortie.radio.channel.snr import Channel
+from sortie.radio.event_loop import EventLoop
 from sortie.radio.transmission import Transmission
 
 QUIET: dict[str, Any] = {"shadowing_sigma_db": 0.0, "rician_k_db": 40.0}
@@ -87,7 +88,7 @@ def run_air(
     """
     frames, n = round(stop_s / FRAME_S) + 1, len(plan.positions_m)
     wall_s, cpu_s = time.perf_counter(), time.process_time()
-    env = simpy.Environment()
+    env = EventLoop()
     at = np.broadcast_to(plan.positions_m, (frames, n, 3))
     air = Air(env, AirSettings(**settings), at, seed=seed, frame_s=FRAME_S, publish_spread=0.0)
     if mcs is not None:
