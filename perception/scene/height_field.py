@@ -52,11 +52,20 @@ class HeightField:
         pixel = ((y_m - self.y0_m) / RES_M).astype(np.intp) * self.columns + ((x_m - self.x0_m) / RES_M).astype(np.intp)
         return np.asarray(~self._roofed.take(pixel, mode="clip"))
 
+    @property
+    def raster(self) -> tuple[NDArray[np.float32], NDArray[np.bool_], int, float, float]:
+        """Heights and roofs, flat, row by row; how many columns; and the south-west corner."""
+        return self._flat, self._roofed, self.columns, self.x0_m, self.y0_m
+
+    def steps(self, from_m: float) -> int:
+        """Steps that a ray takes from a height until it is above everything."""
+        return int(np.ceil(max(self.top_m - from_m, 0.0) / STEP_M))
+
     def _march(
         self, x_m: Floats, y_m: Floats, slope_x: Floats, slope_y: Floats, from_m: float = CAR_TOP_M
     ) -> NDArray[np.bool_]:
         """Follow rays upwards from a height; slopes are metres sideways for each metre of height. Rays go in groups that fit the cache."""
-        steps = int(np.ceil(max(self.top_m - from_m, 0.0) / STEP_M))
+        steps = self.steps(from_m)
         clear = np.ones(len(x_m), bool)
         for at in range(0, len(x_m), _RAYS):
             some = slice(at, at + _RAYS)
