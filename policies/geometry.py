@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from functools import cache
-from itertools import chain
 from math import hypot
+from struct import pack
 from typing import Any
 
 import numpy as np
@@ -30,12 +30,15 @@ def peers_by_overlap(view: FleetView, receiver: int | None = None) -> list[int]:
     known = view.descriptors
     if of not in known:
         return []
-    ids, each = list(known), known.values()
-    position_m = np.fromiter(chain.from_iterable([d.position_m for d in each]), np.float64)
-    radius_m = np.array([d.footprint_radius_m for d in each], np.float64)
-    places = places_loop()(ids.index(of), np.array(ids), position_m, radius_m)
+    n, numbers = len(known), [d.footprint_radius_m for d in known.values()]
+    for d in known.values():
+        numbers += d.position_m
+    packed = pack(f"{n}q{4 * n}d", *known, *numbers)  # takes half the time that an array of a list does
+    places = places_loop()(of, np.frombuffer(packed, np.int64, n), np.frombuffer(packed, np.float64, -1, 8 * n))
     places.sort()
-    ranked: list[int] = ((of + places) % AGENT_IDS).tolist()
+    places += of
+    places %= AGENT_IDS
+    ranked: list[int] = places.tolist()
     return ranked
 
 
@@ -44,5 +47,6 @@ def places_loop() -> Any:
     """The compiled loop, imported and made ready at its first use: before a flight, for decisions may have little time."""
     from sortie.policies.overlap_loops import places
 
-    places(0, np.zeros(1, np.int64), np.zeros(3), np.zeros(1))
+    packed = bytes(40)  # read-only, as those in flight
+    places(0, np.frombuffer(packed, np.int64, 1), np.frombuffer(packed, np.float64, 4, 8))
     return places

@@ -28,22 +28,24 @@ def _overlap(distance_m, a_m, b_m):
 
 
 @compiled
-def places(me, ids, position_m, radius_m):
-    """What `sortie.scenarios.disc.rank_by_overlap` sorts by, of all ids but one, `ids[me]`.
+def places(of, ids, circles):
+    """What `sortie.scenarios.disc.rank_by_overlap` sorts by, of all ids but one.
 
     Args:
-        me: whose peers are ranked.
-        ids: [N].
-        position_m: [3 N], x, y and z of each.
-        radius_m: [N], of the footprints.
+        of: the id whose peers are ranked.
+        ids: [N], it among them.
+        circles: [4 N], of the footprints: every radius, then x, y and z of each, m.
     """
-    ego, x_m, y_m = ids[me], position_m[3 * me], position_m[3 * me + 1]
-    found = np.empty(len(ids) - 1, np.int64)
+    n, me = len(ids), 0
+    while ids[me] != of:
+        me += 1
+    radius_m, x_m, y_m = circles[:n], circles[n::3], circles[n + 1 :: 3]
+    found = np.empty(n - 1, np.int64)
     count = 0
-    for k in range(len(ids)):
+    for k in range(n):
         if k != me:
-            away_m = np.hypot(x_m - position_m[3 * k], y_m - position_m[3 * k + 1])
+            away_m = np.hypot(x_m[me] - x_m[k], y_m[me] - y_m[k])
             overlap = _overlap(away_m, radius_m[me], radius_m[k])
-            found[count] = (ids[k] - ego) % _AGENT_IDS - _AGENT_IDS * int(np.rint(overlap / _STEP))
+            found[count] = (ids[k] - of) % _AGENT_IDS - _AGENT_IDS * int(np.rint(overlap / _STEP))
             count += 1
     return found
