@@ -384,7 +384,10 @@ class Agent:
         if self._guard is not None:
             self._keep_invariants(self._guard, view, asked_of)
         self.status.work.decisions += 1
-        others = ages[memory.ids != me] if is_heard else [age_s for peer, age_s in view.age_s.items() if peer != me]
+        if is_heard:
+            others: Ages = ages.take(memory.others)
+        else:
+            others = [age_s for peer, age_s in view.age_s.items() if peer != me]
         self._log.decision(now_s, me, elapsed_ns, others)
 
     def _overdue(self, ages_s: NDArray[np.float64], now_s: float) -> list[int]:

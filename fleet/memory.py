@@ -67,6 +67,8 @@ class PeerMemory:
         self._known: dict[int, Descriptor] = {}  # by ascending id
         self.ids: NDArray[np.int64] = np.empty(0, np.int64)
         """Of whom it has a descriptor, itself included, ascending; another array once there is one more."""
+        self.others: NDArray[np.intp] = np.empty(0, np.intp)
+        """Places in `ids` of all but itself."""
         self._standings = Standings({}, table.heard_s.shape[1] if rules.trust else 0)
         self._doubted: frozenset[int] = frozenset()
         self._arrivals: dict[int, list[Arrival]] = {}
@@ -93,6 +95,7 @@ class PeerMemory:
         else:  # by ascending id, so that the order of arrival decides nothing
             self._known = dict(sorted([*known.items(), (sender, descriptor)]))
             self.ids = np.array(list(self._known), np.int64)
+            self.others = np.flatnonzero(self.ids != self.drone)
         self._heard_s[sender], self._stamps_s[sender] = now_s, descriptor.stamp_ns * 1e-9
 
     def can_fuse(self, payload: Payload) -> bool:
@@ -245,15 +248,20 @@ def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float
     table, rules = first.table, first._rules
     if sender >= table.heard_s.shape[1]:  # no drone of this fleet has such an id
         return [(memory.drone, DropReason.MALFORMED) for memory in receivers]
-    module = loops()
+    module, count = loops(), len(receivers)
     found = module.hear(
-        np.array([memory.row for memory in receivers]), table.first,
-        np.array([memory.status.clock_skew_s for memory in receivers]), sender, descriptor.stamp_ns * 1e-9, now_s,
-        key_id is not None, np.uint64(counter), rules.period_s, rules.descriptor_period_s, table.window,
-        table.counters(key_id or 0), table.heard_s, table.stamps_s, table.watched, table.bits,
-    )  # fmt: skip
+        np.fromiter([memory.row for memory in receivers], np.int64, count), table.first,
+        np.fromiter([memory.status.clock_skew_s for memory in receivers], np.float64, count), sender,
+        descriptor.stamp_ns * 1e-9, now_s, key_id is not None, np.uint64(counter), rules.period_s,
+        rules.descriptor_period_s, table.window, table.counters(key_id or 0), table.heard_s, table.stamps_s,
+        table.watched, table.bits,
+    ).tobytes()  # fmt: skip
+    if found.count(module.TAKEN) == count:  # as nearly always
+        for memory in receivers:
+            memory._known[sender] = descriptor
+        return []
     refused = []
-    for memory, what in zip(receivers, found.tolist(), strict=True):
+    for memory, what in zip(receivers, found, strict=True):
         if what == module.TAKEN:
             memory._known[sender] = descriptor
         elif what == module.UNUSUAL:

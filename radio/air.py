@@ -454,6 +454,12 @@ class Air:
         payload would go over others, it is the goodput of its hops in sequence.
         """
         known = self._known_mbps(sender)
+        if to is None and self._routes is None:  # as most fleets ask in every frame
+            listed = [0.0] * self._n
+            for i, mbps in known.items():
+                listed[i] = mbps
+            del listed[sender]
+            return tuple(listed)
         targets = [i for i in range(self._n) if i != sender] if to is None else to
         if self._routes is not None:
             rows: dict[int, dict[int, float]] = {sender: known.copy()}
