@@ -85,6 +85,7 @@ def loops() -> Any:
     coverage_loops.hide(
         states, wide.astype(np.int64), wide, wide, wide, none, none, 0.0, single, single > 0, 1, 0.0, 0.0, 0.0, 0
     )
+    coverage_loops.count(np.frombuffer(b"", np.uint8).reshape(0, COVERAGE_BYTES), states[:, 0])
     return coverage_loops
 
 

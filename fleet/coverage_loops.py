@@ -7,7 +7,7 @@ import numpy as np
 from sortie.scenarios.compiled import compiled, part
 
 # constants of the file itself: kept machine code does not see that another file has changed
-_CELLS, _SAMPLES = 16, 2
+_CELLS, _SAMPLES, _WELL = 16, 2, 2
 _RES_M, _STEP_M = 0.8, 1.0  # those of `sortie.perception.scene.height_field`
 _F = np.float32
 _ONE, _HALF, _LEAST, _FAR, _ROOT = _F(1.0), _F(0.5), _F(0.1), _F(np.inf), _F(np.sqrt(2.0))
@@ -55,6 +55,19 @@ def camera_states(x_m, y_m, height_m, body, middles_m, half_h, half_v, ahead, do
                     depth = _depth_m(x, y, z, half_h, half_v, ahead, down)
                     if depth < _FAR:
                         states[k, row, column] = 1 + (depth * depth * depth <= well_m2 * up)
+
+
+@compiled
+def count(grids, could):
+    """Cells of packed grids [K, 64] that are seen well and could not be so by the states of `could` [K, 16, 16], and cells
+    that are seen: [K, 2]."""
+    found = np.zeros((len(grids), 2), np.int64)
+    for k in range(len(grids)):
+        for cell in range(_CELLS * _CELLS):
+            state = (grids[k, cell >> 2] >> np.uint8(2 * (cell & 3))) & np.uint8(3)
+            found[k, 0] += state >= _WELL and could[k, cell // _CELLS, cell % _CELLS] < _WELL
+            found[k, 1] += state > 0
+    return found
 
 
 @part

@@ -28,6 +28,7 @@ from sortie.fleet.trust import (
     judge,
     split_arrivals,
 )
+from sortie.perception.geometry import USUAL
 from sortie.perception.types import Capture
 from sortie.policies.contract import ROUNDING_PERIODS, Descriptor, FleetView
 from sortie.scenarios.representation import MAPS, Representation
@@ -73,6 +74,7 @@ class PeerMemory:
         self._doubted: frozenset[int] = frozenset()
         self._arrivals: dict[int, list[Arrival]] = {}
         self._judged_at_s = -math.inf
+        self._cameras = {i: its.cameras for i, its in rules.makes.items() if its.cameras != USUAL}
         self._stations = frozenset(i for i, its in rules.makes.items() if not its.flies)
         self._loops = loops()
         charge_loop()
@@ -217,7 +219,7 @@ class PeerMemory:
             self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
         self._standings = after = judge(
             before, self.drone, heard, arrivals, self._rules.form, looking,
-            lambda i: self._rules.equipment(i).cameras, self._stations,
+            self._cameras, self._stations,
         )  # fmt: skip
         strikes, were = after.rows["strikes"], before.rows["strikes"]
         self._doubted = frozenset(np.flatnonzero(strikes >= STRIKES_TO_DOUBT).tolist())

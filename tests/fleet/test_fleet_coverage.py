@@ -236,4 +236,8 @@ def test_a_chart_holds_whatever_is_claimed() -> None:
 
 def test_the_compiled_loops_have_the_constants_of_the_raster() -> None:
     assert (coverage_loops._RES_M, coverage_loops._STEP_M) == (height_field.RES_M, height_field.STEP_M)
-    assert (coverage_loops._CELLS, coverage_loops._SAMPLES) == (COVERAGE_CELLS, SAMPLES)
+    assert (coverage_loops._CELLS, coverage_loops._SAMPLES, coverage_loops._WELL) == (
+        COVERAGE_CELLS,
+        SAMPLES,
+        Coverage.WELL,
+    )
