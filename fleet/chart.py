@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache
+from struct import pack
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,11 @@ def grids_of(claims: Sequence[Descriptor]) -> Grids:
     packed = np.frombuffer(b"".join([d.coverage_grid for d in claims]), np.uint8).reshape(-1, COVERAGE_BYTES)
     if not claims:
         return packed, np.empty(0, np.int64), np.empty(0, np.int64)
-    cells = np.floor(np.array([d.position_m for d in claims]) / COVERAGE_CELL_M)
+    numbers: list[float] = []
+    for d in claims:
+        numbers += d.position_m
+    position_m = np.frombuffer(pack(f"{len(numbers)}d", *numbers)).reshape(-1, 3)  # faster than an array of tuples
+    cells = np.floor(position_m / COVERAGE_CELL_M)
     corner = np.maximum(np.minimum(cells, _FARTHEST), -_FARTHEST).astype(np.int64) - COVERAGE_CELLS // 2
     return packed, np.ascontiguousarray(corner[:, 1]), np.ascontiguousarray(corner[:, 0])
 
