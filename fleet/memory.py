@@ -31,6 +31,7 @@ from sortie.fleet.trust import (
 from sortie.perception.geometry import USUAL
 from sortie.perception.types import Capture
 from sortie.policies.contract import ROUNDING_PERIODS, Descriptor, FleetView
+from sortie.policies.geometry import note_circles
 from sortie.scenarios.representation import MAPS, Representation
 
 _FEATURES, _CODES = Representation.FEATURES, Representation.CODES  # slow to look up, each time
@@ -65,6 +66,7 @@ class PeerMemory:
         self._period_s, self._fresh_s = rules.descriptor_period_s, rules.fresh_s
         self.clocks = PeerClocks(rules.period_s, table.ahead_s[row], table.watched[row])
         self._heard_s, self._stamps_s, self._ahead_s = table.heard_s[row], table.stamps_s[row], table.ahead_s[row]
+        self._circles = table.circles[row]
         self._known: dict[int, Descriptor] = {}  # by ascending id
         self.ids: NDArray[np.int64] = np.empty(0, np.int64)
         """Of whom it has a descriptor, itself included, ascending; another array once there is one more."""
@@ -99,6 +101,7 @@ class PeerMemory:
             self.ids = np.array(list(self._known), np.int64)
             self.others = np.flatnonzero(self.ids != self.drone)
         self._heard_s[sender], self._stamps_s[sender] = now_s, descriptor.stamp_ns * 1e-9
+        self._circles[sender] = _circle(descriptor)
 
     def can_fuse(self, payload: Payload) -> bool:
         """Whether the drone can use it. Feature cells of another network mean nothing to it, and codes of another codebook.
@@ -169,6 +172,7 @@ class PeerMemory:
         known = dict(self._known)
         for doubted in self._doubted:
             known[doubted] = discounted(known[doubted])
+        note_circles(known, self._circles.copy())
         ages_s = self.ages(now_s) if ages is None else ages
         by_peer = MappingProxyType(dict(zip(known, ages_s.tolist(), strict=True)))
         return FleetView(
@@ -227,6 +231,12 @@ class PeerMemory:
         return [(peer, after[peer]) for peer in moved if after[peer].trust != before.get(peer, UNJUDGED).trust]
 
 
+def _circle(d: Descriptor) -> tuple[float, float, float]:
+    """The footprint that a drone claims."""
+    x_m, y_m, _ = d.position_m
+    return float(x_m), float(y_m), float(d.footprint_radius_m)
+
+
 def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float) -> list[tuple[int, DropReason]]:
     """Take a datagram in at all drones that it reached: a credible one replaces the last descriptor of its sender.
 
@@ -254,9 +264,9 @@ def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float
     found = module.hear(
         np.fromiter([memory.row for memory in receivers], np.int64, count), table.first,
         np.fromiter([memory.status.clock_skew_s for memory in receivers], np.float64, count), sender,
-        descriptor.stamp_ns * 1e-9, now_s, key_id is not None, np.uint64(counter), rules.period_s,
+        descriptor.stamp_ns * 1e-9, _circle(descriptor), now_s, key_id is not None, np.uint64(counter), rules.period_s,
         rules.descriptor_period_s, table.window, table.counters(key_id or 0), table.heard_s, table.stamps_s,
-        table.watched, table.bits,
+        table.circles, table.watched, table.bits,
     ).tobytes()  # fmt: skip
     if found.count(module.TAKEN) == count:  # as nearly always
         for memory in receivers:

@@ -28,24 +28,25 @@ def _overlap(distance_m, a_m, b_m):
 
 
 @compiled
-def places(of, ids, circles):
+def places(of, ids, at, circles):
     """What `sortie.scenarios.disc.rank_by_overlap` sorts by, of all ids but one.
 
     Args:
         of: the id whose peers are ranked.
         ids: [N], it among them.
-        circles: [4 N], of the footprints: every radius, then x, y and z of each, m.
+        at: [N], the row of each in the next array.
+        circles: [..., 3], the footprints: x, y and radius, m.
     """
-    n, me = len(ids), 0
+    me = 0
     while ids[me] != of:
         me += 1
-    radius_m, x_m, y_m = circles[:n], circles[n::3], circles[n + 1 :: 3]
-    found = np.empty(n - 1, np.int64)
+    x_m, y_m, radius_m = circles[at[me]]
+    found = np.empty(len(ids) - 1, np.int64)
     count = 0
-    for k in range(n):
+    for k in range(len(ids)):
         if k != me:
-            away_m = np.hypot(x_m[me] - x_m[k], y_m[me] - y_m[k])
-            overlap = _overlap(away_m, radius_m[me], radius_m[k])
+            its = circles[at[k]]
+            overlap = _overlap(np.hypot(x_m - its[0], y_m - its[1]), radius_m, its[2])
             found[count] = (ids[k] - of) % _AGENT_IDS - _AGENT_IDS * int(np.rint(overlap / _STEP))
             count += 1
     return found

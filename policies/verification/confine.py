@@ -22,9 +22,9 @@ from sortie.scenarios.plugins.user_code import is_users
 Decides = TypeVar("Decides", bound=Callable[..., Any])
 
 ALLOWED = frozenset({
-    "__future__", "_bisect", "_collections", "_functools", "_heapq", "_json", "_operator", "_random", "_struct", "abc", "bisect",
+    "__future__", "_bisect", "_collections", "_functools", "_heapq", "_json", "_operator", "_random", "abc", "bisect",
     "builtins", "cmath", "collections", "contextlib", "copy", "dataclasses", "decimal", "enum", "fractions", "functools",
-    "heapq", "itertools", "json", "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "struct", "types", "typing",
+    "heapq", "itertools", "json", "math", "numbers", "numpy", "operator", "re", "sortie.policies", "statistics", "string", "types", "typing",
 })  # fmt: skip
 """Packages that only use their arguments; a policy may use them."""
 SHARED = frozenset(

@@ -91,10 +91,10 @@ class FleetOfRanges:
         """
         picks, usual, placed = self.path.picks, geometry.places_loop, self._placed
 
-        def places(of: int, ids: Any, circles: Any) -> Any:
+        def places(of: int, ids: Any, *circles: Any) -> Any:
             label = _order_of(of)
             if label == placed or label not in picks:
-                return usual()(of, ids, circles)
+                return usual()(of, ids, *circles)
             order = [p for p in picks[label] if p in ids]
             return np.array([(p - of) % AGENT_IDS - AGENT_IDS * (len(order) - k) for k, p in enumerate(order)])
 
