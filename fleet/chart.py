@@ -57,6 +57,8 @@ class Chart:
         self._loops = ready = loops()
         self._keys = np.full(_FIRST_CELLS, ready.EMPTY, np.int64)
         self._count = 0
+        self._known: tuple[bytes, int, int] | None = None
+        """A grid of which all that it sees well is in the chart, which forgets nothing."""
         self._new = np.zeros(COVERAGE_CELLS**2, np.bool_)
 
     def fold(self, claims: Sequence[Descriptor]) -> None:
@@ -84,9 +86,12 @@ class Chart:
             claims: gives the latest descriptors of the peers that it believes; called where they matter.
             told: whether the answer goes on the air. From then on the cells are known.
         """
+        if (grid, row, column) == self._known:
+            return grid, False
         loops, own = self._loops, np.frombuffer(grid, np.uint8)
         count = loops.unknown(self._keys, own, row, column, self._new)
         if not count:
+            self._known = grid, row, column
             return grid, False
         count = loops.without(self._new, count, row, column, *grids_of(claims()))
         if told:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from sortie.perception.geometry import FULL, USUAL, Cameras
-from sortie.perception.scene.height_field import CAR_TOP_M, HeightField
+from sortie.perception.scene.height_field import HeightField
 from sortie.policies.contract import COVERAGE_BYTES, COVERAGE_CELLS
 from sortie.policies.contract import COVERAGE_CELL_M as CELL_M
 from sortie.scenarios.schema import Fleet
@@ -77,15 +77,11 @@ def loops() -> Any:
     """The compiled loops, imported and made ready at their first use: before a flight, whose drones may be real ones."""
     from sortie.fleet import coverage_loops
 
-    f, states, wide = np.float32, np.zeros((0, 1, COVERAGE_CELLS, COVERAGE_CELLS), np.uint8), np.zeros((0, 1))
-    none, single = wide[:, 0].copy(), np.zeros(0, np.float32)
+    f, states, single = np.float32, np.zeros((0, COVERAGE_CELLS, COVERAGE_CELLS), np.uint8), np.zeros(0, np.float32)
     coverage_loops.camera_states(
-        single, single, single, np.zeros((0, 3, 3), f), single, 1.0, 1.0, 1.0, 1.0, f(0), f(0), states[:, 0]
+        single, single, single, np.zeros((0, 3, 3), f), single, 1.0, 1.0, 1.0, 1.0, f(0), f(0), states
     )
-    coverage_loops.hide(
-        states, wide.astype(np.int64), wide, wide, wide, none, none, 0.0, single, single > 0, 1, 0.0, 0.0, 0.0, 0
-    )
-    coverage_loops.count(np.frombuffer(b"", np.uint8).reshape(0, COVERAGE_BYTES), states[:, 0])
+    coverage_loops.count(np.frombuffer(b"", np.uint8).reshape(0, COVERAGE_BYTES), states)
     return coverage_loops
 
 
@@ -185,10 +181,7 @@ def _hide(states: States, poses: Poses, corner: npt.NDArray[np.int64], turn: Arr
     ends = corner[frame, drone] * CELL_M - believed
     east, north = ends[:, :1] + steps, ends[:, 1:] + steps
     turned = turn[frame, drone]
-    loops().hide(
-        states, at, eye, east, north, np.cos(turned), np.sin(turned), (RANGE_M + CELL_M) ** 2, *field.raster, CAR_TOP_M,
-        field.steps(CAR_TOP_M),
-    )  # fmt: skip
+    field.hide(states, at, eye, east, north, np.cos(turned), np.sin(turned), (RANGE_M + CELL_M) ** 2)
 
 
 @lru_cache(maxsize=256)

@@ -7,10 +7,9 @@ import numpy as np
 from sortie.scenarios.compiled import compiled, part
 
 # constants of the file itself: kept machine code does not see that another file has changed
-_CELLS, _SAMPLES, _WELL = 16, 2, 2
-_RES_M, _STEP_M = 0.8, 1.0  # those of `sortie.perception.scene.height_field`
+_CELLS, _WELL = 16, 2
 _F = np.float32
-_ONE, _HALF, _LEAST, _FAR, _ROOT = _F(1.0), _F(0.5), _F(0.1), _F(np.inf), _F(np.sqrt(2.0))
+_ONE, _LEAST, _FAR, _ROOT = _F(1.0), _F(0.1), _F(np.inf), _F(np.sqrt(2.0))
 _ROOT_64 = np.sqrt(2.0)
 
 
@@ -68,63 +67,3 @@ def count(grids, could):
             found[k, 0] += state >= _WELL and could[k, cell // _CELLS, cell % _CELLS] < _WELL
             found[k, 1] += state > 0
     return found
-
-
-@part
-def _is_clear(tops_m, columns, px, py, slope_x, slope_y, from_m, steps):
-    """Whether a ray upwards from a height meets no roof and no crown (`HeightField._march`)."""
-    px, py = px - _HALF * slope_x, py - _HALF * slope_y
-    for k in range(steps):
-        px, py = px + slope_x, py + slope_y
-        pixel = min(max(np.int64(py) * columns + np.int64(px), 0), len(tops_m) - 1)
-        if not tops_m[pixel] < _F(from_m + (k + 0.5) * _STEP_M):
-            return False
-    return True
-
-
-@compiled
-def hide(
-    states, at, eye_m, east_m, north_m, cosine, sine, reach_m2, tops_m, roofed, columns, x0_m, y0_m, from_m, steps
-):
-    """Set those cells of `states` [frames, drones, 16, 16] to 0 of which less than half of the open ground is in sight.
-
-    Args:
-        at: [frames, drones], the place of each in the next arrays. Frames that follow one another may share one.
-        eye_m: [K, 3], where the drone is.
-        east_m, north_m: [K, 32], from where it believes to be to the lines of sight's ends.
-        cosine, sine: [K], by which what it believes is turned into what is.
-        reach_m2: lines that are longer do not count.
-        tops_m, roofed, columns, x0_m, y0_m: the raster of the scene, flat, its columns and its south-west corner.
-        from_m: height of the lines' ends.
-        steps: how many a line takes until it is above all.
-    """
-    known = np.zeros(_CELLS * _CELLS, np.int8)  # 1 in sight, -1 hidden, 0 not known yet
-    for drone in range(states.shape[1]):
-        for frame in range(len(states)):
-            k = at[frame, drone]
-            if frame == 0 or k != at[frame - 1, drone]:
-                known[:] = 0
-            x_m, y_m, c, s = eye_m[k, 0], eye_m[k, 1], cosine[k], sine[k]
-            fall_m = max(eye_m[k, 2] - from_m, 1.0)
-            for cell in range(_CELLS * _CELLS):
-                row, column = cell // _CELLS, cell % _CELLS
-                if states[frame, drone, row, column] == 0:
-                    continue
-                if known[cell] == 0:
-                    there = seen = 0
-                    for i in range(_SAMPLES * row, _SAMPLES * (row + 1)):
-                        for j in range(_SAMPLES * column, _SAMPLES * (column + 1)):
-                            east, north = east_m[k, j], north_m[k, i]
-                            x, y = x_m + c * east - s * north, y_m + s * east + c * north
-                            px, py = (x - x0_m) / _RES_M, (y - y0_m) / _RES_M
-                            pixel = min(max(np.int64(py) * columns + np.int64(px), 0), len(roofed) - 1)
-                            if east * east + north * north <= reach_m2 and not roofed[pixel]:
-                                slope_x, slope_y = (x_m - x) / fall_m, (y_m - y) / fall_m
-                                there += 1
-                                seen += _is_clear(
-                                    tops_m, columns, _F(px), _F(py), _F(slope_x * (_STEP_M / _RES_M)),
-                                    _F(slope_y * (_STEP_M / _RES_M)), from_m, steps,
-                                )  # fmt: skip
-                    known[cell] = 1 if there > 0 and 2 * seen >= there else -1
-                if known[cell] < 0:
-                    states[frame, drone, row, column] = 0

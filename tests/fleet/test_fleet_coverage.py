@@ -15,7 +15,6 @@ from sortie.fleet.chart import Chart
 from sortie.fleet.coverage import (
     CELL_M,
     RANGE_M,
-    SAMPLES,
     Poses,
     View,
     attitude,
@@ -27,7 +26,7 @@ from sortie.fleet.coverage import (
 )
 from sortie.perception.benchmark.visibility import in_a_camera, past_houses, past_trees
 from sortie.perception.geometry import FOCAL_PX, FULL, USUAL, Cameras
-from sortie.perception.scene import height_field
+from sortie.perception.scene import height_field, sight_loops
 from sortie.perception.scene.height_field import CAR_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
@@ -235,9 +234,5 @@ def test_a_chart_holds_whatever_is_claimed() -> None:
 
 
 def test_the_compiled_loops_have_the_constants_of_the_raster() -> None:
-    assert (coverage_loops._RES_M, coverage_loops._STEP_M) == (height_field.RES_M, height_field.STEP_M)
-    assert (coverage_loops._CELLS, coverage_loops._SAMPLES, coverage_loops._WELL) == (
-        COVERAGE_CELLS,
-        SAMPLES,
-        Coverage.WELL,
-    )
+    assert (coverage_loops._CELLS, coverage_loops._WELL) == (COVERAGE_CELLS, Coverage.WELL)
+    assert (sight_loops._RES_M, sight_loops._STEP_M) == (height_field.RES_M, height_field.STEP_M)
