@@ -330,8 +330,9 @@ class Agent:
         look = self._look
         if look is None or now_s - look.capture.t_s > LOOK_STANDS_S + 1e-9:
             return NOTHING_SEEN, False
-        grid = placed(look.view, here.row, here.column)
-        return self._chart.mark(grid, here.row, here.column, self.memory.believed, told)
+        seen, row, column = look.view, here.row, here.column
+        grid = seen.grid if seen.row == row and seen.column == column else placed(seen, row, column)
+        return self._chart.mark(grid, row, column, self.memory.believed, told)
 
     def _check_clock(self) -> None:
         """Report where the own clock is off the fleet's, and where it no longer is."""
@@ -384,7 +385,10 @@ class Agent:
         if self._guard is not None:
             self._keep_invariants(self._guard, view, asked_of)
         self.status.work.decisions += 1
-        others = ages[memory.ids != me] if is_heard else [age_s for peer, age_s in view.age_s.items() if peer != me]
+        if is_heard:
+            others: Ages = ages.take(memory.others)
+        else:
+            others = [age_s for peer, age_s in view.age_s.items() if peer != me]
         self._log.decision(now_s, me, elapsed_ns, others)
 
     def _overdue(self, ages_s: NDArray[np.float64], now_s: float) -> list[int]:

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
-from typing import NamedTuple, overload
+from functools import cache, lru_cache
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from sortie.perception.geometry import FULL, USUAL, Cameras, camera_depth_m
+from sortie.perception.geometry import FULL, USUAL, Cameras
 from sortie.perception.scene.height_field import HeightField
 from sortie.policies.contract import COVERAGE_BYTES, COVERAGE_CELLS
 from sortie.policies.contract import COVERAGE_CELL_M as CELL_M
@@ -72,6 +72,19 @@ def unpack_grid(grid: bytes) -> States:
     return states.reshape(COVERAGE_CELLS, COVERAGE_CELLS)
 
 
+@cache
+def loops() -> Any:
+    """The compiled loops, imported and made ready at their first use: before a flight, whose drones may be real ones."""
+    from sortie.fleet import coverage_loops
+
+    f, states, single = np.float32, np.zeros((0, COVERAGE_CELLS, COVERAGE_CELLS), np.uint8), np.zeros(0, np.float32)
+    coverage_loops.camera_states(
+        single, single, single, np.zeros((0, 3, 3), f), single, 1.0, 1.0, 1.0, 1.0, f(0), f(0), states
+    )
+    coverage_loops.count(np.frombuffer(b"", np.uint8).reshape(0, COVERAGE_BYTES), states)
+    return coverage_loops
+
+
 class View(NamedTuple):
     """What a drone's cameras see at one moment: states unseen, poor and well, placed where it believes to be."""
 
@@ -103,16 +116,14 @@ def camera_states(x_m: Array, y_m: Array, height_m: Array, body: Array, cameras:
         body: [..., 3, 3] the attitude, body (FLU) to ENU.
         cameras: of all these drones.
     """
-    east, north = ((_MIDDLES_M - np.asarray(v, np.float32)[..., None]) for v in (x_m, y_m))
-    east, north, up = east[..., None, :], north[..., :, None], np.asarray(height_m, np.float32)[..., None, None]
-    turn = body.astype(np.float32)[..., None, None]
-    x, y, z = (
-        turn[..., 0, k, :, :] * east + turn[..., 1, k, :, :] * north - turn[..., 2, k, :, :] * up for k in range(3)
+    lens = cameras.lens
+    states = np.empty((*body.shape[:-2], COVERAGE_CELLS, COVERAGE_CELLS), np.uint8)
+    x, y, height = (np.ascontiguousarray(v, np.float32).reshape(-1) for v in (x_m, y_m, height_m))
+    turn = np.ascontiguousarray(body, np.float32).reshape(-1, 3, 3)
+    near_m2, well_m2 = np.float32(RANGE_M**2), np.float32(WELL_PIXEL_M2 * cameras.focal_px**2)
+    loops().camera_states(
+        x, y, height, turn, _MIDDLES_M, *lens, near_m2, well_m2, states.reshape(-1, COVERAGE_CELLS, COVERAGE_CELLS)
     )
-    depth = camera_depth_m(x, y, z, cameras.lens)
-    near = east * east + north * north <= np.float32(RANGE_M**2)
-    well = depth * depth * depth <= np.float32(WELL_PIXEL_M2 * cameras.focal_px**2) * up
-    states: States = (near & np.isfinite(depth)).astype(np.uint8) + (near & well).astype(np.uint8)
     return states
 
 
@@ -145,7 +156,7 @@ def views(poses: Poses, field: HeightField, cameras: Sequence[Cameras] | None = 
         of = [drone for drone, its in enumerate(each) if its == kind]
         x, y = away[:, of, 0], away[:, of, 1]
         states[:, of] = camera_states(x, y, poses.position_m[:, of, 2], body[:, of], kind)
-    states *= _in_sight(poses, corner, -turn, field)
+    _hide(states, poses, corner, -turn, field)
     packed = states.reshape(*states.shape[:2], COVERAGE_BYTES, 4) @ _BYTE_PLACES
     return [
         [View(row, column, grid.tobytes()) for (column, row), grid in zip(at, grids, strict=True)]
@@ -153,10 +164,10 @@ def views(poses: Poses, field: HeightField, cameras: Sequence[Cameras] | None = 
     ]
 
 
-def _in_sight(poses: Poses, corner: npt.NDArray[np.int64], turn: Array, field: HeightField) -> npt.NDArray[np.bool_]:
-    """Whether half of each cell's open ground has a line of sight: [frames, drones, 16, 16].
+def _hide(states: States, poses: Poses, corner: npt.NDArray[np.int64], turn: Array, field: HeightField) -> None:
+    """Set the states [frames, drones, 16, 16] of cells to unseen where less than half of their open ground is in sight.
 
-    Lines are followed where a drone has flown `SIGHT_MOVES_M` or its grid has moved; the frames in between keep them.
+    Lines of sight are followed where a drone has flown `SIGHT_MOVES_M` or its grid has moved; the frames in between keep them.
     """
     moved = np.zeros(turn.shape)
     moved[1:] = np.cumsum(np.linalg.norm(np.diff(poses.position_m, axis=0), axis=-1), axis=0)
@@ -167,20 +178,10 @@ def _in_sight(poses: Poses, corner: npt.NDArray[np.int64], turn: Array, field: H
     at = np.maximum.accumulate(np.where(renewed, np.cumsum(renewed.ravel()).reshape(renewed.shape) - 1, 0), axis=0)
     eye, believed = poses.position_m[frame, drone], poses.est_position_m[frame, drone, :2]
     steps = (np.arange(COVERAGE_CELLS * SAMPLES) + 0.5) * (CELL_M / SAMPLES)
-    east = (corner[frame, drone, 0] * CELL_M - believed[:, 0])[:, None, None] + steps
-    north = (corner[frame, drone, 1] * CELL_M - believed[:, 1])[:, None, None] + steps[:, None]
-    c, s = np.cos(turn[frame, drone])[:, None, None], np.sin(turn[frame, drone])[:, None, None]
-    x = eye[:, 0, None, None] + c * east - s * north
-    y = eye[:, 1, None, None] + s * east + c * north
-    ground = field.open(x.ravel(), y.ravel())
-    ground &= np.broadcast_to(east * east + north * north <= (RANGE_M + CELL_M) ** 2, x.shape).ravel()
-    which = np.flatnonzero(ground)
-    free = np.zeros(len(ground), bool)
-    free[which] = field.seen(x.ravel()[which], y.ravel()[which], eye[which // steps.size**2])
-    cells = (len(frame), COVERAGE_CELLS, SAMPLES, COVERAGE_CELLS, SAMPLES)
-    seen, there = (v.reshape(cells).sum(axis=(2, 4), dtype=np.int8) for v in (free, ground))
-    enough: npt.NDArray[np.bool_] = (2 * seen >= there) & (there > 0)
-    return enough[at]
+    ends = corner[frame, drone] * CELL_M - believed
+    east, north = ends[:, :1] + steps, ends[:, 1:] + steps
+    turned = turn[frame, drone]
+    field.hide(states, at, eye, east, north, np.cos(turned), np.sin(turned), (RANGE_M + CELL_M) ** 2)
 
 
 @lru_cache(maxsize=256)

@@ -28,8 +28,10 @@ from sortie.fleet.trust import (
     judge,
     split_arrivals,
 )
+from sortie.perception.geometry import USUAL
 from sortie.perception.types import Capture
 from sortie.policies.contract import ROUNDING_PERIODS, Descriptor, FleetView
+from sortie.policies.geometry import note_circles
 from sortie.scenarios.disc import LISTED_MEMBERS
 from sortie.scenarios.representation import MAPS, Representation
 
@@ -65,13 +67,17 @@ class PeerMemory:
         self._period_s, self._fresh_s = rules.descriptor_period_s, rules.fresh_s
         self.clocks = PeerClocks(rules.period_s, table.ahead_s[row], table.watched[row])
         self._heard_s, self._stamps_s, self._ahead_s = table.heard_s[row], table.stamps_s[row], table.ahead_s[row]
+        self._circles = table.circles[row]
         self._known: dict[int, Descriptor] = {}  # by ascending id
         self.ids: NDArray[np.int64] = np.empty(0, np.int64)
         """Of whom it has a descriptor, itself included, ascending; another array once there is one more."""
+        self.others: NDArray[np.intp] = np.empty(0, np.intp)
+        """Places in `ids` of all but itself."""
         self._standings = Standings({}, table.heard_s.shape[1] if rules.trust else 0)
         self._doubted: frozenset[int] = frozenset()
         self._arrivals: dict[int, list[Arrival]] = {}
         self._judged_at_s = -math.inf
+        self._cameras = {i: its.cameras for i, its in rules.makes.items() if its.cameras != USUAL}
         self._stations = frozenset(i for i, its in rules.makes.items() if not its.flies)
         self._loops = loops()
         charge_loop()
@@ -94,7 +100,9 @@ class PeerMemory:
         else:  # by ascending id, so that the order of arrival decides nothing
             self._known = dict(sorted([*known.items(), (sender, descriptor)]))
             self.ids = np.array(list(self._known), np.int64)
+            self.others = np.flatnonzero(self.ids != self.drone)
         self._heard_s[sender], self._stamps_s[sender] = now_s, descriptor.stamp_ns * 1e-9
+        self._circles[sender] = _circle(descriptor)
 
     def can_fuse(self, payload: Payload) -> bool:
         """Whether the drone can use it. Feature cells of another network mean nothing to it, and codes of another codebook.
@@ -165,6 +173,7 @@ class PeerMemory:
         known = dict(self._known)
         for doubted in self._doubted:
             known[doubted] = discounted(known[doubted])
+        note_circles(known, self._circles.copy())
         ages_s = self.ages(now_s) if ages is None else ages
         by_peer = MappingProxyType(dict(zip(known, ages_s.tolist(), strict=True)))
         return FleetView(
@@ -215,12 +224,18 @@ class PeerMemory:
             self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
         self._standings = after = judge(
             before, self.drone, heard, arrivals, self._rules.form, looking,
-            lambda i: self._rules.equipment(i).cameras, self._stations,
+            self._cameras, self._stations,
         )  # fmt: skip
         strikes, were = after.rows["strikes"], before.rows["strikes"]
         self._doubted = frozenset(np.flatnonzero(strikes >= STRIKES_TO_DOUBT).tolist())
         moved = np.flatnonzero(strikes != were).tolist()
         return [(peer, after[peer]) for peer in moved if after[peer].trust != before.get(peer, UNJUDGED).trust]
+
+
+def _circle(d: Descriptor) -> tuple[float, float, float]:
+    """The footprint that a drone claims."""
+    x_m, y_m, _ = d.position_m
+    return float(x_m), float(y_m), float(d.footprint_radius_m)
 
 
 def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float) -> list[tuple[int, DropReason]]:
@@ -246,15 +261,20 @@ def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float
     table, rules = first.table, first._rules
     if sender >= table.heard_s.shape[1]:  # no drone of this fleet has such an id
         return [(memory.drone, DropReason.MALFORMED) for memory in receivers]
-    module = loops()
+    module, count = loops(), len(receivers)
     found = module.hear(
-        np.array([memory.row for memory in receivers]), table.first,
-        np.array([memory.status.clock_skew_s for memory in receivers]), sender, descriptor.stamp_ns * 1e-9, now_s,
-        key_id is not None, np.uint64(counter), rules.period_s, rules.descriptor_period_s, table.window,
-        table.counters(key_id or 0), table.heard_s, table.stamps_s, table.watched, table.bits,
-    )  # fmt: skip
+        np.fromiter([memory.row for memory in receivers], np.int64, count), table.first,
+        np.fromiter([memory.status.clock_skew_s for memory in receivers], np.float64, count), sender,
+        descriptor.stamp_ns * 1e-9, _circle(descriptor), now_s, key_id is not None, np.uint64(counter), rules.period_s,
+        rules.descriptor_period_s, table.window, table.counters(key_id or 0), table.heard_s, table.stamps_s,
+        table.circles, table.watched, table.bits,
+    ).tobytes()  # fmt: skip
+    if found.count(module.TAKEN) == count:  # as nearly always
+        for memory in receivers:
+            memory._known[sender] = descriptor
+        return []
     refused = []
-    for memory, what in zip(receivers, found.tolist(), strict=True):
+    for memory, what in zip(receivers, found, strict=True):
         if what == module.TAKEN:
             memory._known[sender] = descriptor
         elif what == module.UNUSUAL:

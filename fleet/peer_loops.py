@@ -49,8 +49,8 @@ def _count(words, window):
 
 @compiled
 def hear(
-    rows, first, skews_s, sender, stamp_s, now_s, is_counted, counter, delay_s, period_s, window, counters, heard_s,
-    stamps_s, watched, bits,
+    rows, first, skews_s, sender, stamp_s, circle, now_s, is_counted, counter, delay_s, period_s, window, counters, heard_s,
+    stamps_s, circles, watched, bits,
 ):  # fmt: skip
     """Take a datagram in at several receivers, drones `first` + `rows` [K]; returns what it is to each, [K]."""
     found = np.empty(len(rows), np.uint8)
@@ -74,6 +74,8 @@ def hear(
             _arrived(words, window, min(int((now_s - heard_s[row, sender]) / period_s + 0.5), window))
         heard_s[row, sender] = now_s
         stamps_s[row, sender] = stamp_s
+        for axis in range(3):
+            circles[row, sender, axis] = circle[axis]
     return found
 
 

@@ -24,8 +24,8 @@ def loops() -> Any:
     none, ids, flags = np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.uint8)
     bits, square = np.zeros((0, 1), np.uint64), np.zeros((0, 0))
     peer_loops.hear(
-        ids, 0, none, 0, 0.0, 0.0, True, np.uint64(0), 1.0, 1.0, 1, square.astype(np.uint64), square, square,
-        square.astype(np.uint8), bits[None],
+        ids, 0, none, 0, 0.0, (0.0, 0.0, 0.0), 0.0, True, np.uint64(0), 1.0, 1.0, 1, square.astype(np.uint64), square, square,
+        square[..., None], square.astype(np.uint8), bits[None],
     )  # fmt: skip
     peer_loops.fill(0.0, 1.0, 1, ids, none, bits, none, none)
     peer_loops.ages(0.0, 0.0, ids, none, none, none)
@@ -51,6 +51,8 @@ class PeerTable:
         """Its stamp, by the sender's clock."""
         self.ahead_s = np.zeros(shape)
         """How far the receiver's clock is ahead of the sender's, as far as that shows."""
+        self.circles = np.zeros((*shape, 3))
+        """The footprint that it claims: x, y and radius, m."""
         self.watched = np.zeros(shape, np.uint8)
         """Whether the sender's clock showed an offset lately, so that each of its lags counts (`sortie.fleet.clock`)."""
         self.bits = np.zeros((*shape, -(-window // loops().WORD)), np.uint64)

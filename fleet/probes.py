@@ -40,6 +40,6 @@ class Probes:
             goodput_mbps: [K], as measured with payloads; 0 without a measurement.
             now_s: the time, s.
         """
-        known = np.array(goodput_mbps, np.float64)
+        known = np.fromiter(goodput_mbps, np.float64, len(goodput_mbps))
         self._fill(now_s, self._period_s, self._window, peers, self._heard_s, self._bits, self._mbps, known)
         return tuple(known.tolist())

@@ -13,20 +13,21 @@ All of it is pure: `judge` takes what is known and gives what is thought of a pe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from functools import cache
 from itertools import pairwise
 from statistics import median
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from sortie.fleet.coverage import LOOK_STANDS_S, attitude, camera_states, unpack_grid
+from sortie.fleet.coverage import LOOK_STANDS_S, attitude, camera_states, loops, unpack_grid
 from sortie.fleet.messages.compact import FULL, Form
 from sortie.fleet.standings import MOST_STRIKES, Standing, Standings
 from sortie.perception.geometry import USUAL, Cameras
-from sortie.policies.contract import COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
+from sortie.policies.contract import COVERAGE_BYTES, COVERAGE_CELL_M, COVERAGE_CELLS, Coverage, Descriptor
 
 JUDGED_EVERY_S = 1.0
 
@@ -99,7 +100,7 @@ def judge(
     arrivals: Mapping[int, Sequence[Arrival]],
     form: Form = FULL,
     looking: Container[int] = (),
-    cameras: Callable[[int], Cameras] = lambda _: USUAL,
+    cameras: Mapping[int, Cameras] = MappingProxyType({}),
     stations: Container[int] = (),
 ) -> Standings:
     """What `ego` thinks of everyone after one more second.
@@ -110,31 +111,32 @@ def judge(
         arrivals: payloads that reached it in this second, by sender.
         form: how finely descriptors are written; what rounding can do is no doubt.
         looking: who looked shortly before its claim, as payloads of that look show.
-        cameras: a drone's cameras, as its make has them.
+        cameras: those of drones that have others than the usual ones.
         stations: who stands on the ground. Their charge says nothing about the fleet's fall, and may stay as it is.
 
     Returns:
         Standings of all in `known`, and of others a second older: one strike more where a claim cannot be so, one less
         where all can. The ego has nothing to doubt in itself, but its battery is one of the fleet's.
     """
-    claims, ids = list(known.values()), np.array(list(known), np.int64)
+    claims, ids, peers = list(known.values()), np.array(list(known), np.int64), [i for i in known if i != ego]
     after = Standings(standings, int(ids.max(initial=-1)) + 1)
     claimed_soc = np.array([d.battery_soc for d in claims])
-    flies = np.array([i not in stations for i in known], np.bool_)
+    flies = np.array([i not in stations for i in known], np.bool_) if stations else np.ones(len(ids), np.bool_)
     false_charge, others_fell = charge_loop()(after.rows, ids, claimed_soc, flies, form.soc_step)
-    peers = [i for i in known if i != ego]
-    cells = dict.fromkeys(peers, NO_CELLS)
+    wrong = {}  # what coverage says of peers
     if math.isfinite(form.blur_m):
-        counted = _count_cells([known[i] for i in peers], form.blur_m, [cameras(i) for i in peers])
-        cells = dict(zip(peers, counted, strict=True))
-    doubts = {}
-    for k, (peer, claim, is_false) in enumerate(zip(known, claims, false_charge.tolist(), strict=True)):
-        if peer == ego:
+        kinds = [cameras.get(i, USUAL) for i in peers] if cameras else [USUAL] * len(peers)
+        for peer, cells in zip(peers, _count_cells([known[i] for i in peers], form.blur_m, kinds), strict=True):
+            if cells.seen < FALSE_CELLS or cells.impossible >= FALSE_CELLS:
+                wrong[peer] = _coverage_doubt(cells, peer in looking)
+    doubts, open_to_doubt = {}, {*wrong, *arrivals, *ids[false_charge].tolist()} - {ego}
+    for k, (peer, claim) in enumerate(known.items()):
+        if peer not in open_to_doubt:
             continue
-        doubt, came = _coverage_doubt(cells[peer], peer in looking), arrivals.get(peer)
+        doubt, came = wrong.get(peer, ""), arrivals.get(peer)
         if not doubt and came and claim.counts(ego):  # who leaves the ego out claims no goodput to it
             doubt = goodput_doubt(claim.goodput_to(ego), came, form.goodput_step_mbps)
-        if not doubt and is_false:
+        if not doubt and false_charge[k]:
             standing = after[peer]
             unseen = max(3 * form.soc_step, 0.0 if standing.fine else PERCENT)
             doubt = battery_doubt(
@@ -193,9 +195,6 @@ class _Cells(NamedTuple):
     """Whether the drone is above the roofs."""
 
 
-NO_CELLS = _Cells(0, 0, False)
-"""Of a descriptor without a coverage grid."""
-
 _COUNTED: dict[int, tuple[Descriptor, float, Cameras, _Cells]] = {}
 """By the identity of the claim, which all who heard it share."""
 _MOST_COUNTED = 4096
@@ -209,11 +208,11 @@ def _count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[
         blur_m: how far a cell may be off by the descriptors' form.
         cameras: of the drone of each claim.
     """
-    found = [_COUNTED.get(id(d)) for d in claims]
+    found = list(map(_COUNTED.get, map(id, claims)))
     new = [
         k
         for k, (d, its, one) in enumerate(zip(claims, cameras, found, strict=True))
-        if one is None or one[0] is not d or one[1] != blur_m or (one[2] is not its and one[2] != its)
+        if one is None or one[0] is not d or one[2] is not its or one[1] != blur_m
     ]
     if len(_COUNTED) + len(new) > max(_MOST_COUNTED, 2 * len(claims)):
         _COUNTED.clear()
@@ -225,22 +224,21 @@ def _count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[
 
 
 def _count(claims: Sequence[Descriptor], blur_m: float, cameras: Cameras) -> list[_Cells]:
-    states = np.stack([unpack_grid(d.coverage_grid) for d in claims])
+    grids = np.frombuffer(b"".join([d.coverage_grid for d in claims]), np.uint8).reshape(-1, COVERAGE_BYTES)
     half, position_m = COVERAGE_CELLS // 2, np.array([d.position_m for d in claims])
     corner = np.array([d.coverage_corner for d in claims], np.float64)
     away_x = position_m[:, 0] - (corner[:, 1] + half) * COVERAGE_CELL_M
     away_y = position_m[:, 1] - (corner[:, 0] + half) * COVERAGE_CELL_M
     body = attitude(np.array([d.orientation_xyzw for d in claims]))
-    could = camera_states(away_x, away_y, position_m[:, 2], body, cameras) >= Coverage.WELL
-    well, found = states >= Coverage.WELL, []
-    for d, claimed, possible, seen in zip(claims, well, could, np.count_nonzero(states, axis=(1, 2)), strict=True):
-        impossible = int(np.count_nonzero(claimed & ~possible))
+    could, found = camera_states(away_x, away_y, position_m[:, 2], body, cameras), []
+    counts = loops().count(grids, could).tolist()
+    for d, possible, (impossible, seen) in zip(claims, could, counts, strict=True):
         if impossible >= FALSE_CELLS:  # else no leave that is given can matter
             flown_m = math.hypot(*d.velocity_mps) * LOOK_STANDS_S + blur_m
             reach = 1 + math.ceil(flown_m / COVERAGE_CELL_M)  # a cell more: it may have turned since it looked
-            near = binary_dilation(possible, np.ones((3, 3)), iterations=reach)
-            impossible = int(np.count_nonzero(claimed & ~near))
-        found.append(_Cells(impossible, int(seen), d.position_m[2] >= ROOFS_M))
+            near = binary_dilation(possible >= Coverage.WELL, np.ones((3, 3)), iterations=reach)
+            impossible = int(np.count_nonzero((unpack_grid(d.coverage_grid) >= Coverage.WELL) & ~near))
+        found.append(_Cells(impossible, seen, d.position_m[2] >= ROOFS_M))
     return found
 
 

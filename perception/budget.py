@@ -8,9 +8,9 @@ running the detector. The evaluation (`evaluation/selection.py`) ranks cells by 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,9 +122,18 @@ def cells_sent(rho: float, roi: Disc | None, x_m: float, y_m: float, yaw_rad: fl
     budget = cells_in(rho)
     if roi is None or budget == 0:
         return budget
-    _, _, row_room, column_part = _window(roi, x_m, y_m, yaw_rad)
-    column_part.sort()
-    return min(budget, sum([bisect_right(column_part, room) for room in row_room]))
+    dx, dy, c, s = roi[0] - x_m, roi[1] - y_m, math.cos(yaw_rad), math.sin(yaw_rad)
+    inside: int = _loops().count(c * dx + s * dy, -s * dx + c * dy, float(roi[2]), CELL_M)
+    return min(budget, inside)
+
+
+@cache
+def _loops() -> Any:
+    """The compiled loop, imported and made ready at its first use."""
+    from sortie.perception import budget_loops
+
+    budget_loops.count(0.0, 0.0, 1.0, CELL_M)
+    return budget_loops
 
 
 def must_choose(rho: float, roi: Disc | None, x_m: float, y_m: float, yaw_rad: float) -> bool:

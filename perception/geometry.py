@@ -143,18 +143,6 @@ def camera_margins(x: Any, y: Any, z: Any, lens: Lens = USUAL.lens) -> tuple[Any
     return down, 1.0 - np.maximum(u, v)
 
 
-def camera_depth_m(x: Any, y: Any, z: Any, lens: Lens = USUAL.lens) -> Any:
-    """How far points lie in front of the camera that shows them largest, along its axis; infinite where none shows them.
-
-    Args:
-        x, y, z: the points in the body frame (FLU), metres, arrays.
-        lens: the cameras', numbers.
-    """
-    down, side = camera_margins(x, y, z, lens)
-    ahead = (lens.ahead * np.maximum(np.abs(x), np.abs(y)) - lens.down * z) / np.sqrt(2.0, dtype=np.float32)
-    return np.minimum(np.where(down > 0.0, -z, np.inf), np.where(side > 0.0, ahead, np.inf))
-
-
 def in_square(
     xy_m: NDArray[np.floating], poses: ArrayLike, half_extent_m: float = FULL.half_extent_m
 ) -> NDArray[np.bool_]:

@@ -97,10 +97,11 @@ def grown(covariance: Floats, dt_s: Floats) -> Floats:
     pp, pv, vv = covariance.T
     noise = ACCELERATION_DENSITY * np.abs(dt_s)
     square = dt_s * dt_s
-    return np.stack(
-        [pp + 2.0 * dt_s * pv + square * vv + noise * square / 3.0, pv + dt_s * vv + noise * dt_s / 2.0, vv + noise],
-        axis=1,
-    )
+    out = np.empty((len(pp), 3))
+    out[:, 0] = pp + 2.0 * dt_s * pv + square * vv + noise * square / 3.0
+    out[:, 1] = pv + dt_s * vv + noise * dt_s / 2.0
+    out[:, 2] = vv + noise
+    return out
 
 
 def predicted(tracks: Tracks, to_s: ArrayLike) -> Tracks:

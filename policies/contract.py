@@ -213,8 +213,10 @@ class FleetView(NamedTuple):
     @property
     def peers(self) -> tuple[int, ...]:
         """Ids of the other drones heard, ascending."""
-        ego = self.ego
-        return tuple([i for i in sorted(self.descriptors) if i != ego])
+        ids = sorted(self.descriptors)
+        if self.ego in self.descriptors:
+            ids.remove(self.ego)
+        return tuple(ids)
 
     @property
     def human_in_region(self) -> bool:
@@ -320,25 +322,31 @@ def nothing(source: int, destination: int, reason: str) -> Directive:
     An id of another type than int, though equal to one, gives a directive of its own.
     """
     if type(source) is type(destination) is int and type(reason) is str:
-        return _nothing(source, destination, reason)
-    return Directive(source, destination, reason=reason)
-
-
-@lru_cache(maxsize=1 << 18)  # a few for each link of a thousand drones
-def _nothing(source: int, destination: int, reason: str) -> Directive:
+        return _nothing(source, reason)[destination]
     return Directive(source, destination, reason=reason)
 
 
 def nothing_to_all(source: int, destinations: tuple[int, ...], reason: str) -> tuple[Directive, ...]:
     """`nothing` for each of several destinations."""
     if type(destinations) is tuple and {type(source), *map(type, destinations)} == {int} and type(reason) is str:
-        return _nothing_to_all(source, destinations, reason)
+        return tuple(map(_nothing(source, reason).__getitem__, destinations))
     return tuple([nothing(source, destination, reason) for destination in destinations])
 
 
-@lru_cache(maxsize=1 << 12)
-def _nothing_to_all(source: int, destinations: tuple[int, ...], reason: str) -> tuple[Directive, ...]:
-    return tuple([_nothing(source, destination, reason) for destination in destinations])
+class _Nothing(dict[int, Directive]):
+    """By destination, the directive to send nothing; made when it is first asked for."""
+
+    def __init__(self, source: int, reason: str) -> None:
+        self._source, self._reason = source, reason
+
+    def __missing__(self, destination: int) -> Directive:
+        made = self[destination] = Directive(self._source, destination, reason=self._reason)
+        return made
+
+
+@lru_cache(maxsize=1 << 13)  # a few for each of a thousand drones
+def _nothing(source: int, reason: str) -> _Nothing:
+    return _Nothing(source, reason)
 
 
 class Policy(Protocol):

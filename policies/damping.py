@@ -52,13 +52,13 @@ def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float
     soc, cpu, gpu, links, last = own_soc, own_cpu, own_gpu, own_links, before.peer_goodput_mbps
     if measured.roster is not None and measured.roster != before.roster:
         last = before.with_roster(measured.roster).peer_goodput_mbps
-    if links != last and len(links) == len(last):  # else the fleet is another; tiny values are states, not rates
-        links = tuple(
-            [
-                u if u <= v or u <= PROBED_MBPS else (v if v > u * part else u * part)
-                for u, v in zip(links, last, strict=True)
-            ]
-        )
+    if links != last and len(links) == len(last):  # else the fleet is another
+        risen = list(links)
+        for k in [k for k, u in enumerate(links) if u > PROBED_MBPS]:  # tiny values are states, not rates
+            u, v = links[k], last[k]
+            if u > v:
+                risen[k] = v if v > u * part else u * part
+        links = tuple(risen)
     if soc > before.battery_soc:
         soc = max(before.battery_soc, soc * part)
     if cpu > before.cpu_headroom:

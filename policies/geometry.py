@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
-from itertools import chain
 from math import hypot
+from operator import is_
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sortie.policies.contract import Descriptor, FleetView
 from sortie.scenarios.disc import AGENT_IDS, disc_overlap
@@ -30,13 +32,35 @@ def peers_by_overlap(view: FleetView, receiver: int | None = None) -> list[int]:
     known = view.descriptors
     if of not in known:
         return []
-    ids, each = list(known), known.values()
-    position_m = np.fromiter(chain.from_iterable([d.position_m for d in each]), np.float64)
-    radius_m = np.array([d.footprint_radius_m for d in each], np.float64)
-    places = places_loop()(ids.index(of), np.array(ids), position_m, radius_m)
+    ids = np.fromiter(known, np.int64, len(known))
+    noted, circles = _latest
+    if all(map(is_, map(noted.get, known), known.values())):
+        at = ids
+    else:
+        numbers: list[float] = []
+        for d in known.values():
+            numbers += (*d.position_m[:2], d.footprint_radius_m)
+        at, circles = np.arange(len(ids)), np.fromiter(numbers, np.float64, len(numbers)).reshape(-1, 3)
+    places = places_loop()(of, ids, at, circles)
     places.sort()
-    ranked: list[int] = ((of + places) % AGENT_IDS).tolist()
+    places += of
+    places %= AGENT_IDS
+    ranked: list[int] = places.tolist()
     return ranked
+
+
+_latest: tuple[Mapping[int, Descriptor], NDArray[np.float64]] = {}, np.zeros((0, 3))
+
+
+def note_circles(descriptors: Mapping[int, Descriptor], circles: NDArray[np.float64]) -> None:
+    """Give the footprints of descriptors that are about to be ranked as an array, which takes longer to make of them than to rank.
+
+    Args:
+        descriptors: they and the array must not change any more. Views of some of them rank by the array too.
+        circles: [ids, 3], x, y and radius, m.
+    """
+    global _latest
+    _latest = descriptors, circles
 
 
 @cache
@@ -44,5 +68,6 @@ def places_loop() -> Any:
     """The compiled loop, imported and made ready at its first use: before a flight, for decisions may have little time."""
     from sortie.policies.overlap_loops import places
 
-    places(0, np.zeros(1, np.int64), np.zeros(3), np.zeros(1))
+    one = np.zeros(1, np.int64)
+    places(0, one, one, np.zeros((1, 3)))
     return places

@@ -28,22 +28,25 @@ def _overlap(distance_m, a_m, b_m):
 
 
 @compiled
-def places(me, ids, position_m, radius_m):
-    """What `sortie.scenarios.disc.rank_by_overlap` sorts by, of all ids but one, `ids[me]`.
+def places(of, ids, at, circles):
+    """What `sortie.scenarios.disc.rank_by_overlap` sorts by, of all ids but one.
 
     Args:
-        me: whose peers are ranked.
-        ids: [N].
-        position_m: [3 N], x, y and z of each.
-        radius_m: [N], of the footprints.
+        of: the id whose peers are ranked.
+        ids: [N], it among them.
+        at: [N], the row of each in the next array.
+        circles: [..., 3], the footprints: x, y and radius, m.
     """
-    ego, x_m, y_m = ids[me], position_m[3 * me], position_m[3 * me + 1]
+    me = 0
+    while ids[me] != of:
+        me += 1
+    x_m, y_m, radius_m = circles[at[me]]
     found = np.empty(len(ids) - 1, np.int64)
     count = 0
     for k in range(len(ids)):
         if k != me:
-            away_m = np.hypot(x_m - position_m[3 * k], y_m - position_m[3 * k + 1])
-            overlap = _overlap(away_m, radius_m[me], radius_m[k])
-            found[count] = (ids[k] - ego) % _AGENT_IDS - _AGENT_IDS * int(np.rint(overlap / _STEP))
+            its = circles[at[k]]
+            overlap = _overlap(np.hypot(x_m - its[0], y_m - its[1]), radius_m, its[2])
+            found[count] = (ids[k] - of) % _AGENT_IDS - _AGENT_IDS * int(np.rint(overlap / _STEP))
             count += 1
     return found

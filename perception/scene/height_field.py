@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +17,20 @@ CAR_TOP_M = 1.2
 """What of a car has to be seen over a roof or a hedge."""
 TRUCK_TOP_M = 2.4
 """The same of a truck: three quarters of its height too."""
-_RAYS = 16384
+
+
+@cache
+def loops() -> Any:
+    """The compiled loops, imported and made ready at their first use: before a flight, whose drones may be real ones."""
+    from sortie.perception.scene import sight_loops
+
+    single, none, wide = np.zeros(0, np.float32), np.zeros(0), np.zeros((0, 1))
+    states = np.zeros((0, 1, 16, 16), np.uint8)
+    sight_loops.march(single, 1, single, single, single, single, 0.0, 0)
+    sight_loops.hide(
+        states, wide.astype(np.int64), wide, wide, wide, none, none, 0.0, single, single > 0, 1, 0.0, 0.0, 0.0, 0
+    )
+    return sight_loops
 
 
 class HeightField:
@@ -36,6 +52,7 @@ class HeightField:
         self.top_m = float(height.max(initial=0.0))
         self._flat = height.ravel()
         self._sun = shadow_m(town.scene)
+        loops()
 
     def seen(self, x_m: Floats, y_m: Floats, eye_m: Floats, top_m: float = CAR_TOP_M) -> NDArray[np.bool_]:
         """Whether points [n] at a height, a car's if not given, are seen from `eye_m` [n, 3]."""
@@ -52,27 +69,24 @@ class HeightField:
         pixel = ((y_m - self.y0_m) / RES_M).astype(np.intp) * self.columns + ((x_m - self.x0_m) / RES_M).astype(np.intp)
         return np.asarray(~self._roofed.take(pixel, mode="clip"))
 
+    def hide(self, states: NDArray[np.uint8], at: NDArray[np.int64], *lines: Any) -> None:
+        """Set cells to 0 of which less than half of the open ground is in sight; arguments as for `sight_loops.hide`."""
+        loops().hide(
+            states, at, *lines, self._flat, self._roofed, self.columns, self.x0_m, self.y0_m, CAR_TOP_M, self._steps(CAR_TOP_M)
+        )  # fmt: skip
+
+    def _steps(self, from_m: float) -> int:
+        """Steps that a ray takes from a height until it is above everything."""
+        return int(np.ceil(max(self.top_m - from_m, 0.0) / STEP_M))
+
     def _march(
         self, x_m: Floats, y_m: Floats, slope_x: Floats, slope_y: Floats, from_m: float = CAR_TOP_M
     ) -> NDArray[np.bool_]:
-        """Follow rays upwards from a height; slopes are metres sideways for each metre of height. Rays go in groups that fit the cache."""
-        steps = int(np.ceil(max(self.top_m - from_m, 0.0) / STEP_M))
-        clear = np.ones(len(x_m), bool)
-        for at in range(0, len(x_m), _RAYS):
-            some = slice(at, at + _RAYS)
-            sx, sy = (
-                (slope_x[some] * (STEP_M / RES_M)).astype(np.float32),
-                (slope_y[some] * (STEP_M / RES_M)).astype(np.float32),
-            )
-            px = ((x_m[some] - self.x0_m) / RES_M).astype(np.float32) - 0.5 * sx
-            py = ((y_m[some] - self.y0_m) / RES_M).astype(np.float32) - 0.5 * sy
-            for k in range(steps):
-                px += sx
-                py += sy
-                pixel = py.astype(np.intp)
-                pixel *= self.columns
-                pixel += px.astype(np.intp)
-                clear[some] &= self._flat.take(pixel, mode="clip") < from_m + (k + 0.5) * STEP_M
+        """Follow rays upwards from a height; slopes are metres sideways for each metre of height."""
+        px, py = (x_m - self.x0_m) / RES_M, (y_m - self.y0_m) / RES_M
+        each = (px, py, slope_x * (STEP_M / RES_M), slope_y * (STEP_M / RES_M))
+        rays = [v.astype(np.float32) for v in each]
+        clear: NDArray[np.bool_] = loops().march(self._flat, self.columns, *rays, float(from_m), self._steps(from_m))
         return clear
 
 

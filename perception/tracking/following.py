@@ -11,7 +11,7 @@ import numpy as np
 
 from sortie.perception.classes import PERSON
 from sortie.perception.lateness import movement
-from sortie.perception.motion import ACCELERATION_DENSITY, Floats, Tracks, grown, predicted
+from sortie.perception.motion import ACCELERATION_DENSITY, Floats, Tracks, grown
 from sortie.perception.tracking.association import GATE
 from sortie.perception.tracking.tracker import COAST_S, PLACE_VARIANCE_M2
 from sortie.perception.types import Boxes
@@ -78,29 +78,29 @@ def followed(tracks: Tracks, cues: Mapping[int, Cue], before: Mapping[int, int],
         before: what was followed until now, as returned.
         t_s: now.
     """
-    vehicle = tracks.kind != PERSON
-    now = predicted(tracks.take(vehicle & tracks.confirmed & (t_s - tracks.seen_s <= COAST_S)), t_s)
-    row = {track: k for k, track in enumerate(now.id.tolist())}
-    spread = now.covariance + np.array([CUE_VARIANCE_M2, 0.0, CUE_SPEED_VARIANCE])
+    its = np.flatnonzero((tracks.kind != PERSON) & tracks.confirmed & (t_s - tracks.seen_s <= COAST_S))
+    ids, velocity_mps, dt = tracks.id[its].tolist(), tracks.velocity_mps[its], t_s - tracks.t_s[its]
+    xy_m, row = tracks.xy_m[its] + dt[:, None] * velocity_mps, {track: k for k, track in enumerate(ids)}
+    spread = grown(tracks.covariance[its], dt) + np.array((CUE_VARIANCE_M2, 0.0, CUE_SPEED_VARIANCE))
     out: dict[int, int] = {}
     for target, track in before.items():
         k = row.get(track)
         if target in cues and k is not None:
-            x_m, y_m = now.xy_m[k] - np.array(cues[target][:2])
+            x_m, y_m = (xy_m[k] - cues[target][:2]).tolist()
             if x_m * x_m + y_m * y_m < GATE * spread[k, 0]:
                 out[target] = track
     for target in sorted(cues.keys() - out.keys()):
-        cost = _disagreement(now, spread, cues[target])
+        cost = _disagreement(xy_m, velocity_mps, spread, cues[target])
         cost[[row[track] for track in out.values()]] = np.inf
         best = int(cost.argmin()) if len(cost) else -1
         if best >= 0 and cost[best] < AGREE:
-            out[target] = int(now.id[best])
+            out[target] = ids[best]
     return out
 
 
-def _disagreement(tracks: Tracks, spread: Floats, cue: Cue) -> Floats:
+def _disagreement(xy_m: Floats, velocity_mps: Floats, spread: Floats, cue: Cue) -> Floats:
     """Squared Mahalanobis distance [n] in place and velocity; `spread` [n, 3] is the covariance of the difference."""
-    off, faster = tracks.xy_m - np.array(cue[:2]), tracks.velocity_mps - np.array(cue[2:])
+    off, faster = xy_m - cue[:2], velocity_mps - cue[2:]
     pp, pv, vv = spread.T
     cost = vv * (off * off).sum(axis=1) - 2.0 * pv * (off * faster).sum(axis=1) + pp * (faster * faster).sum(axis=1)
     return np.asarray(cost / (pp * vv - pv * pv))

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from sortie.policies.contract import Directive, FleetView, nothing
+from sortie.policies.contract import Directive, FleetView, nothing_to_all
 
 Decide = TypeVar("Decide", bound=Callable[..., Sequence[Directive]])
 DETACHED = "detached: not heard any more"
@@ -27,8 +27,9 @@ def among_attached(policy: Decide) -> Decide:
         if attached is view or attached.me is None:
             return directives
         duty = directives[0].duty_percent if directives else 100
-        gone = (nothing(view.ego, p, DETACHED) for p in sorted(view.descriptors.keys() - attached.descriptors.keys()))
-        return [*directives, *(d if duty == 100 else d._replace(duty_percent=duty) for d in gone)]
+        away = sorted([p for p in view.descriptors if p not in attached.descriptors])
+        gone = nothing_to_all(view.ego, tuple(away), DETACHED)
+        return [*directives, *(gone if duty == 100 else [d._replace(duty_percent=duty) for d in gone])]
 
     decide.__signature__ = inspect.signature(policy)  # type: ignore[attr-defined]
     return decide  # type: ignore[return-value]

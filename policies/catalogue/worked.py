@@ -63,8 +63,7 @@ def worked(view: FleetView, *, rho: float = 1.0) -> list[Directive]:
     for peer in chosen:
         if (goodput_mbps := me.goodput_to(peer)) < MIN_GOODPUT_MBPS:
             weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.2g} < {MIN_GOODPUT_MBPS:g} Mb/s"
-            low = min(rung, DETECTIONS)
-            directive = Directive(ego, peer, low, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak)
+            directive = Directive(ego, peer, DETECTIONS, 0.0, roi, min(rate_hz, SLOW_RATE_HZ), reason=weak)
         else:
             directive = Directive(ego, peer, rung, link_rho, roi, rate_hz, reason=why)
         directives[peers.index(peer)] = directive

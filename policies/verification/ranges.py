@@ -91,12 +91,12 @@ class FleetOfRanges:
         """
         picks, usual, placed = self.path.picks, geometry.places_loop, self._placed
 
-        def places(me: int, ids: Any, position_m: Any, radius_m: Any) -> Any:
-            label = _order_of(ids[me])
+        def places(of: int, ids: Any, *circles: Any) -> Any:
+            label = _order_of(of)
             if label == placed or label not in picks:
-                return usual()(me, ids, position_m, radius_m)
+                return usual()(of, ids, *circles)
             order = [p for p in picks[label] if p in ids]
-            return np.array([(p - ids[me]) % AGENT_IDS - AGENT_IDS * (len(order) - k) for k, p in enumerate(order)])
+            return np.array([(p - of) % AGENT_IDS - AGENT_IDS * (len(order) - k) for k, p in enumerate(order)])
 
         geometry.places_loop = lambda: places  # type: ignore[assignment]
         try:

@@ -78,8 +78,9 @@ class Transport:
 
     def hand_over(self, opened: Opened | Dropped, heard: Sequence[int]) -> None:
         """Give an opened datagram to those that heard it; a refused one is counted and changes nothing."""
-        now_s, memories = self._env.now, [self._receivers[receiver] for receiver in heard]
-        for receiver, reason in hear([m for m in memories if m.status.airborne], opened, now_s):
+        now_s, each = self._env.now, self._receivers
+        memories = [memory for receiver in heard if (memory := each[receiver]).status.airborne]
+        for receiver, reason in hear(memories, opened, now_s):
             self._recorder.rows["drops"].append((now_s, receiver, reason.value))
 
     def send(self, drone: int, peer: int, payload: Payload, capture: Capture, deadline_s: float) -> None:

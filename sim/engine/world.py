@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -196,7 +195,7 @@ class World:
     def _measure_headrooms(self) -> None:
         """Over the last second, so that a duty cycle does not show as a computer that is idle and busy in turn."""
         scenario = self._scenario
-        self._work.append([replace(status.work) for status in self.drones])
+        self._work.append([status.work.copy() for status in self.drones])
         lasts_s = (len(self._work) - 1) * scenario.frame_s
         self._headrooms = [
             headrooms(computer, look_s, a, b, lasts_s)

@@ -10,15 +10,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from sortie.fleet import coverage_loops
 from sortie.fleet.chart import Chart
-from sortie.fleet.coverage import CELL_M, RANGE_M, Poses, View, pack_grid, placed, unpack_grid, views
+from sortie.fleet.coverage import (
+    CELL_M,
+    RANGE_M,
+    Poses,
+    View,
+    attitude,
+    camera_states,
+    pack_grid,
+    placed,
+    unpack_grid,
+    views,
+)
 from sortie.perception.benchmark.visibility import in_a_camera, past_houses, past_trees
-from sortie.perception.geometry import FOCAL_PX, FULL
+from sortie.perception.geometry import FOCAL_PX, FULL, USUAL, Cameras
+from sortie.perception.scene import height_field, sight_loops
 from sortie.perception.scene.height_field import CAR_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Capture
 from sortie.policies.catalogue.coverage_cells import Cells, seen_well, well_cells
-from sortie.policies.contract import Coverage, Descriptor, TaskPhase
+from sortie.policies.contract import COVERAGE_CELLS, Coverage, Descriptor, TaskPhase
 from sortie.scenarios.schema import Scene
 
 BOUNDS = (-100.0, -100.0, 100.0, 100.0)
@@ -54,6 +67,29 @@ def test_a_tilted_camera_looks_elsewhere() -> None:
     )
     ahead, behind = tilted[:, 8:] > 0, tilted[:, :8] > 0
     assert ahead.sum() < 0.7 * behind.sum(), "nose down, the cameras that look ahead see the ground below"
+
+
+@pytest.mark.parametrize("cameras", [USUAL, Cameras(50.0), Cameras(pitch_deg=30.0), Cameras(60.0, 60.0, 320)])
+def test_cells_are_as_five_pinholes_show_them(cameras: Cameras) -> None:
+    at = RNG.uniform((-6.0, -6.0, 20.0), (6.0, 6.0, 60.0), (50, 3))
+    turn = Rotation.from_euler("zyx", RNG.uniform(-1.0, 1.0, (50, 3)) * (180.0, 20.0, 20.0), degrees=True)
+    middle = (np.arange(16) - 7.5) * CELL_M
+    off = np.stack(np.broadcast_arrays(middle, middle[:, None], 0.0), axis=-1) - at[:, None, None]
+    body = off @ turn.as_matrix()[:, None]
+    pitch, half = np.radians(cameras.pitch_deg), np.tan(np.radians(cameras.field_of_view_deg / 2))
+    axes = [(np.cos(a) * np.cos(pitch), np.sin(a) * np.cos(pitch), -np.sin(pitch)) for a in np.arange(4) * np.pi / 2]
+    depth = np.full(body.shape[:-1], np.inf)
+    for ahead, side in zip([*axes, (0, 0, -1)], [(0, 1, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0), (0, 1, 0)], strict=True):
+        away, right, up = body @ ahead, body @ side, body @ np.cross(ahead, side)
+        shown = (away > 0.1) & (np.abs(right) < half * away) & (np.abs(up) < half * 9 / 16 * away)
+        depth = np.where(shown, np.minimum(depth, away), depth)
+    pixel_m2 = depth**3 / (cameras.width_px / 2 / half) ** 2 / at[:, 2, None, None]
+    near = np.hypot(off[..., 0], off[..., 1]) <= RANGE_M
+    expected = near * (np.isfinite(depth).astype(int) + (pixel_m2 <= FULL.image_m**2))
+    found = camera_states(*at.T, attitude(turn.as_quat()), cameras)
+    assert (found == expected).mean() > 0.995
+    assert 0.05 < (expected > 0).mean() < 0.95
+    assert (expected == Coverage.WELL).any()
 
 
 def test_pixels_on_the_ground_decide_how_well() -> None:
@@ -195,3 +231,8 @@ def test_a_chart_holds_whatever_is_claimed() -> None:
         chart.fold([heard])
         known |= seen_well(heard)
     chart.fold([claim(bytes([255]) * 64, 3e38, -3e38)])
+
+
+def test_the_compiled_loops_have_the_constants_of_the_raster() -> None:
+    assert (coverage_loops._CELLS, coverage_loops._WELL) == (COVERAGE_CELLS, Coverage.WELL)
+    assert (sight_loops._RES_M, sight_loops._STEP_M) == (height_field.RES_M, height_field.STEP_M)
