@@ -13,6 +13,8 @@ from sortie.fleet.messages.auth import Opened
 from sortie.fleet.peers import PeerTable, loops
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.fleet.staleness import LinkHealth, health
+from sortie.policies.contract import FleetView
+from sortie.policies.geometry import note_circles, peers_by_overlap
 from sortie.scenarios.link_state import probed_mbps
 
 PERIOD_S = 0.1
@@ -101,3 +103,31 @@ def test_links_are_looked_at_where_age_or_a_clock_can_change_them(data: st.DataO
         me, now_s, PERIOD_S * 3.0, PERIOD_S, 3.0, delay_s, ids, ages, heard_s, busy, at_rest, blamed
     )
     assert found.tolist() == expected
+
+
+def test_peers_are_ranked_by_the_noted_array_only_where_all_descriptors_are_those_that_it_is_of() -> None:
+    known = {i: descriptor(i, 0.0, position_m=(10.0 * i, 0.0, 60.0)) for i in range(4)}
+    view = FleetView(0, 0.1, known, dict.fromkeys(known, 0.0))
+    part = view._replace(descriptors={i: known[i] for i in (0, 1, 3)})
+    moved = view._replace(descriptors={**known, 3: known[3]._replace(position_m=(0.0, 0.0, 60.0))})
+    by_descriptors = [peers_by_overlap(v) for v in (view, part, moved)]
+    assert by_descriptors == [[1, 2, 3], [1, 3], [3, 1, 2]]
+    backwards = np.array([(0.0, 0.0, 42.0), (60.0, 0.0, 42.0), (40.0, 0.0, 42.0), (20.0, 0.0, 42.0)])
+    note_circles(known, backwards)
+    assert [peers_by_overlap(v) for v in (view, part, moved)] == [[3, 2, 1], [3, 1], [3, 1, 2]]
+    note_circles({}, np.zeros((0, 3)))
+
+
+@pytest.mark.parametrize("doubted", [False, True])
+def test_a_view_is_ranked_as_its_descriptors_say(doubted: bool) -> None:
+    (mine,), rng = fleet(1), np.random.default_rng(5)
+    for second in range(3):
+        for i in range(6):
+            at = (*rng.uniform(-60.0, 60.0, 2), 60.0)
+            claim = descriptor(i, second + 0.01 * i, position_m=at, footprint_radius_m=float(rng.uniform(20.0, 60.0)))
+            _ = mine.hold(claim, float(second)) if i == 0 else mine.hear(Opened(claim, None, 0), float(second) + 0.05)
+        mine._doubted = frozenset({2} if doubted else ())
+        view = mine.view(float(second))
+        ranked = peers_by_overlap(view)
+        note_circles({}, np.zeros((0, 3)))
+        assert ranked == peers_by_overlap(view)
