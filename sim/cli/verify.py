@@ -67,7 +67,7 @@ def verify(
             help="A file of invariants, one per line; default: those in the policy's file, or those that a registered policy promises."
         ),
     ] = None,
-    drones: Annotated[int, typer.Option(help="Largest fleet that proofs search.", min=1, max=8)] = DRONES,
+    drones: Annotated[int, typer.Option(help="Largest fleet that proofs search. Drawn views go up to 5,000 drones whatever this is.", min=1, max=8)] = DRONES,
     budget: Annotated[
         float,
         typer.Option(
@@ -96,9 +96,8 @@ def verify(
     Invariants about time (`within 0.5 s: …`, `climbs_in(dwell) <= 1`) are tested on sequences of views. What counts is
     what the gates enforce, after staleness rules and damping.
 
-    A counterexample is written as a view (JSON), and as a scenario in which the policy meets that view in flight, if its
-    fleet has at most 200 drones.
-    `sortie check` on this scenario fails until the policy is corrected.
+    A counterexample is written as a view (JSON). If the policy fails on it in flight too, and all ids of its drones are
+    below 200, it is also written as a scenario. `sortie check` on this scenario fails until the policy is corrected.
     """
     kind, reference = model if len(model) == 2 else ("policy", model[0])
     if len(model) > 2 or (model[0] in KITS and len(model) == 1):
