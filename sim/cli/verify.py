@@ -26,7 +26,7 @@ from sortie.policies.verification.search import BUDGET_S, LEAST_DRAWN_S
 from sortie.policies.verification.shield import check_shieldable
 from sortie.policies.verification.single_view import PLANE
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
-from sortie.policies.verification.views import to_json
+from sortie.policies.verification.views import LARGEST, to_json
 from sortie.scenarios.plugins.reference import Params
 from sortie.scenarios.plugins.user_calls import DECISION_S, LOAD_S, watched
 from sortie.scenarios.reading.load import build, dump, loads
@@ -67,7 +67,14 @@ def verify(
             help="A file of invariants, one per line; default: those in the policy's file, or those that a registered policy promises."
         ),
     ] = None,
-    drones: Annotated[int, typer.Option(help="Largest fleet that proofs search. Drawn views go up to 5,000 drones whatever this is.", min=1, max=8)] = DRONES,
+    drones: Annotated[
+        int,
+        typer.Option(
+            help=f"Largest fleet that proofs search. Drawn views go up to {LARGEST:,} drones whatever this is.",
+            min=1,
+            max=8,
+        ),
+    ] = DRONES,
     budget: Annotated[
         float,
         typer.Option(
