@@ -19,7 +19,7 @@ PYTHON = ROOT / ".venv-compiled/bin/python"
 
 
 def compiled_cpu_s(cases: Sequence[Case], seeds: Sequence[int]) -> list[float] | None:
-    """The mean over the seeds, seconds, of each case; None without a compiled install."""
+    """The median over the seeds, seconds, of each case; None without a compiled install."""
     if not PYTHON.exists():
         return None
     asked = json.dumps([[asdict(case) for case in cases], list(seeds)])
