@@ -13,6 +13,7 @@ from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.metadata import requires, version
 from importlib.resources import files
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 from sortie.scenarios.code_digest import contents, digest_of, installed
@@ -223,7 +224,8 @@ def own_files(
         try:
             file = Path(inspect.getsourcefile(function) or "")
             source = inspect.getsource(function)
-        except (OSError, TypeError):  # typed in, or written in C
+        # typed in, written in C, or compiled under another file's name
+        except (OSError, TypeError, SyntaxError, TokenError):
             file, source = Path(), ""
         if file.is_file():
             code.append(file)
