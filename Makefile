@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
 COMPILED := .venv-compiled
-SOURCES := $(shell find -L sortie -type f -not -name "*.pyc")
+SOURCES := $(shell find -L sortie -type f -not -path "*/__pycache__/*")
 
 
 .PHONY: help sortie screenshot test test-all lint check format bench bench-all figures validate-ns3 ns3 mavproxy mutate clean scenarios notebooks outputs fuzz docs test-lowest compiled test-compiled

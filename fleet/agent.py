@@ -28,6 +28,7 @@ from sortie.fleet.senses import Sensed
 from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age, health
 from sortie.fleet.standings import Standing
 from sortie.fleet.trust import JUDGED_EVERY_S
+from sortie.perception.budget import loops as cell_loops
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.checks import check_directives, differing
@@ -185,7 +186,8 @@ class Agent:
         self._heard_s = table.heard_s[row]
         self._busy, self._at_rest, self._blamed = table.busy[row], table.at_rest[row], table.blamed[row]
         self._find_overdue = loops().overdue
-        places_loop()  # policies may rank peers
+        places_loop()  # policies may rank peers, and gates count cells
+        cell_loops()
         self._alert = False  # whether it knows of a person in its region
         self._last_own: Descriptor | None = None  # published or not
         self._roster = Roster(0, (self.drone,))

@@ -212,7 +212,7 @@ def _count_cells(claims: Sequence[Descriptor], blur_m: float, cameras: Sequence[
     new = [
         k
         for k, (d, its, one) in enumerate(zip(claims, cameras, found, strict=True))
-        if one is None or one[0] is not d or one[2] is not its or one[1] != blur_m
+        if one is None or one[0] is not d or one[1] != blur_m or (one[2] is not its and one[2] != its)
     ]
     if len(_COUNTED) + len(new) > max(_MOST_COUNTED, 2 * len(claims)):
         _COUNTED.clear()

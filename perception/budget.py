@@ -123,12 +123,12 @@ def cells_sent(rho: float, roi: Disc | None, x_m: float, y_m: float, yaw_rad: fl
     if roi is None or budget == 0:
         return budget
     dx, dy, c, s = roi[0] - x_m, roi[1] - y_m, math.cos(yaw_rad), math.sin(yaw_rad)
-    inside: int = _loops().count(c * dx + s * dy, -s * dx + c * dy, float(roi[2]), CELL_M)
+    inside: int = loops().count(c * dx + s * dy, -s * dx + c * dy, float(roi[2]), CELL_M)
     return min(budget, inside)
 
 
 @cache
-def _loops() -> Any:
+def loops() -> Any:
     """The compiled loop, imported and made ready at its first use."""
     from sortie.perception import budget_loops
 

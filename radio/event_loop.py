@@ -35,7 +35,7 @@ class EventLoop(simpy.Environment):
         """Move on to `t_s` if nothing is due until then, and return whether this was done.
 
         A callback whose next thing to do is at `t_s` can then do it at once, without an event. This works in `run` only: who
-        calls `step` may want to stop after any event.
+        calls `step` instead may want to stop after any event.
         """
         if not self._is_running or (self._queue and self._queue[0][0] <= t_s):
             return False

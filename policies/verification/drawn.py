@@ -15,7 +15,7 @@ from sortie.policies.verification.single_view import PLANE, Property, Repeatable
 from sortie.policies.verification.subject import apart
 from sortie.policies.verification.views import LARGEST, MAX_DRONES, draw_view, shrink
 from sortie.scenarios.disc import LISTED_IDS
-from sortie.scenarios.plugins.user_calls import TookTooLongError, watched
+from sortie.scenarios.plugins.user_calls import Guarded, TookTooLongError, watched
 
 TRIED_VIEWS = 1000
 TRIED_AT_CONSTANTS = 200
@@ -24,15 +24,15 @@ TRIED_LISTED = 2
 """Drawn views of the largest fleet in which descriptors list goodput to everyone."""
 TRIED_LARGEST = (0.02, 1.0)
 """Drawn views of the largest fleet, each with the share of the others that the ego hears."""
-LARGE_S = 3.0
-"""A policy that takes longer for a decision in a fleet that large is not tried there. A flight would take hours."""
+LARGE_S = 10.0
+"""A property that takes longer on a view of more than `LISTED_IDS` drones is not judged there; the policy is not to blame."""
 
 
 class Drawn:
     """Drawn views and what the policy decides on them, each decision made once."""
 
     def __init__(self, policy: Policy, rules: Sequence[Invariant], seed: int, count: int) -> None:
-        self._policy, self._apart, self._count = policy, apart(policy), count
+        self._policy, self._count = policy, count
         own = list(views_at(constants_of(policy, rules), seed, min(count, TRIED_AT_CONSTANTS)))
         self._own = len(own)
         views = [
@@ -47,16 +47,13 @@ class Drawn:
         # large ones by size: where a policy is too slow, it was tried on the smaller ones
         self._views = sorted(views, key=lambda view: max(len(view.descriptors), LISTED_IDS))
         self._answers: dict[int, Any] = {}
-        self._late = 0
-        """The size of the first large fleet in which the policy gave no answer in time."""
 
-    def _text(self, tried: int) -> str:
-        """How many views were tried, in words."""
-        if tried < len(self._views):
-            late = f"; no answer within {LARGE_S:g} s where {self._late} drones are heard" if self._late else ""
-            return f"{tried} of {len(self._views)} drawn views keep it{late}"
+    def _text(self, tried: int, why: str = "") -> str:
+        """How many views were tried, and why not all, in words."""
         if not self._views:
             return "no drawn views"
+        if tried < len(self._views):
+            return f"{tried} of {len(self._views)} drawn views keep it{why}"
         own = f", {self._own} at the policy's own constants" if self._own else ""
         return (
             f"{self._count} drawn views of up to {MAX_DRONES} drones{own}, {TRIED_LISTED} of {LISTED_IDS} drones and "
@@ -75,30 +72,21 @@ class Drawn:
 
     def _first_fault(self, prop: Property, budget: Budget) -> tuple[FleetView | None, str]:
         for number, view in enumerate(self._views):
-            if number >= LEAST_VIEWS and budget.is_spent:
+            has_end = number >= LEAST_VIEWS
+            if has_end and budget.is_spent:
                 return None, self._text(number)
             shown = RepeatableView(view)
             now = shown.now()
 
-            has_end = number >= LEAST_VIEWS
-            cut = list[FleetView]()  # a view with many ages takes many decisions
-
-            def ask(other: FleetView, /, has_end: bool = has_end, cut: list[FleetView] = cut) -> Any:
-                if has_end and budget.is_spent:
-                    cut.append(other)
+            def ask(other: FleetView, /, has_end: bool = has_end) -> Any:
+                if has_end and budget.is_spent:  # a view with many ages takes many decisions
                     raise Stopped
                 if len(other.descriptors) <= LISTED_IDS:
                     return self._policy(other)
                 try:
-                    with watched(LARGE_S):
-                        return self._apart(other)
-                except TookTooLongError as late:
-                    self._late = self._late or len(other.descriptors)
-                    cut.append(other)
+                    return apart(self._policy)(other)
+                except TookTooLongError as late:  # not to be asked again
                     raise Stopped from late
-
-            def fails(other: FleetView, ask: Policy = ask, cut: list[FleetView] = cut) -> bool:
-                return not budget.is_spent and check_property(prop, ask, other) is not None and not cut
 
             def decide(other: FleetView, /, now: FleetView = now, number: int = number, ask: Policy = ask) -> Any:
                 if other is not now:
@@ -107,14 +95,38 @@ class Drawn:
                     self._answers[number] = ask(now)
                 return self._answers[number]
 
-            complaint = complaint_of(prop, decide, shown)
-            if cut:
-                return None, self._text(number)
+            def fails(other: FleetView, ask: Policy = ask) -> bool:
+                try:
+                    return not budget.is_spent and _judged(prop, ask, RepeatableView(other)) is not None
+                except Stopped:
+                    return False
+
+            try:
+                complaint = _judged(prop, decide, shown)
+            except Stopped as stopped:
+                return None, self._text(number, str(stopped))
             if complaint is not None:
                 if check_property(prop, self._policy, view) is None:
                     return view.frozen, ""  # it fails only sometimes: it is not the same for the same view
                 return shrink(view, fails), ""
         return None, self._text(len(self._views))
+
+
+def _judged(prop: Property, policy: Policy, view: RepeatableView) -> str | None:
+    """A property's complaint about a policy on a view.
+
+    Raises:
+        Stopped: the view is large, and the policy or the property itself takes too long on it.
+    """
+    drones = len(view.now().descriptors)
+    if drones <= LISTED_IDS:
+        return complaint_of(prop, policy, view)
+    try:
+        with watched(LARGE_S):
+            found: str | None = Guarded(complaint_of, shares_lateness=False)(prop, policy, view)
+            return found
+    except TookTooLongError:
+        raise Stopped(f"; a view of {drones:,} drones takes more than {LARGE_S:g} s") from None
 
 
 @lru_cache(maxsize=len(TRIED_LARGEST))

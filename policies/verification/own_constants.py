@@ -13,9 +13,11 @@ import numpy as np
 
 from sortie.policies.contract import FleetView
 from sortie.policies.verification.views import LARGEST, LONGEST_S, MAX_DRONES, draw_view
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.streams import stream
 
-MOST_SIZES = 24
+MOST_SIZES, MOST_LARGE_SIZES = 24, 6
+"""So many sizes of fleets are tried, and so many more of those whose drones have rosters, which take long to draw."""
 _SHARES = ("battery_soc", "cpu_headroom", "gpu_headroom")
 _APART = 1_000_000
 """These views are numbered from here on, so that they are others than the drawn ones."""
@@ -35,8 +37,10 @@ def views_at(constants: Iterable[float], seed: int, count: int) -> Iterator[Flee
     for number in range(count):
         yield _moved(draw_view(seed, _APART + number), known, stream(seed, number, (), "verify.constants"))
     whole = [int(c) for c in known if c == int(c)]
-    sizes = sorted({size for c in whole for size in (c, c + 1, c + 2) if MAX_DRONES < size <= LARGEST})
-    for number, size in enumerate(sizes[:MOST_SIZES]):
+    # with c peers first: a cut leaves no constant out before others have three sizes
+    sizes = list(dict.fromkeys(c + more for more in (1, 2, 0) for c in whole if MAX_DRONES < c + more <= LARGEST))
+    listed, large = ([size for size in sizes if (size > LISTED_IDS) == is_large] for is_large in (False, True))
+    for number, size in enumerate((*listed[:MOST_SIZES], *large[:MOST_LARGE_SIZES])):
         view = draw_view(seed, _APART + count + number, size, 1.0)
         yield view
         ego = next((c for c in whole if c in view.descriptors and c > MAX_DRONES), view.ego)

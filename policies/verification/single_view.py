@@ -11,6 +11,7 @@ from sortie.policies.contract import Directive, FleetView, Policy, PolicyError
 from sortie.policies.verification.age_rule import listed, older_views, raised_part, without_detached
 from sortie.policies.verification.invariants import Invariant, describe_directives, just_heard, violations
 from sortie.policies.verification.policy_rules import missing_links
+from sortie.policies.verification.search import Stopped
 from sortie.policies.verification.views import MAX_DRONES
 from sortie.scenarios.plugins.user_calls import text_of
 
@@ -109,8 +110,11 @@ def check_property(
 
 
 def complaint_of(prop: Property, policy: Policy, view: RepeatableView) -> str | None:
+    """The complaint of a property about a policy on a view. Only `Stopped` passes: whoever asks for the policy's answer has no more time."""
     try:
         return prop.complaint(policy, view)
+    except Stopped:
+        raise
     except Exception as error:
         return _invalid_directive(policy, view.now()) or f"raises {type(error).__name__}: {text_of(error, str)}"
 

@@ -192,7 +192,7 @@ def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
     for few in (drones, *each):  # all at once, which is often enough, then each
         kept(view._replace(age_s={**view.age_s, **dict.fromkeys(few, 0.0)}))
         for field, plain in _PLAIN.items():
-            if field != "roster" or max(drones) < LISTED_IDS:
+            if field != "roster" or max(drones, default=0) < LISTED_IDS:
                 kept(_with(view, {i: view.descriptors[i]._replace(**{field: plain}) for i in few}))
         flat = {i: (100.0,) * len(view.descriptors[i].peer_goodput_mbps) for i in few}
         kept(_with(view, {i: view.descriptors[i]._replace(peer_goodput_mbps=flat[i]) for i in few}))

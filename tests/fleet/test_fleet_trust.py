@@ -26,6 +26,7 @@ from sortie.fleet.trust import (
     judge,
     split_arrivals,
 )
+from sortie.perception.geometry import Cameras
 from sortie.policies.contract import COVERAGE_CELL_M, Coverage, Descriptor, TaskPhase
 
 
@@ -375,3 +376,15 @@ def test_the_compiled_loop_finds_what_the_formula_finds(data: st.DataObject) -> 
 def test_the_compiled_loop_has_the_constants_of_the_formula() -> None:
     for name in ("RISE", "PERCENT", "FALL", "FALL_SHARE", "LONG_SILENCE"):
         assert getattr(trust_loops, f"_{name}") == getattr(trust, name)
+
+
+def test_a_claim_is_counted_once_whoever_made_the_record_of_its_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted: list[int] = []
+    count = trust._count
+    monkeypatch.setattr(trust, "_count", lambda claims, *rest: counted.append(len(claims)) or count(claims, *rest))
+    claims = [honest(i, 20.0 * i) for i in range(4)]
+    first = trust._count_cells(claims, 0.0, [Cameras(60.0) for _ in claims])
+    assert trust._count_cells(claims, 0.0, [Cameras(60.0) for _ in claims]) == first
+    assert counted == [4]
+    trust._count_cells(claims, 0.0, [Cameras(61.0) for _ in claims])
+    assert counted == [4, 4]

@@ -41,6 +41,13 @@ def test_the_mission_disc_is_314_cells() -> None:
     assert budget.cells_sent(1.0, (0, 0, 32.0), 0, 0, 0) == pytest.approx(math.pi * 32**2 / 3.2**2, abs=4)
 
 
+@pytest.mark.parametrize("radius_m", [1e5, 1e20, 3e38])
+def test_a_disc_of_any_size_holds_all_cells(radius_m: float) -> None:
+    """A directive's region may be as large as single precision has numbers."""
+    assert budget.cells_sent(1.0, (7.0, -3.0, radius_m), 20.0, 5.0, 0.3) == 4096
+    assert budget.cells_sent(1.0, (3e38, 0.0, radius_m / 2), 20.0, 5.0, 0.3) == 0
+
+
 @settings(max_examples=60, deadline=None)
 @given(roi=rois, pose=poses, rho=st.floats(0, 1))
 def test_count_and_selection_agree_with_brute_force(
