@@ -45,7 +45,8 @@ from sortie.policies.contract import (
 )
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
 from sortie.policies.geometry import places_loop
-from sortie.policies.verification.enforced import Ceilings, Steps
+from sortie.policies.verification.enforced import Steps
+from sortie.policies.verification.shield_together import Ceilings
 
 _FRESH = LinkHealth.FRESH
 _NOTHING = nothing(0, 1, "")[2:8]
@@ -332,9 +333,8 @@ class Agent:
         look = self._look
         if look is None or now_s - look.capture.t_s > LOOK_STANDS_S + 1e-9:
             return NOTHING_SEEN, False
-        seen, row, column = look.view, here.row, here.column
-        grid = seen.grid if seen.row == row and seen.column == column else placed(seen, row, column)
-        return self._chart.mark(grid, row, column, self.memory.believed, told)
+        grid = placed(look.view, here.row, here.column)
+        return self._chart.mark(grid, here.row, here.column, self.memory.believed, told)
 
     def _check_clock(self) -> None:
         """Report where the own clock is off the fleet's, and where it no longer is."""

@@ -26,7 +26,7 @@ from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.verification.invariants import Invariant, describe_directives, violations
 from sortie.policies.verification.past import Past
 from sortie.policies.verification.shield import enforce
-from sortie.policies.verification.shield_together import Ceilings as Ceilings
+from sortie.policies.verification.shield_together import Ceilings
 
 POLICY, STALENESS, DAMPING, NO_PEER = "policy", "staleness", "damping", "no peer"
 CAUSES = (POLICY, STALENESS, DAMPING, NO_PEER)

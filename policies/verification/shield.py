@@ -27,8 +27,7 @@ from sortie.policies.verification.compiled import Context, Rule, compiled
 from sortie.policies.verification.invariants import Invariant, InvariantError, LinksTerm, Recent, just_heard
 from sortie.policies.verification.links import HIGHEST, Link, as_link
 from sortie.policies.verification.nearest import nearest
-from sortie.policies.verification.shield_together import MARK as MARK
-from sortie.policies.verification.shield_together import Boxes, Ceilings, Together, replaced
+from sortie.policies.verification.shield_together import MARK, Boxes, Ceilings, Together, replaced
 from sortie.policies.verification.words import CHANGES
 
 _MOST_KNOWN = 512

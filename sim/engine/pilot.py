@@ -29,7 +29,7 @@ from sortie.policies.contract import (
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
 from sortie.policies.verification.age_rule import raised_part
-from sortie.policies.verification.enforced import Ceilings, Steps, effective, judge, put_right
+from sortie.policies.verification.enforced import Steps, effective, judge, put_right
 from sortie.policies.verification.invariants import (
     Invariant,
     InvariantError,
@@ -39,7 +39,8 @@ from sortie.policies.verification.invariants import (
     violations,
 )
 from sortie.policies.verification.past import Past
-from sortie.policies.verification.shield import MARK, check_shieldable, enforce
+from sortie.policies.verification.shield import check_shieldable, enforce
+from sortie.policies.verification.shield_together import MARK, Ceilings
 from sortie.policies.verification.views import ViewError, from_json
 from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.scenarios.schema import PolicyChange, PolicySection, Scenario

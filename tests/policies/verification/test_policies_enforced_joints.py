@@ -20,7 +20,6 @@ from sortie.policies.verification.enforced import (
     NO_PEER,
     POLICY,
     STALENESS,
-    Ceilings,
     Steps,
     effective,
     judge,
@@ -30,6 +29,7 @@ from sortie.policies.verification.invariants import parse, violations
 from sortie.policies.verification.links import LEVEL, RATE_HZ
 from sortie.policies.verification.past import Past
 from sortie.policies.verification.shield import enforce, shield
+from sortie.policies.verification.shield_together import Ceilings
 
 NONE, DETECTIONS, FEATURES = Representation.NONE, Representation.DETECTIONS, Representation.FEATURES
 VIEW = fleet_of(4)

@@ -17,7 +17,8 @@ from sortie.policies.verification.conformance import conform, failing
 from sortie.policies.verification.invariants import InvariantError, just_heard, parse, violations
 from sortie.policies.verification.links import as_link, distance
 from sortie.policies.verification.proof import prove
-from sortie.policies.verification.shield import MARK, enforce, interventions, shield
+from sortie.policies.verification.shield import enforce, interventions, shield
+from sortie.policies.verification.shield_together import MARK
 from sortie.policies.verification.views import draw_views
 
 HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"

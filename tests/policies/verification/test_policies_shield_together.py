@@ -14,8 +14,8 @@ from sortie.policies.contract import Directive, Representation
 from sortie.policies.verification import shield_together
 from sortie.policies.verification.invariants import parse, violations
 from sortie.policies.verification.nearest import nearest
-from sortie.policies.verification.shield import MARK, enforce
-from sortie.policies.verification.shield_together import MOST_CHANGES
+from sortie.policies.verification.shield import enforce
+from sortie.policies.verification.shield_together import MARK, MOST_CHANGES
 
 RUNGS, RATES_HZ, WEIGHTS = (0, 1, 2), (0.0, 2.0, 5.0, 10.0), (0.2, 1.0)
 CANNOT = f"{MARK}cannot keep "

@@ -15,6 +15,8 @@ if __name__ == "__main__":
 from stored import ROOT
 from wifi_plan import Case
 
+from sortie.scenarios.code_digest import sources_digest
+
 PYTHON = ROOT / ".venv-compiled/bin/python"
 
 
@@ -24,8 +26,10 @@ def compiled_cpu_s(cases: Sequence[Case], seeds: Sequence[int]) -> list[float] |
         return None
     asked = json.dumps([[asdict(case) for case in cases], list(seeds)])
     done = subprocess.run([PYTHON, __file__], input=asked, capture_output=True, text=True, check=True)
-    found: list[float] = json.loads(done.stdout)
-    return found
+    sources, found = json.loads(done.stdout)
+    if sources != sources_digest(("radio",), ()):
+        raise RuntimeError("the compiled radio was built of other sources; run `make compiled`")
+    return [float(cpu_s) for cpu_s in found]
 
 
 def main() -> None:
@@ -38,7 +42,7 @@ def main() -> None:
     if not compiled_modules():
         sys.exit(f"{sys.executable} has no compiled radio")
     found = [means([through_air(Case(**case), seed) for seed in seeds])["cpu_s"] for case in given]
-    sys.stdout.write(json.dumps(found))
+    sys.stdout.write(json.dumps([sources_digest(("radio",), ()), found]))
 
 
 if __name__ == "__main__":
