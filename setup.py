@@ -34,7 +34,7 @@ MYPY = "mypy==2.4.1"
 
 
 def compiled() -> dict[str, Any]:
-    """What `setup` needs to compile: mypyc's modules, or mypyc itself while the environment of the build is made."""
+    """Arguments for `setup`: the modules to compile, or, while pip asks what the build needs, mypy and numpy."""
     if "editable_wheel" in sys.argv or "develop" in sys.argv:
         raise SystemExit(
             "SORTIE_COMPILE=1 does not work with an editable install (pip install -e), because a compiled module would hide "

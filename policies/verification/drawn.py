@@ -19,17 +19,17 @@ from sortie.scenarios.plugins.user_calls import Guarded, TookTooLongError, watch
 
 TRIED_VIEWS = 1000
 TRIED_AT_CONSTANTS = 200
-"""At most so many views more have the numbers of the policy's own code."""
+"""So many more views at most have numbers of the policy's code and invariants; fleets as large as these numbers come on top."""
 TRIED_LISTED = 2
-"""Drawn views of the largest fleet in which descriptors list goodput to everyone."""
+"""So many drawn views have `LISTED_IDS` drones, the most with which descriptors list goodput to everyone."""
 TRIED_LARGEST = (0.02, 1.0)
 """Drawn views of the largest fleet, each with the share of the others that the ego hears."""
 LARGE_S = 10.0
-"""A property that takes longer on a view of more than `LISTED_IDS` drones is not judged there; the policy is not to blame."""
+"""Where the ego has heard more than `LISTED_IDS` drones, a property that takes longer is not judged, and the policy is not refuted."""
 
 
 class Drawn:
-    """Drawn views and what the policy decides on them, each decision made once."""
+    """Drawn views, and the policy's decision on each, which all properties share."""
 
     def __init__(self, policy: Policy, rules: Sequence[Invariant], seed: int, count: int) -> None:
         self._policy, self._count = policy, count
@@ -63,7 +63,7 @@ class Drawn:
     def first_faults(
         self, properties: Sequence[Property], budget_s: float
     ) -> dict[Property, tuple[FleetView | None, str]]:
-        """Of each property the first view on which it fails, made smaller, or None, and how many views keep it, in words."""
+        """For each property: the first view on which it fails, made smaller, and no text; or None, and how many views keep it."""
         ordered = sorted(
             properties, key=lambda p: p is PLANE[1]
         )  # raised ages cost most: last, they get what others leave

@@ -39,7 +39,7 @@ class RepeatableView:
         return just_heard(self._plain).frozen
 
     def older(self) -> Iterator[FleetView]:
-        """The view with raised ages, a few of all raises; in a large fleet of all drones at once alone."""
+        """The view with some raises of its ages: of each drone by itself and of all at once; above `MAX_DRONES`, of all at once alone."""
         if self._raised is not None:
             yield self._plain._replace(age_s=dict(self._raised)).frozen
         for _, _, older in older_views(self._plain, one_by_one=len(self._plain.age_s) <= MAX_DRONES):
@@ -110,7 +110,7 @@ def check_property(
 
 
 def complaint_of(prop: Property, policy: Policy, view: RepeatableView) -> str | None:
-    """The complaint of a property about a policy on a view. Only `Stopped` passes: whoever asks for the policy's answer has no more time."""
+    """The complaint of a property about a policy on a view. An exception is a complaint too, except `Stopped`: it says that the time is over."""
     try:
         return prop.complaint(policy, view)
     except Stopped:

@@ -59,7 +59,7 @@ class ViewError(SortieError):
 
 
 def draw_view(seed: int, number: int, drones: int | None = None, reach: float | None = None) -> FleetView:
-    """View `number` of a seed: 1 to 20 drones, some never heard, some stale, anywhere, in any state.
+    """View `number` of a seed: 1 to 20 drones if not said otherwise, some never heard, some stale, anywhere, in any state.
 
     Half of all numbers are drawn uniformly. The other half are values at which rules often change their decision.
 
@@ -67,7 +67,7 @@ def draw_view(seed: int, number: int, drones: int | None = None, reach: float | 
         seed: of all its views.
         number: which one.
         drones: the size of the fleet; left out, it is drawn. In one of more than `LISTED_IDS` every drone has a roster.
-        reach: the share of the other drones that the ego has heard, 0 … 1; left out, it is drawn.
+        reach: the chance that the ego has heard each other drone, 0 … 1; left out, it is drawn.
     """
     rng = stream(seed, number, (), "verify.view")
     n = int(rng.integers(1, MAX_DRONES + 1)) if rng.random() < 0.5 else int(rng.integers(1, 6))
@@ -169,11 +169,12 @@ _PLAIN: dict[str, Any] = {
 
 
 def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
-    """A view that still fails, with fewer drones and plainer fields, as found by one pass over them.
+    """A view that still fails, with fewer drones and plainer fields; not always the smallest.
 
     Args:
         view: a view that fails.
-        fails: whether a view fails; called about twenty times for each drone that is left.
+        fails: whether a view fails; called about twenty times for each drone that is left, some hundreds of times if more
+            than 200 are left.
     """
 
     def kept(candidate: FleetView) -> bool:
