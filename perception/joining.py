@@ -52,8 +52,7 @@ NMS_IOU = 0.15
 """Boxes that overlap by more are of one car."""
 OWN_WEIGHT = 2.0
 """Weight of an ego's boxes that come from fused maps; a drone that looked alone weighs 1. Of 1, 2, 3 and 5, tried on the
-calibration's held-out scenes, 1 and 2 lie within 0.01 of AP of each other and 5 up to 0.05 below. Where maps are read alone as
-well, it is 1 plus their number, if that is more. Suppression does not use it."""
+calibration's held-out scenes, 1 and 2 lie within 0.01 of AP of each other and 5 up to 0.05 below. Suppression does not use it."""
 LATE_MIN_SCORE = 0.2
 """In late fusion peers send boxes with a score above this."""
 Rule = Literal["nms", "average"]
@@ -138,8 +137,6 @@ class EgoSources(NamedTuple):
     """False: a drone without a look of its own. Its silence means nothing."""
     errors: BoxErrors | None = None
     """How uncertain its own boxes are, where it joins them with covariances."""
-    read: int = 0
-    """How many of `others` were found in maps that were fused for `own` as well."""
 
     @classmethod
     def of(
@@ -149,16 +146,15 @@ class EgoSources(NamedTuple):
         own: Boxes,
         fused: bool,
         others: Sequence[SourceBoxes],
-        read: int = 0,
     ) -> EgoSources:
-        """For a detector's job; `others` are the boxes of the shares that are not fused as maps, and of those that are read too."""
+        """For a detector's job; `others` are the boxes of shares that are not fused as maps, and of maps on other grids."""
         maps_s = [s.age_s for s in shares if s.is_map and s.weight > 0.0]
         age_s = own_age_s(ego, shares) if ego.looked else min(maps_s, default=0.0)
-        return cls(ego.est_pose, own, fused, others, age_s, ego.looked or fused, read=read)
+        return cls(ego.est_pose, own, fused, others, age_s, ego.looked or fused)
 
     def sources(self) -> list[SourceBoxes]:
         """Its own boxes, if it has any, and those of the peers that count."""
-        weight = max(OWN_WEIGHT, 1.0 + self.read) if self.fused else 1.0
+        weight = OWN_WEIGHT if self.fused else 1.0
         known = None if self.errors is None else self.errors.covariances_m2(self.own.xy_m, self.own.score, self.pose)
         own = [SourceBoxes(self.own, weight, self.pose, age_s=self.age_s, covariance_m2=known)] if self.looked else []
         return own + [o for o in self.others if o.weight > 0.0]

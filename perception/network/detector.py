@@ -10,7 +10,7 @@ The same calls in the same order give the same boxes.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -50,9 +50,7 @@ from sortie.scenarios.schema import Perception
 from sortie.scenarios.shipped import CODEBOOK, ERRORS, NETWORKS, SHIPPED_WEIGHTS, beside, located
 
 KEPT_CAPTURES = 64
-LEAST_READ = 0.2
-"""The share of a map's cells, of those in its region, from which it is read alone. On the validation split, reading a quarter
-gains 1 to 3 points of AP, reading a tenth loses."""
+ALL_CELLS = torch.ones(1, CELLS, CELLS, dtype=torch.bool)
 Jobs = Sequence[tuple[Capture, Sequence[Share]]]
 R = TypeVar("R")
 
@@ -178,7 +176,7 @@ class TorchDetector:
             if share.representation == "codes":
                 self._read_codes(share, known)
         for share in shared:
-            if share.is_map and (self._shares == "boxes" or match or self._is_read(share)):
+            if share.is_map and (self._shares == "boxes" or match):
                 self._head_in_part(share, known)
         now = {ego.drone: ego for ego, _ in jobs}
         # a copy: later requests queue behind these tasks, and no task may wait for them
@@ -293,7 +291,7 @@ class TorchDetector:
     def _sent(self, share: Share, known: Known) -> Tensor:
         """[1, 64, 64] bool: the cells of the share's capture that its budget let through."""
         if share.representation == "raw":
-            return torch.ones(1, CELLS, CELLS, dtype=torch.bool)
+            return ALL_CELLS
         kept = known[share.capture]
         if not _is_ranked(share):
             rank = np.zeros((CELLS, CELLS))
@@ -308,14 +306,6 @@ class TorchDetector:
 
     def _is_fused(self, share: Share) -> bool:
         return self._shares == "features" and share.is_map
-
-    def _is_read(self, share: Share) -> bool:
-        """Whether the boxes of a map that came are found in it alone as well: enough of it is there."""
-        if not self._config.read_maps or self._shares != "features":
-            return False
-        pose = share.capture.est_pose
-        whole, came = (budget.cells_sent(rho, share.roi, *pose) for rho in (1.0, share.rho))
-        return share.representation == "raw" or came - len(share.missing) >= LEAST_READ * whole
 
     def _detect_ego(self, ego: Capture, shares: Sequence[Share], now: Mapping[int, Capture], known: Known) -> Boxes:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
@@ -336,8 +326,10 @@ class TorchDetector:
             own = alone.result().moved(ego.est_pose, place)
         else:
             own = self._place(self._head(known[ego].maps.result()[None]), place)
-        read = [self._source(s, at, known) for s, at in zip(maps, places, strict=True) if self._is_read(s)]
-        sources = EgoSources.of(ego, shares, own, bool(maps) and out is not None, [*late, *read], len(read))
+        if self._config.fused_grids == "all" and maps:
+            mine = [Peer(place, 1.0, known[ego].maps.result(), ALL_CELLS)] if ego.looked else []
+            late += self._on_their_grids(maps, peers, mine)
+        sources = EgoSources.of(ego, shares, own, bool(maps) and out is not None, late)
         if any(s.covariance_m2 is not None for s in late):
             sources = sources._replace(errors=self._own_errors)
         return joined_many([sources], self._config.join, self._config.common_share)[0]
@@ -383,6 +375,23 @@ class TorchDetector:
         own = known[ego].maps.result() if ego.looked else None
         fused = fused_map(self._net, pose, own, peers, self._config.unsent_cells)
         return None if fused is None else self._head(fused)
+
+    def _on_their_grids(
+        self, maps: Sequence[Share], peers: Sequence[Peer], mine: Sequence[Peer]
+    ) -> Iterator[SourceBoxes]:
+        """The boxes of the same maps, fused once more on the grid of each drone that sent one.
+
+        Args:
+            maps: the shares that are fused; peers: theirs in the same order, and the silent ones; mine: the ego's own map.
+        """
+        for k, share in enumerate(maps):
+            first = peers[k]  # of equal weights the first takes the place of an ego's own map
+            fused = fused_map(
+                self._net, first.pose, None, [first, *mine, *peers[:k], *peers[k + 1 :]], self._config.unsent_cells
+            )
+            if fused is not None:
+                found = self._place(self._head(fused), first.pose)
+                yield SourceBoxes(found, share.weight, first.pose, age_s=share.age_s)
 
     def _map(self, share: Share, known: Known) -> Future[Tensor]:
         """The map of a share as it is fused."""

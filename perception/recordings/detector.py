@@ -45,11 +45,11 @@ class RecordedDetector:
     """As `perception.detector` names it."""
 
     def __init__(self, config: Perception) -> None:
-        if config.absent_peers != "excluded":
-            raise InputError(f"perception.absent_peers is {config.absent_peers!r}, must be excluded for a recording")
-        for option in ("match_poses", "read_maps"):
-            if getattr(config, option):
-                raise InputError(f"perception.{option} is true, must be false for a recording")
+        for option, usual in (("absent_peers", "excluded"), ("fused_grids", "own")):
+            if (value := getattr(config, option)) != usual:
+                raise InputError(f"perception.{option} is {value!r}, must be {usual} for a recording")
+        if config.match_poses:
+            raise InputError("perception.match_poses is true, must be false for a recording")
         self._recording = rec = open_recording(Path(config.recording or ""))
         self._config = config
         self._fuse = None if config.recorded_fusion is None else resolve("recorded_fusion", config.recorded_fusion)

@@ -116,11 +116,11 @@ class SurrogateDetector:
             raise InputError(
                 f"perception.absent_peers is {config.absent_peers!r}: {name} was calibrated without them, must be excluded"
             )
-        for option in ("match_poses", "read_maps"):
-            if getattr(config, option):
-                raise InputError(f"perception.{option} is true: {name} was calibrated without it, must be false")
-        if config.serve != "grid":
-            raise InputError(f"perception.serve is {config.serve!r}: {name} was calibrated without it, must be grid")
+        if config.match_poses:
+            raise InputError(f"perception.match_poses is true: {name} was calibrated without it, must be false")
+        for option, usual in (("fused_grids", "own"), ("serve", "grid")):
+            if (value := getattr(config, option)) != usual:
+                raise InputError(f"perception.{option} is {value!r}: {name} was calibrated without it, must be {usual}")
         self.parameters, self.calibration, self._path = parameters, parameters.id, path
         self._scene, self._config = scene, config
         self._eyes = eyes or Eyes(scene)

@@ -129,9 +129,9 @@ class Perception(Section):
         "average",
         description="How boxes of several drones become one list: of those that overlap, their weighted mean (average), or only the best (nms).",
     )
-    read_maps: bool = Field(
-        False,
-        description="Receivers also detect in each received map by itself, and join these boxes with those of the fused maps (the torch detector's).",
+    fused_grids: Literal["own", "all"] = Field(
+        "own",
+        description="On which grids a receiver fuses maps: on its own, or also on that of each drone that sent one (all), and the boxes of all grids are joined (the torch detector's).",
     )
     match_poses: bool = Field(
         False,

@@ -45,7 +45,7 @@ UNUSED = (
     "perception.motion_compensation",
     "perception.join",
     "perception.match_poses",
-    "perception.read_maps",
+    "perception.fused_grids",
     "perception.common_errors",
     "perception.score_threshold",
     "perception.cells_by",

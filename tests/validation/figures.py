@@ -482,12 +482,6 @@ def _fine_network() -> Tables:
     return fine_network.tables(ROOT / "runs/bench", ROOT / "docs/results/fine_network.png")
 
 
-def _read_maps() -> Tables:
-    import read_maps
-
-    return read_maps.tables()
-
-
 def _trucks() -> Tables:
     import trucks
 
@@ -786,7 +780,6 @@ FIGURES: dict[str, Figure] = {
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
     "fine_network": Figure(7, _fine_network),
-    "read_maps": Figure(12, _read_maps),
     "trucks": Figure(1, _trucks),
     "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),

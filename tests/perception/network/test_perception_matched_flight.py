@@ -83,10 +83,13 @@ def test_a_drone_that_hears_nobody_keeps_its_pose() -> None:
     np.testing.assert_array_equal(matched.table(), plain.table())
 
 
-@pytest.mark.parametrize("option", ["match_poses", "read_maps"])
-def test_the_surrogate_and_recordings_refuse_it(option: str) -> None:
-    scene, on = SceneModel(Scene(), None, (-50, -50, 50, 50)), {option: True}
-    with pytest.raises(InputError, match=rf"perception.{option} is true: .* was calibrated without it, must be false"):
-        SurrogateDetector(scene, Perception(detector="surrogate", **on), 1)
-    with pytest.raises(InputError, match=rf"perception\.{option} is true, must be false for a recording"):
-        RecordedDetector(Perception(detector="recorded", recording="seen.npz", **on))
+@pytest.mark.parametrize(
+    ("option", "value", "shown", "usual"),
+    [("match_poses", True, "true", "false"), ("fused_grids", "all", "'all'", "own")],
+)
+def test_the_surrogate_and_recordings_refuse_it(option: str, value: object, shown: str, usual: str) -> None:
+    scene, on = SceneModel(Scene(), None, (-50, -50, 50, 50)), {option: value}
+    with pytest.raises(InputError, match=rf"perception.{option} is {shown}: .* calibrated without it, must be {usual}"):
+        SurrogateDetector(scene, Perception.model_validate({"detector": "surrogate", **on}), 1)
+    with pytest.raises(InputError, match=rf"perception\.{option} is {shown}, must be {usual} for a recording"):
+        RecordedDetector(Perception.model_validate({"detector": "recorded", "recording": "seen.npz", **on}))

@@ -340,7 +340,7 @@ CHANGED = {
     "perception.join": "nms",
     "perception.codebook": "other.safetensors",
     "perception.match_poses": "true",
-    "perception.read_maps": "true",
+    "perception.fused_grids": "all",
     "perception.common_errors": "unknown",
     "perception.score_threshold": "0.5",
     "perception.cells_by": "norm",
