@@ -30,6 +30,8 @@ LOAD_S = 60.0
 GRACE_S = 5.0
 """A call that is interrupted must end within this time."""
 TICK_S = 0.1
+_AGAIN_TICKS = 10
+"""Between two interrupts of one call."""
 STUCK = 70
 """Exit code of a process that was ended because a call could not be interrupted."""
 BEAT = "=Qd480s"
@@ -225,7 +227,9 @@ class _Watch:
                     continue
                 before_s, self._ticks = self._ticks * TICK_S, self._ticks + 1
                 now_s = self._ticks * TICK_S
-                if before_s <= self._limit_s < now_s:
+                is_late = before_s <= self._limit_s < now_s
+                # again each second: Python drops what reaches a `__del__` or a callback of its garbage collector
+                if is_late or (before_s > self._limit_s and self._ticks % _AGAIN_TICKS == 0):
                     ctypes.pythonapi.PyThreadState_SetAsyncExc(
                         ctypes.c_ulong(self._thread), ctypes.py_object(_Interrupt)
                     )

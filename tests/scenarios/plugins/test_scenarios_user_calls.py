@@ -63,6 +63,10 @@ def spins_at_its_end(view):
     kept = Spins()
     return []
 
+def spins_on_after_one_is_lost(view):
+    Spins()
+    spins(view)
+
 def says_text(view):
     return Text("said")
 
@@ -153,7 +157,7 @@ def test_the_guard_leaves_a_policy_as_it_is(file: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Python drops what `__del__` raises
-@pytest.mark.parametrize("name", ["spins", "spins_again", "spins_at_its_end"])
+@pytest.mark.parametrize("name", ["spins", "spins_again", "spins_at_its_end", "spins_on_after_one_is_lost"])
 def test_a_call_that_is_late_is_interrupted_and_not_made_again(file: Path, name: str) -> None:
     policy = resolve(f"{file}:{name}")
     with watched(0.15, "0.15 s"):
