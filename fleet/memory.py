@@ -284,16 +284,17 @@ def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float
         rules.descriptor_period_s, table.window, table.counters(key_id or 0), table.heard_s, table.stamps_s,
         table.circles, table.watched, table.bits,
     ).tobytes()  # fmt: skip
-    if found.count(module.TAKEN) == count:  # as nearly always
+    taken, unusual, refused = module.TAKEN, module.UNUSUAL, module.REFUSED
+    if found.count(taken) == count:  # as nearly always
         for memory in receivers:
             memory._known[sender] = descriptor
         return []
-    refused = []
+    drops = []
     for memory, what in zip(receivers, found, strict=True):
-        if what == module.TAKEN:
+        if what == taken:
             memory._known[sender] = descriptor
-        elif what == module.UNUSUAL:
+        elif what == unusual:
             memory.meet(descriptor, now_s)
-        elif what == module.REFUSED:
-            refused.append((memory.drone, DropReason.REPLAYED))
-    return refused
+        elif what == refused:
+            drops.append((memory.drone, DropReason.REPLAYED))
+    return drops

@@ -106,6 +106,15 @@ def test_links_are_looked_at_where_age_or_a_clock_can_change_them(data: st.DataO
     assert found[:count].tolist() == expected
 
 
+@settings(max_examples=60)
+@given(st.lists(st.tuples(*[st.sampled_from([-30.0, -10.0, 0.0, 9.5, 10.0, 10.5, 30.0])] * 2), min_size=1, max_size=9))
+def test_claims_are_near_within_a_square_its_edge_included(places: list[tuple[float, float]]) -> None:
+    circles = np.array([(x_m, y_m, 1.0) for x_m, y_m in places])
+    ids = np.arange(len(places))[::2]
+    expected = [k for k, i in enumerate(ids) if max(abs(places[i][0]), abs(places[i][1] - 0.5)) <= 10.0]
+    assert loops().near(ids, circles, 0.0, 0.5, 10.0).tolist() == expected
+
+
 def test_peers_are_ranked_by_the_noted_array_only_where_all_descriptors_are_those_that_it_is_of() -> None:
     known = {i: descriptor(i, 0.0, position_m=(10.0 * i, 0.0, 60.0)) for i in range(4)}
     view = FleetView(0, 0.1, known, dict.fromkeys(known, 0.0))
