@@ -164,8 +164,6 @@ class TargetSeen:
         flat = pose.reshape(-1, 3)
         eyes = np.repeat(position, len(targets), axis=0)
         seen &= self._scene.height_field.seen(flat[:, 0], flat[:, 1], eyes).reshape(seen.shape)
-        size = np.tile(TARGET_SIZE_M[:2], (len(targets), 1))
-        return [
-            Boxes(each[:, :2], size, each[:, 2], np.ones(len(each))).take(here)
-            for each, here in zip(pose, seen, strict=True)
-        ]
+        size, score = np.tile(TARGET_SIZE_M[:2], (len(targets), 1)), np.ones(len(targets))
+        found = [each[here] for each, here in zip(pose, seen, strict=True)]
+        return [Boxes(each[:, :2], size[: len(each)], each[:, 2], score[: len(each)]) for each in found]
