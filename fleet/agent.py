@@ -33,6 +33,8 @@ from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.checks import check_directives, differing
 from sortie.policies.contract import (
+    COVERAGE_CELL_M,
+    COVERAGE_CELLS,
     PERSON_FLAG,
     Descriptor,
     Directive,
@@ -44,7 +46,7 @@ from sortie.policies.contract import (
     nothing,
 )
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
-from sortie.policies.geometry import places_loop
+from sortie.policies.geometry import rank_loop
 from sortie.policies.verification.enforced import Steps
 from sortie.policies.verification.shield_together import Ceilings
 
@@ -187,7 +189,8 @@ class Agent:
         self._heard_s = table.heard_s[row]
         self._busy, self._at_rest, self._blamed = table.busy[row], table.at_rest[row], table.blamed[row]
         self._find_overdue = loops().overdue
-        places_loop()  # policies may rank peers, and gates count cells
+        self._overdue_ids = np.empty(table.heard_s.shape[1], np.int64)  # that it writes into
+        rank_loop()  # policies may rank peers, and gates count cells
         cell_loops()
         self._alert = False  # whether it knows of a person in its region
         self._last_own: Descriptor | None = None  # published or not
@@ -314,7 +317,8 @@ class Agent:
         members = self.memory.members(self._env.now, here_m)
         if members != self._roster.members:
             self._roster = Roster(self._roster.epoch + 1, members)
-            self._listed = np.array([i for i in members if i != self.drone], np.int64)
+            listed = np.array(members, np.int64)
+            self._listed = listed[listed != self.drone]
         return self._roster
 
     def _goodput_mbps(self) -> tuple[float, ...]:
@@ -334,7 +338,12 @@ class Agent:
         if look is None or now_s - look.capture.t_s > LOOK_STANDS_S + 1e-9:
             return NOTHING_SEEN, False
         grid = placed(look.view, here.row, here.column)
-        return self._chart.mark(grid, here.row, here.column, self.memory.believed, told)
+        return self._chart.mark(grid, here.row, here.column, partial(self._seen_near, here), told)
+
+    def _seen_near(self, here: View) -> list[Descriptor]:
+        """The latest descriptors of believed peers whose grids may overlap one of these rows and columns."""
+        y_m, x_m = ((corner + COVERAGE_CELLS // 2) * COVERAGE_CELL_M for corner in (here.row, here.column))
+        return self.memory.believed_near(x_m, y_m, (COVERAGE_CELLS + 1) * COVERAGE_CELL_M)
 
     def _check_clock(self) -> None:
         """Report where the own clock is off the fleet's, and where it no longer is."""
@@ -395,13 +404,13 @@ class Agent:
 
     def _overdue(self, ages_s: NDArray[np.float64], now_s: float) -> list[int]:
         """Peers to which the link's directive may change although the policy asks for nothing new."""
-        ids = self.memory.ids
-        places = self._find_overdue(
+        found = self._overdue_ids
+        count = self._find_overdue(
             self.drone, now_s, self._fresh_s, self._period_s, self._rules.degraded_after_periods,
-            self.memory.clocks.delay_s, ids, ages_s, self._heard_s, self._busy, self._at_rest, self._blamed,
+            self.memory.clocks.delay_s, self.memory.ids, ages_s, self._heard_s, self._busy, self._at_rest, self._blamed,
+            found,
         )  # fmt: skip
-        found: list[int] = ids[places].tolist()
-        return found
+        return found[:count].tolist() if count else []
 
     def _enforce(self, link: _OutgoingLink, asked: Directive, age_s: float, now_s: float) -> None:
         """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""

@@ -184,13 +184,15 @@ def _hide(states: States, poses: Poses, corner: npt.NDArray[np.int64], turn: Arr
     field.hide(states, at, eye, east, north, np.cos(turned), np.sin(turned), (RANGE_M + CELL_M) ** 2)
 
 
-@lru_cache(maxsize=256)
 def placed(view: View, row: int, column: int) -> bytes:
     """The grid of a view, on the cells of a grid whose south-west cell is (row, column)."""
     north, east = row - view.row, column - view.column
-    if not (north or east):
-        return view.grid
+    return _moved(view.grid, north, east) if north or east else view.grid
+
+
+@lru_cache(maxsize=256)
+def _moved(grid: bytes, north: int, east: int) -> bytes:
     states = np.zeros((3 * COVERAGE_CELLS,) * 2, np.uint8)
-    states[COVERAGE_CELLS:-COVERAGE_CELLS, COVERAGE_CELLS:-COVERAGE_CELLS] = unpack_grid(view.grid)
+    states[COVERAGE_CELLS:-COVERAGE_CELLS, COVERAGE_CELLS:-COVERAGE_CELLS] = unpack_grid(grid)
     north, east = (COVERAGE_CELLS + min(max(by, -COVERAGE_CELLS), COVERAGE_CELLS) for by in (north, east))
     return pack_grid(states[north : north + COVERAGE_CELLS, east : east + COVERAGE_CELLS])

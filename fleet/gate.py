@@ -133,7 +133,10 @@ class Gate:
         peer, sending = directive.destination, self._sending
         before = self._directives.get(peer)
         self._directives[peer] = directive
-        if before is None or before.duty_percent != directive.duty_percent:
+        duty = directive.duty_percent
+        if before is None and len(self._directives) > 1:  # one more
+            self.duty_percent = max(self.duty_percent, duty)
+        elif before is None or before.duty_percent != duty:
             self.duty_percent = max([d.duty_percent for d in self._directives.values()])
         if directive.representation == _NONE or directive.rate_hz <= 0:
             sending.pop(peer, None)

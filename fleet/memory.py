@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from bisect import insort
+from collections.abc import Iterable, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -88,9 +89,13 @@ class PeerMemory:
         return refused[0][1] if refused else None
 
     def meet(self, descriptor: Descriptor, now_s: float) -> None:
-        """Take in a descriptor of a new peer, or of one with another clock."""
-        self.clocks.heard(descriptor.agent_id, now_s + self.status.clock_skew_s - descriptor.stamp_ns * 1e-9)
-        self.hold(descriptor, now_s)
+        """Take in a descriptor, entered in the table already, of a new peer or of one with another clock."""
+        sender = descriptor.agent_id
+        self.clocks.heard(sender, now_s + self.status.clock_skew_s - descriptor.stamp_ns * 1e-9)
+        if sender in self._known:
+            self._known[sender] = descriptor  # the table has the rest already
+        else:
+            self.hold(descriptor, now_s)
 
     def hold(self, descriptor: Descriptor, now_s: float) -> None:
         """Replace the last descriptor of this sender, which may be the drone itself."""
@@ -173,26 +178,36 @@ class PeerMemory:
         known = dict(self._known)
         for doubted in self._doubted:
             known[doubted] = discounted(known[doubted])
-        note_circles(known, self._circles.copy())
+        shown = note_circles(known, self.ids, self._circles.copy())
         ages_s = self.ages(now_s) if ages is None else ages
         by_peer = MappingProxyType(dict(zip(known, ages_s.tolist(), strict=True)))
-        return FleetView(
-            self.drone, self._period_s, MappingProxyType(known), by_peer, self._rules.detached_after_periods
-        )
+        return FleetView(self.drone, self._period_s, shown, by_peer, self._rules.detached_after_periods)
 
     def members(self, now_s: float, here_m: tuple[float, float, float]) -> tuple[int, ...]:
         """Ids of the drone and its attached peers, ascending; of the peers that claim to be nearest, where a descriptor cannot
         list them all."""
         limit_s = (self._rules.detached_after_periods + ROUNDING_PERIODS) * self._period_s
-        found = self.ids[(self.ages(now_s) <= limit_s) & (self.ids != self.drone)]
-        if len(found) >= LISTED_MEMBERS and found[-1] >= WIDE_FROM:
-            away_m = np.linalg.norm(np.array([self._known[i].position_m for i in found.tolist()]) - here_m, axis=1)
-            found = found[np.argsort(away_m, kind="stable")[: LISTED_MEMBERS - 1]]
-        return tuple(sorted([self.drone, *found.tolist()]))
+        found: list[int] = self.ids[self.ages(now_s) <= limit_s].tolist()
+        if self.drone not in found:
+            insort(found, self.drone)
+        if len(found) > LISTED_MEMBERS:
+            others = [i for i in found if i != self.drone]
+            if others[-1] >= WIDE_FROM:
+                away_m = np.linalg.norm(np.array([self._known[i].position_m for i in others]) - here_m, axis=1)
+                nearest = np.array(others)[np.argsort(away_m, kind="stable")[: LISTED_MEMBERS - 1]]
+                found = sorted([self.drone, *nearest.tolist()])
+        return tuple(found)
 
     def believed(self) -> list[Descriptor]:
         """The latest descriptors of the peers that it does not doubt."""
-        return [d for i, d in self._known.items() if i != self.drone and i not in self._doubted]
+        return self._believed(self._known)
+
+    def believed_near(self, x_m: float, y_m: float, reach_m: float) -> list[Descriptor]:
+        """Those of `believed` that claim to be in a square about a place, as far as `reach_m` to each side."""
+        return self._believed(self.ids[self._loops.near(self.ids, self._circles, x_m, y_m, reach_m)].tolist())
+
+    def _believed(self, of: Iterable[int]) -> list[Descriptor]:
+        return [self._known[i] for i in of if i != self.drone and i not in self._doubted]
 
     def trust_in(self, peer: int) -> float:
         """Trust in a peer, 0 … 1. The fusion weight of its payloads is multiplied by it."""
@@ -269,16 +284,17 @@ def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float
         rules.descriptor_period_s, table.window, table.counters(key_id or 0), table.heard_s, table.stamps_s,
         table.circles, table.watched, table.bits,
     ).tobytes()  # fmt: skip
-    if found.count(module.TAKEN) == count:  # as nearly always
+    taken, unusual, refused = module.TAKEN, module.UNUSUAL, module.REFUSED
+    if found.count(taken) == count:  # as nearly always
         for memory in receivers:
             memory._known[sender] = descriptor
         return []
-    refused = []
+    drops = []
     for memory, what in zip(receivers, found, strict=True):
-        if what == module.TAKEN:
+        if what == taken:
             memory._known[sender] = descriptor
-        elif what == module.UNUSUAL:
+        elif what == unusual:
             memory.meet(descriptor, now_s)
-        elif what == module.REFUSED:
-            refused.append((memory.drone, DropReason.REPLAYED))
-    return refused
+        elif what == refused:
+            drops.append((memory.drone, DropReason.REPLAYED))
+    return drops

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from sortie.scenarios.compiled import compiled, part
+
+within = partial(compiled, allocates=False)
 
 # constants of the file itself: kept machine code does not see that another file has changed
 REFUSED, TAKEN, UNUSUAL, OWN = range(4)
@@ -79,7 +83,7 @@ def hear(
     return found
 
 
-@compiled
+@within
 def fill(now_s, period_s, window, peers, heard_s, bits, mbps, known):
     """Let probes stand where nothing was measured: changes `known`, [K] goodputs to `peers`."""
     for k in range(len(peers)):
@@ -102,12 +106,27 @@ def ages(clock_s, now_s, ids, heard_s, stamps_s, ahead_s):
 
 
 @compiled
-def overdue(me, now_s, fresh_s, period_s, degraded, delay_s, ids, ages_s, heard_s, busy, at_rest, blamed):
-    """Places in `ids` of links whose directives must be looked at although nothing new was asked of them.
+def near(ids, circles, x_m, y_m, reach_m):
+    """Places in `ids` of the circles, [..., 3], with their middle in the square of side 2 `reach_m` about a place."""
+    found = np.empty(len(ids), np.int64)
+    count = 0
+    for k in range(len(ids)):
+        circle = circles[ids[k]]
+        if abs(circle[0] - x_m) <= reach_m and abs(circle[1] - y_m) <= reach_m:
+            found[count] = k
+            count += 1
+    return found[:count]
+
+
+@within
+def overdue(
+    me, now_s, fresh_s, period_s, degraded, delay_s, ids, ages_s, heard_s, busy, at_rest, blamed, found,
+):  # fmt: skip
+    """Peers whose links' directives must be looked at although nothing new was asked of them, to the front of `found`; returns
+    how many.
 
     Those that are busy, those that are aged and not at rest, and those where a clock begins or ceases to be to blame.
     """
-    found = np.empty(len(ids), np.int64)
     count = 0
     for k in range(len(ids)):
         i = ids[k]
@@ -117,6 +136,6 @@ def overdue(me, now_s, fresh_s, period_s, degraded, delay_s, ids, ages_s, heard_
         is_stale = age_s / period_s - _ROUNDING_PERIODS > degraded
         is_blamed = is_stale and age_s - (now_s - heard_s[i]) > delay_s
         if busy[i] or (age_s > fresh_s and not at_rest[i]) or is_blamed != (blamed[i] > 0):
-            found[count] = k
+            found[count] = i
             count += 1
-    return found[:count]
+    return count

@@ -29,7 +29,8 @@ def loops() -> Any:
     )  # fmt: skip
     peer_loops.fill(0.0, 1.0, 1, ids, none, bits, none, none)
     peer_loops.ages(0.0, 0.0, ids, none, none, none)
-    peer_loops.overdue(0, 0.0, 1.0, 1.0, 1.0, 1.0, ids, none, none, flags, flags, flags)
+    peer_loops.near(ids, square, 0.0, 0.0, 0.0)
+    peer_loops.overdue(0, 0.0, 1.0, 1.0, 1.0, 1.0, ids, none, none, flags, flags, flags, ids)
     return peer_loops
 
 

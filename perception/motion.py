@@ -79,7 +79,10 @@ class Tracks:
     @classmethod
     def join(cls, *several: Tracks) -> Tracks:
         """All tracks of several, in order."""
-        return cls(*[np.concatenate([getattr(t, name) for t in several]) for name in _FIELDS])
+        some = [t for t in several if len(t)]
+        if len(some) < 2:
+            return some[0] if some else cls.empty()
+        return cls(*[np.concatenate([getattr(t, name) for t in some]) for name in _FIELDS])
 
     @property
     def moves(self) -> Bools:

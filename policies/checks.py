@@ -64,10 +64,10 @@ def differing(before: Sequence[Directive], directives: Sequence[Directive], view
     if (type(directives) is not tuple and type(directives) is not list) or len(before) != len(directives):
         return None
     moved = list(map(operator.is_not, directives, before))
-    changed, were = list(compress(directives, moved)), list(compress(before, moved))
-    old = set(map(id, were))
-    new = [d for d in changed if id(d) not in old]  # others have only another place in the answer
-    if not _is_plainly_valid(new, view) or {d.destination for d in changed} != {d.destination for d in were}:
+    changed, were = compress(directives, moved), list(compress(before, moved))
+    gone = dict(zip(map(id, were), were, strict=True))
+    new = [d for d in changed if gone.pop(id(d), None) is None]  # others have only another place in the answer
+    if not _is_plainly_valid(new, view) or {d.destination for d in new} != {d.destination for d in gone.values()}:
         return None
     return new
 

@@ -17,6 +17,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from functools import lru_cache
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -153,14 +154,18 @@ class Descriptor(NamedTuple):
 
     def with_roster(self, roster: Roster) -> Descriptor:
         """The same descriptor with this roster, and with goodputs to its members alone."""
-        ids = range(len(self.peer_goodput_mbps) + 1) if self.roster is None else self.roster.members
-        known = dict(zip([i for i in ids if i != self.agent_id], self.peer_goodput_mbps, strict=False))
-        goodput_mbps = tuple([known.get(i, 0.0) for i in roster.members if i != self.agent_id])
-        return self._replace(peer_goodput_mbps=goodput_mbps, roster=roster)
+        return self._replace(peer_goodput_mbps=goodput_to_members(self, roster), roster=roster)
+
+
+def goodput_to_members(d: Descriptor, roster: Roster) -> tuple[float, ...]:
+    """A descriptor's goodput to the other members of any roster, by ascending id; 0 for those off its own."""
+    ids = range(len(d.peer_goodput_mbps) + 1) if d.roster is None else d.roster.members
+    known = dict(zip([i for i in ids if i != d.agent_id], d.peer_goodput_mbps, strict=False))
+    return tuple([known.get(i, 0.0) for i in roster.members if i != d.agent_id])
 
 
 def goodput_in(known: tuple[float, ...], me: int, roster: Roster | None, peer: int) -> float:
-    """Goodput to `peer` in the list of drone `me`; `Descriptor.with_roster` reads the whole list at once."""
+    """Goodput to `peer` in the list of drone `me`; `goodput_to_members` reads the whole list at once."""
     if peer == me:
         return 0.0
     place = peer if roster is None else roster.slot(peer)
@@ -329,7 +334,11 @@ def nothing(source: int, destination: int, reason: str) -> Directive:
 def nothing_to_all(source: int, destinations: tuple[int, ...], reason: str) -> tuple[Directive, ...]:
     """`nothing` for each of several destinations."""
     if type(destinations) is tuple and {type(source), *map(type, destinations)} == {int} and type(reason) is str:
-        return tuple(map(_nothing(source, reason).__getitem__, destinations))
+        made = _nothing(source, reason)
+        if len(destinations) > 1:
+            found: tuple[Directive, ...] = itemgetter(*destinations)(made)  # in half the time of one after the other
+            return found
+        return tuple([made[destination] for destination in destinations])
     return tuple([nothing(source, destination, reason) for destination in destinations])
 
 

@@ -14,7 +14,7 @@ import math
 from functools import reduce
 from typing import Any, NamedTuple
 
-from sortie.policies.contract import Descriptor, Directive, Disc, Representation
+from sortie.policies.contract import Descriptor, Directive, Disc, Representation, goodput_to_members
 from sortie.scenarios.link_state import PROBED_MBPS
 
 _NONE = Representation.NONE
@@ -51,7 +51,7 @@ def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float
     ) = measured  # fmt: skip
     soc, cpu, gpu, links, last = own_soc, own_cpu, own_gpu, own_links, before.peer_goodput_mbps
     if measured.roster is not None and measured.roster != before.roster:
-        last = before.with_roster(measured.roster).peer_goodput_mbps
+        last = goodput_to_members(before, measured.roster)
     if links != last and len(links) == len(last):  # else the fleet is another
         risen = list(links)
         for k in [k for k, u in enumerate(links) if u > PROBED_MBPS]:  # tiny values are states, not rates

@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from functools import cache
 from math import hypot
 from operator import is_
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sortie.policies.contract import Descriptor, FleetView
-from sortie.scenarios.disc import AGENT_IDS, disc_overlap
+from sortie.scenarios.disc import disc_overlap
 
 
 def footprint_overlap(a: Descriptor, b: Descriptor) -> float:
@@ -32,42 +33,48 @@ def peers_by_overlap(view: FleetView, receiver: int | None = None) -> list[int]:
     known = view.descriptors
     if of not in known:
         return []
-    ids = np.fromiter(known, np.int64, len(known))
-    noted, circles = _latest
-    if all(map(is_, map(noted.get, known), known.values())):
-        at = ids
+    whole, noted, at, circles = _latest
+    if known is whole:
+        ids = at
     else:
-        numbers: list[float] = []
-        for d in known.values():
-            numbers += (*d.position_m[:2], d.footprint_radius_m)
-        at, circles = np.arange(len(ids)), np.fromiter(numbers, np.float64, len(numbers)).reshape(-1, 3)
-    places = places_loop()(of, ids, at, circles)
-    places.sort()
-    places += of
-    places %= AGENT_IDS
-    ranked: list[int] = places.tolist()
+        at = ids = np.fromiter(known, np.int64, len(known))
+        if not all(map(is_, map(noted.get, known), known.values())):
+            numbers: list[float] = []
+            for d in known.values():
+                numbers += (*d.position_m[:2], d.footprint_radius_m)
+            at, circles = np.arange(len(ids)), np.fromiter(numbers, np.float64, len(numbers)).reshape(-1, 3)
+    ranked: list[int] = rank_loop()(of, ids, at, circles).tolist()
     return ranked
 
 
-_latest: tuple[Mapping[int, Descriptor], NDArray[np.float64]] = {}, np.zeros((0, 3))
+_Noted = tuple[Mapping[int, Descriptor] | None, Mapping[int, Descriptor], NDArray[np.int64], NDArray[np.float64]]
+_latest: _Noted = None, {}, np.zeros(0, np.int64), np.zeros((0, 3))
 
 
-def note_circles(descriptors: Mapping[int, Descriptor], circles: NDArray[np.float64]) -> None:
+def note_circles(
+    descriptors: dict[int, Descriptor], ids: NDArray[np.int64], circles: NDArray[np.float64]
+) -> Mapping[int, Descriptor]:
     """Give the footprints of descriptors that are about to be ranked as an array, which takes longer to make of them than to rank.
 
     Args:
-        descriptors: they and the array must not change any more. Views of some of them rank by the array too.
+        descriptors: they and the arrays must not change any more. Views of some of them rank by the array too.
+        ids: theirs, in order.
         circles: [ids, 3], x, y and radius, m.
+
+    Returns:
+        The descriptors as the view is to have them, to be read only.
     """
     global _latest
-    _latest = descriptors, circles
+    shown = MappingProxyType(descriptors)
+    _latest = shown, descriptors, ids, circles
+    return shown
 
 
 @cache
-def places_loop() -> Any:
+def rank_loop() -> Any:
     """The compiled loop, imported and made ready at its first use: before a flight, for decisions may have little time."""
-    from sortie.policies.overlap_loops import places
+    from sortie.policies.overlap_loops import ranked
 
     one = np.zeros(1, np.int64)
-    places(0, one, one, np.zeros((1, 3)))
-    return places
+    ranked(0, one, one, np.zeros((1, 3)))
+    return ranked

@@ -28,8 +28,8 @@ def _overlap(distance_m, a_m, b_m):
 
 
 @compiled
-def places(of, ids, at, circles):
-    """What `sortie.scenarios.disc.rank_by_overlap` sorts by, of all ids but one.
+def ranked(of, ids, at, circles):
+    """All ids but one as `sortie.scenarios.disc.rank_by_overlap` ranks them.
 
     Args:
         of: the id whose peers are ranked.
@@ -49,4 +49,7 @@ def places(of, ids, at, circles):
             overlap = _overlap(np.hypot(x_m - its[0], y_m - its[1]), radius_m, its[2])
             found[count] = (ids[k] - of) % _AGENT_IDS - _AGENT_IDS * int(np.rint(overlap / _STEP))
             count += 1
+    found.sort()
+    for k in range(count):
+        found[k] = (found[k] + of) % _AGENT_IDS
     return found

@@ -32,7 +32,7 @@ import reprlib
 import struct
 from collections.abc import Callable
 from functools import lru_cache
-from itertools import pairwise
+from operator import ge
 from typing import Any, NamedTuple
 
 from sortie.fleet.messages.cdr import MalformedDatagram
@@ -125,7 +125,7 @@ def _decode_wide(value: bytes) -> tuple[int, Roster]:
     if count < 1 or odd:
         raise MalformedDatagram(f"wide has {len(value)} B, must have 6 and 2 for each member, one at least")
     drone, epoch, *members = struct.unpack(f"<HI{count}H", value)
-    if any(a >= b for a, b in pairwise(members)) or members[-1] > MAX_WIDE_ID or drone not in members:
+    if any(map(ge, members, members[1:])) or members[-1] > MAX_WIDE_ID or drone not in members:
         raise MalformedDatagram(
             f"wide names drone {drone} and members {reprlib.repr(tuple(members))}, must be ascending ids up to {MAX_WIDE_ID}, "
             "the drone among them"
@@ -183,7 +183,7 @@ def listed_goodput(d: Descriptor) -> tuple[float, ...]:
     epoch, members = d.roster
     if not 0 <= epoch < 2**32:
         raise ValueError(f"roster.epoch is {epoch}, must be in [0, 2³²)")
-    if not members or not 0 <= members[0] <= members[-1] <= MAX_WIDE_ID or any(a >= b for a, b in pairwise(members)):
+    if not members or not 0 <= members[0] <= members[-1] <= MAX_WIDE_ID or any(map(ge, members, members[1:])):
         raise ValueError(
             f"roster.members is {reprlib.repr(members)}, must be ascending ids in [0, {MAX_WIDE_ID}], one at least"
         )
@@ -206,7 +206,8 @@ def with_extensions(d: Descriptor, block: bytes) -> Descriptor:
         return d
     found = read_extensions(block)
     roster, wide = found.pop("roster", None), found.pop("wide", None)
-    d = d._replace(**found)
+    if found:
+        d = d._replace(**found)
     if wide is not None:
         drone, members = wide
         return _widened(d, drone, members, roster)

@@ -6,18 +6,17 @@ Free of torch.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
+from typing import Any
 
 import numpy as np
 
-from sortie.perception.classes import PERSON
 from sortie.perception.lateness import movement
 from sortie.perception.motion import ACCELERATION_DENSITY, Floats, Tracks, grown
 from sortie.perception.tracking.association import GATE
-from sortie.perception.tracking.tracker import COAST_S, PLACE_VARIANCE_M2
+from sortie.perception.tracking.tracker import PLACE_VARIANCE_M2
 from sortie.perception.types import Boxes
 
-CUE_VARIANCE_M2, CUE_SPEED_VARIANCE = 1.0**2, 1.0**2
-"""Of a cue's place and velocity along each axis."""
 AGREE = 13.28
 """Squared Mahalanobis distance of place and velocity within which a track begins to be the target: 99 % (χ², four
 degrees)."""
@@ -78,29 +77,37 @@ def followed(tracks: Tracks, cues: Mapping[int, Cue], before: Mapping[int, int],
         before: what was followed until now, as returned.
         t_s: now.
     """
-    its = np.flatnonzero((tracks.kind != PERSON) & tracks.confirmed & (t_s - tracks.seen_s <= COAST_S))
-    ids, velocity_mps, dt = tracks.id[its].tolist(), tracks.velocity_mps[its], t_s - tracks.t_s[its]
-    xy_m, row = tracks.xy_m[its] + dt[:, None] * velocity_mps, {track: k for k, track in enumerate(ids)}
-    spread = grown(tracks.covariance[its], dt) + np.array((CUE_VARIANCE_M2, 0.0, CUE_SPEED_VARIANCE))
-    out: dict[int, int] = {}
-    for target, track in before.items():
-        k = row.get(track)
-        if target in cues and k is not None:
-            x_m, y_m = (xy_m[k] - cues[target][:2]).tolist()
-            if x_m * x_m + y_m * y_m < GATE * spread[k, 0]:
-                out[target] = track
+    n, ids = len(tracks), tracks.id.tolist()
+    if not n:
+        return {}
+    row, near, cost = {track: k for k, track in enumerate(ids)}, {}, {}
+    for target, cue in cues.items():
+        near[target], cost[target] = np.empty(n, np.bool_), np.empty(n)
+        agree_loop()(
+            tracks.kind, tracks.confirmed, tracks.t_s, tracks.seen_s, tracks.xy_m, tracks.velocity_mps, tracks.covariance,
+            cue, t_s, near[target], cost[target],
+        )  # fmt: skip
+    out = {
+        target: track
+        for target, track in before.items()
+        if target in cues and track in row and near[target][row[track]]
+    }
     for target in sorted(cues.keys() - out.keys()):
-        cost = _disagreement(xy_m, velocity_mps, spread, cues[target])
-        cost[[row[track] for track in out.values()]] = np.inf
-        best = int(cost.argmin()) if len(cost) else -1
-        if best >= 0 and cost[best] < AGREE:
+        cost[target][[row[track] for track in out.values()]] = np.inf
+        best = int(cost[target].argmin())
+        if cost[target][best] < AGREE:
             out[target] = ids[best]
     return out
 
 
-def _disagreement(xy_m: Floats, velocity_mps: Floats, spread: Floats, cue: Cue) -> Floats:
-    """Squared Mahalanobis distance [n] in place and velocity; `spread` [n, 3] is the covariance of the difference."""
-    off, faster = xy_m - cue[:2], velocity_mps - cue[2:]
-    pp, pv, vv = spread.T
-    cost = vv * (off * off).sum(axis=1) - 2.0 * pv * (off * faster).sum(axis=1) + pp * (faster * faster).sum(axis=1)
-    return np.asarray(cost / (pp * vv - pv * pv))
+@cache
+def agree_loop() -> Any:
+    """The compiled loop, imported and made ready at its first use: before a flight, whose drones may be real ones."""
+    from sortie.perception.tracking.following_loops import agree
+
+    none = Tracks.empty()
+    agree(
+        none.kind, none.confirmed, none.t_s, none.seen_s, none.xy_m, none.velocity_mps, none.covariance,
+        (0.0, 0.0, 0.0, 0.0), 0.0, none.confirmed, none.t_s,
+    )  # fmt: skip
+    return agree

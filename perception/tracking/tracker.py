@@ -52,7 +52,8 @@ def step(tracks: Tracks, boxes: Boxes, owner: Ints, looks_s: Floats, next_id: In
     """
     now_s = looks_s[tracks.owner]
     looking = ~np.isnan(now_s)
-    resting, ahead = tracks.take(~looking), predicted(tracks.take(looking), now_s[looking])
+    resting, tracks = (Tracks.empty(), tracks) if looking.all() else (tracks.take(~looking), tracks.take(looking))
+    ahead = predicted(tracks, now_s[looking])
     place = boxes.xy_m.astype(np.float64)
     mine, theirs = (k + len(TargetClass) * of for k, of in ((ahead.kind, ahead.owner), (boxes.kind, owner)))
     i, j = assigned(ahead.xy_m, ahead.covariance[:, 0] + PLACE_VARIANCE_M2[ahead.kind], mine, place, theirs)
@@ -60,6 +61,8 @@ def step(tracks: Tracks, boxes: Boxes, owner: Ints, looks_s: Floats, next_id: In
     of_box[j] = ahead.id[i]
     kept = _survivors(_corrected(ahead, boxes, i, j))
     new = np.flatnonzero((of_box < 0) & (boxes.score >= BEGIN_SCORE))
+    if not len(new):
+        return Tracks.join(resting, kept), next_id, of_box
     begun, after = _begun(boxes.take(new), owner[new], looks_s, next_id)
     of_box[new] = begun.id
     return Tracks.join(resting, kept, begun), after, of_box
@@ -96,7 +99,8 @@ def _survivors(tracks: Tracks) -> Tracks:
     """Without tracks that are lost, and tentative ones that cannot be confirmed any more."""
     missed = tracks.looks - tracks.hits
     lives = (tracks.t_s - tracks.seen_s <= COAST_S + 1e-9) & (tracks.score >= LEAST_SCORE)
-    return tracks.take(np.where(tracks.confirmed, lives, missed <= CONFIRM_LOOKS - CONFIRM_HITS))
+    stays = np.where(tracks.confirmed, lives, missed <= CONFIRM_LOOKS - CONFIRM_HITS)
+    return tracks if stays.all() else tracks.take(stays)
 
 
 def _begun(boxes: Boxes, owner: Ints, looks_s: Floats, next_id: Ints) -> tuple[Tracks, Ints]:

@@ -27,7 +27,8 @@ def among_attached(policy: Decide) -> Decide:
         if attached is view or attached.me is None:
             return directives
         duty = directives[0].duty_percent if directives else 100
-        away = sorted([p for p in view.descriptors if p not in attached.descriptors])
+        near = attached.descriptors
+        away = sorted([p for p in view.descriptors if p not in near])
         gone = nothing_to_all(view.ego, tuple(away), DETACHED)
         return [*directives, *(gone if duty == 100 else [d._replace(duty_percent=duty) for d in gone])]
 

@@ -31,7 +31,7 @@ from sortie.policies.verification.stand_ins import (
 from sortie.policies.verification.symbols import Path, Ranged
 from sortie.policies.verification.views import LONGEST_S, OTHER_CODEBOOK
 from sortie.policies.verification.watch import WATCH
-from sortie.scenarios.disc import AGENT_IDS, disc_overlap
+from sortie.scenarios.disc import disc_overlap
 from sortie.scenarios.link_state import state_of
 
 Choose = Callable[[str, float, float], float]
@@ -89,20 +89,19 @@ class FleetOfRanges:
 
         A run may rank the peers of several drones. The positions of its example show the first of these orders.
         """
-        picks, usual, placed = self.path.picks, geometry.places_loop, self._placed
+        picks, usual, placed = self.path.picks, geometry.rank_loop, self._placed
 
-        def places(of: int, ids: Any, *circles: Any) -> Any:
+        def ranked(of: int, ids: Any, *circles: Any) -> Any:
             label = _order_of(of)
             if label == placed or label not in picks:
                 return usual()(of, ids, *circles)
-            order = [p for p in picks[label] if p in ids]
-            return np.array([(p - of) % AGENT_IDS - AGENT_IDS * (len(order) - k) for k, p in enumerate(order)])
+            return np.array([p for p in picks[label] if p in ids])
 
-        geometry.places_loop = lambda: places  # type: ignore[assignment]
+        geometry.rank_loop = lambda: ranked  # type: ignore[assignment]
         try:
             yield
         finally:
-            geometry.places_loop = usual
+            geometry.rank_loop = usual
 
     @property
     def _placed(self) -> str:

@@ -19,7 +19,7 @@ from sortie.perception.geometry import Lens
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import TARGET_SIZE_M
-from sortie.perception.tracking.following import followed
+from sortie.perception.tracking.following import agree_loop, followed
 from sortie.perception.tracking.tracker import step
 from sortie.perception.types import Boxes, Capture
 from sortie.scenarios.schema import Scenario
@@ -62,6 +62,7 @@ class FleetTracking:
         self._of: dict[int, Tracks] = {}
         self._cues: dict[int, deque[tuple[float, tuple[float, float]]]] = {}
         self._followed = [_Followed(-1, {}, None, -math.inf)] * n
+        agree_loop()
 
     def perceived(self, capture: Capture) -> None:
         """A drone's perception has worked on a capture; its tracker takes it in if a look is due."""
@@ -163,8 +164,6 @@ class TargetSeen:
         flat = pose.reshape(-1, 3)
         eyes = np.repeat(position, len(targets), axis=0)
         seen &= self._scene.height_field.seen(flat[:, 0], flat[:, 1], eyes).reshape(seen.shape)
-        size = np.tile(TARGET_SIZE_M[:2], (len(targets), 1))
-        return [
-            Boxes(each[:, :2], size, each[:, 2], np.ones(len(each))).take(here)
-            for each, here in zip(pose, seen, strict=True)
-        ]
+        size, score = np.tile(TARGET_SIZE_M[:2], (len(targets), 1)), np.ones(len(targets))
+        found = [each[here] for each, here in zip(pose, seen, strict=True)]
+        return [Boxes(each[:, :2], size[: len(each)], each[:, 2], score[: len(each)]) for each in found]

@@ -126,8 +126,8 @@ def sees_ground(xy_m: Floats, position_m: Floats, orientation_xyzw: Floats, lens
     body = np.concatenate([away, drop], axis=-1) @ turn
     seen = np.maximum(*camera_margins(body[..., 0], body[..., 1], body[..., 2], lens)) > 0.0
     yaw = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])[:, None]
-    ahead = np.cos(yaw) * away[..., 0] + np.sin(yaw) * away[..., 1]
-    left = np.cos(yaw) * away[..., 1] - np.sin(yaw) * away[..., 0]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    ahead, left = cos * away[..., 0] + sin * away[..., 1], cos * away[..., 1] - sin * away[..., 0]
     inside: Bools = (np.abs(ahead) < FULL.half_extent_m) & (np.abs(left) < FULL.half_extent_m)
     inside &= seen
     return inside

@@ -99,10 +99,20 @@ def test_links_are_looked_at_where_age_or_a_clock_can_change_them(data: st.DataO
         is_blamed = is_stale and age_s - (now_s - heard_s[i]) > delay_s
         if i != me and (busy[i] or (is_aged and not at_rest[i]) or is_blamed != bool(blamed[i])):
             expected.append(i)
-    found = loops().overdue(
-        me, now_s, PERIOD_S * 3.0, PERIOD_S, 3.0, delay_s, ids, ages, heard_s, busy, at_rest, blamed
+    found = np.empty(len(ids), np.int64)
+    count = loops().overdue(
+        me, now_s, PERIOD_S * 3.0, PERIOD_S, 3.0, delay_s, ids, ages, heard_s, busy, at_rest, blamed, found
     )
-    assert found.tolist() == expected
+    assert found[:count].tolist() == expected
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(*[st.sampled_from([-30.0, -10.0, 0.0, 9.5, 10.0, 10.5, 30.0])] * 2), min_size=1, max_size=9))
+def test_claims_are_near_within_a_square_its_edge_included(places: list[tuple[float, float]]) -> None:
+    circles = np.array([(x_m, y_m, 1.0) for x_m, y_m in places])
+    ids = np.arange(len(places))[::2]
+    expected = [k for k, i in enumerate(ids) if max(abs(places[i][0]), abs(places[i][1] - 0.5)) <= 10.0]
+    assert loops().near(ids, circles, 0.0, 0.5, 10.0).tolist() == expected
 
 
 def test_peers_are_ranked_by_the_noted_array_only_where_all_descriptors_are_those_that_it_is_of() -> None:
@@ -113,9 +123,9 @@ def test_peers_are_ranked_by_the_noted_array_only_where_all_descriptors_are_thos
     by_descriptors = [peers_by_overlap(v) for v in (view, part, moved)]
     assert by_descriptors == [[1, 2, 3], [1, 3], [3, 1, 2]]
     backwards = np.array([(0.0, 0.0, 42.0), (60.0, 0.0, 42.0), (40.0, 0.0, 42.0), (20.0, 0.0, 42.0)])
-    note_circles(known, backwards)
+    note_circles(known, np.arange(4), backwards)
     assert [peers_by_overlap(v) for v in (view, part, moved)] == [[3, 2, 1], [3, 1], [3, 1, 2]]
-    note_circles({}, np.zeros((0, 3)))
+    note_circles({}, np.arange(0), np.zeros((0, 3)))
 
 
 @pytest.mark.parametrize("doubted", [False, True])
@@ -129,5 +139,5 @@ def test_a_view_is_ranked_as_its_descriptors_say(doubted: bool) -> None:
         mine._doubted = frozenset({2} if doubted else ())
         view = mine.view(float(second))
         ranked = peers_by_overlap(view)
-        note_circles({}, np.zeros((0, 3)))
+        note_circles({}, np.arange(0), np.zeros((0, 3)))
         assert ranked == peers_by_overlap(view)

@@ -9,9 +9,10 @@ import pytest
 
 from sortie.perception.classes import CAR, PERSON, TRUCK
 from sortie.perception.lateness import CARS, PEOPLE
-from sortie.perception.motion import ACCELERATION_DENSITY, Tracks
+from sortie.perception.motion import ACCELERATION_DENSITY, Tracks, grown
+from sortie.perception.tracking import following_loops
 from sortie.perception.tracking.association import GATE, assigned
-from sortie.perception.tracking.following import AGREE, followed, motion_of, motion_of_boxes
+from sortie.perception.tracking.following import AGREE, agree_loop, followed, motion_of, motion_of_boxes
 from sortie.perception.tracking.tracker import COAST_S, FIRST_SPEED_VARIANCE, PLACE_VARIANCE_M2, step
 from sortie.perception.types import Boxes
 
@@ -73,6 +74,29 @@ def test_one_track_is_one_targets_and_the_one_that_had_it_keeps_it() -> None:
     assert followed(tracks(), both, {2: 0}, 10.0) == {2: 0}
     two = tracks(2, xy_m=np.array([[0.0, 0.0], [0.9, 0.0]]))
     assert followed(two, both, {2: 0}, 10.0) == {1: 1, 2: 0}
+
+
+def test_the_compiled_loop_agrees_with_the_cue_as_numpy_does() -> None:
+    """Bit by bit, and by the constants of the rooms that they belong to."""
+    loops = following_loops
+    constants = loops.PERSON, loops.COAST_S, loops.GATE, loops.ACCELERATION_DENSITY
+    assert constants == (PERSON, COAST_S, GATE, ACCELERATION_DENSITY)
+    rng, n, now_s = np.random.default_rng(3), 400, 12.3
+    t_s, xy_m, velocity_mps = now_s - rng.uniform(-0.5, 1.0, n), rng.normal(0, 3, (n, 2)), rng.normal(0, 3, (n, 2))
+    covariance = np.column_stack([rng.uniform(0.2, 3, n), rng.uniform(0, 0.2, n), rng.uniform(0.5, 2, n)])
+    kind, confirmed, seen_s = rng.integers(0, 3, n).astype(np.int8), rng.random(n) < 0.8, now_s - rng.uniform(0, 3, n)
+    cue = (0.7, -0.4, 1.1, 0.3)
+    near, cost = np.empty(n, bool), np.empty(n)
+    agree_loop()(kind, confirmed, t_s, seen_s, xy_m, velocity_mps, covariance, cue, now_s, near, cost)
+
+    dt, may = now_s - t_s, (kind != PERSON) & confirmed & (now_s - seen_s <= COAST_S)
+    pp, pv, vv = (grown(covariance, dt) + np.array((1.0, 0.0, 1.0))).T
+    off, faster = xy_m + dt[:, None] * velocity_mps - cue[:2], velocity_mps - cue[2:]
+    place_m2 = (off * off).sum(axis=1)
+    both = vv * place_m2 - 2.0 * pv * (off * faster).sum(axis=1) + pp * (faster * faster).sum(axis=1)
+    assert 20 < near.sum() < may.sum() < n
+    assert near.tolist() == (may & (place_m2 < GATE * pp)).tolist()
+    assert cost.tobytes() == np.where(may, both / (pp * vv - pv * pv), np.inf).tobytes()
 
 
 def test_a_late_box_takes_the_uncertainty_of_its_own_age_and_not_of_the_track_s() -> None:
