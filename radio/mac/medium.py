@@ -202,7 +202,7 @@ class Medium(Generic[J, F]):
         mcs = len(self._rates)
         self._settled = _State(
             (
-                stations, np.vstack([np.full(n, e.FAR), np.zeros(n, np.int64)]), np.zeros(n), np.zeros(0), np.zeros(0, np.uint8), np.zeros(5, np.int64),
+                stations, np.vstack([np.full(n, e.FAR), np.zeros(n, np.int64)]), np.zeros(n), np.zeros(0), np.zeros(0, np.uint8), np.zeros(e.G_FIRST + n, np.int64),
                 np.zeros((_JOBS, e.JOB_COLUMNS), np.int64), np.zeros((n, window), np.uint8),
                 np.zeros((n, window), np.int32), np.zeros((n, e.OVERLAPS), np.int64), np.zeros((n, e.OVERLAPS)),
                 np.zeros((_FLOWS, mcs + 1, 2), np.int64), np.zeros((_DROPS_KEPT + n * window, 2), np.int64),
@@ -218,7 +218,7 @@ class Medium(Generic[J, F]):
         self._out = np.zeros((2 * n + 8, 2), np.int64)
         self._out_rows = memoryview(self._out.reshape(-1).data)
         self._first: list[int] = []  # as `_begin`, in a list
-        self._touch = np.zeros(2 * n + 2, np.int64)
+        self._touch = np.zeros(3 * (n + 1), np.int64)
         self._begin: IntArray = np.zeros(n + 1, np.int64)
         self._receiver: IntArray = np.zeros(0, np.int64)
         self._gain: FloatArray = np.zeros(0)

@@ -32,7 +32,7 @@ class CopiesAll:
 
     def ahead(self, *args: Any) -> Any:
         n = (len(self._medium._differing) - 1) // 2
-        self._medium._differing[:] = [n, *range(n), *[2] * n]
+        self._medium._differing[:] = [n, *range(n), *[edca.SENDS] * n]
         return edca.ahead(*args)
 
 
