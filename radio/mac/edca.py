@@ -29,6 +29,8 @@ CCA = 4_000
 EIFS_EXTRA = SIFS + 44_000
 """After a frame that could not be read: SIFS and an ack at 6 Mb/s, before the AIFS."""
 FAR = 1 << 62
+BLOCK = 32
+"""So many stations are passed over at once if none of them has something to do."""
 ACK, BLOCK_ACK, BLOCK_ACK_LONG, REQUEST_NS, CONTROL = 28_000, 32_000, 40_000, 32_000, 28_000
 """At 24 Mb/s: ack (14 B), block ack of 64 and of 256 frames (32 and 56 B); request (24 B); RTS and CTS (20 and 14 B)."""
 GROUP_CURVE, CONTROL_CURVE = 12, 13
@@ -75,8 +77,8 @@ FLOW_RATE, FLOW_LOSS, FLOW_BURST = range(3)
 # the settings, as integers and as floats
 (
     C_STATIONS, C_AIFSN, C_AIFSN_LOW, C_WINDOW, C_WINDOW_LOW, C_LARGEST, C_LARGEST_LOW, C_RETRIES, C_BLOCK, C_RTS,
-    C_FRAME, C_BY_FRAME, C_SQUARE, C_PREAMBLE_NS, C_SYMBOL_NS, C_LEARNS, C_EXTRA,
-) = range(17)  # fmt: skip
+    C_FRAME, C_BY_FRAME, C_PREAMBLE_NS, C_SYMBOL_NS, C_LEARNS, C_EXTRA,
+) = range(16)  # fmt: skip
 # totals, and then who is on the air, by ascending id
 G_SINCE, G_GROUPS, G_OTHERS, G_GROUP_NS, G_OTHER_NS, G_SENDERS, G_FIRST = range(7)
 
@@ -189,10 +191,9 @@ def plan_access(s, S, C):
 
 @part
 def link_of(s, r, begin, receiver, C):
-    """Where the link stands in the list; −1 where none is listed."""
-    if C[C_SQUARE] == 1:
-        return begin[s] + r
-    low, high = begin[s], begin[s + 1]
+    """Where the link stands in the list; −1 where none is listed. The fewer stations lack in a list, the less is searched."""
+    lacking = C[C_STATIONS] - (begin[s + 1] - begin[s])
+    low, high = begin[s] + max(0, r - lacking), min(begin[s] + r, begin[s + 1])
     while low < high:
         middle = (low + high) // 2
         if receiver[middle] < r:
@@ -915,7 +916,7 @@ def run(
     Returns: the time reached, and how many rows of OUT are to be told; −1 where the drops must be read.
     """
     n = C[C_STATIONS]
-    starters = TOUCH[TOUCH.shape[0] // 3 * 2 :]
+    due, starters = TOUCH[TOUCH.shape[0] // 3 :], TOUCH[TOUCH.shape[0] // 3 * 2 :]
     most_drops = DROPS.shape[0] - 1 - n * C[C_BLOCK]  # at one instant every station may give up a window of fragments
     while True:
         t = FAR
@@ -936,10 +937,18 @@ def run(
                 s, t, S, N, D, P, W, WHY, G, J, M, T, SEG_AT, SEG, OUT, told, DROPS, begin, receiver, gain, extra, LI, LF, LS,
                 RATES, LIMITS, C, F, curves, keys, TOUCH,
             )  # fmt: skip
+        waiting = 0
+        for first in range(0, n, BLOCK):
+            soonest = FAR
+            for s in range(first, min(first + BLOCK, n)):
+                soonest = min(soonest, N[NEXT_AT, s])
+            if soonest <= t:
+                for s in range(first, min(first + BLOCK, n)):
+                    due[waiting] = s
+                    waiting += N[NEXT_AT, s] <= t
         count = 0
-        for s in range(n):
-            if N[NEXT_AT, s] > t:
-                continue
+        for x in range(waiting):
+            s = due[x]
             mark(s, ACTS, D)
             while S[s, ARRIVE_AT] <= t:
                 job = S[s, COMING]
@@ -1235,7 +1244,7 @@ def ahead(at, entered, since, until):
     RATES = carray(pointer(at[45]), (mcs,), np.float64)
     LIMITS = carray(pointer(at[46]), (mcs,), np.int64)
     ORDER = carray(pointer(at[47]), (flows, mcs), np.int64)
-    C = carray(pointer(at[48]), (17,), np.int64)
+    C = carray(pointer(at[48]), (16,), np.int64)
     F = carray(pointer(at[49]), (5,), np.float64)
     curves = carray(pointer(at[50]), (14, 5), np.float64)
     first, goal = SIZES, since

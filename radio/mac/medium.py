@@ -179,7 +179,6 @@ class Medium(Generic[J, F]):
         self._at_row: dict[int, J | F] = {}
         self._flows: dict[tuple[int, int], int] = {}
         self._tuned: list[Link | None] = []  # by flow
-        self._is_square = True
         self._settings = settings
         s, order = _tables(e, settings, n, noise_dbm)
         self._ints, self._floats, self._rates, self._limits = s
@@ -238,7 +237,6 @@ class Medium(Generic[J, F]):
         receiver: IntArray,
         gain: FloatArray,
         *,
-        is_square: bool,
         frame: int,
         extra: FloatArray | None = None,
     ) -> None:
@@ -248,7 +246,6 @@ class Medium(Generic[J, F]):
             begin: [N + 1]: the links of station i are begin[i] … begin[i + 1] − 1.
             receiver: [L], rising within a station's links.
             gain: [L]: mean received power over the noise of the whole channel, linear.
-            is_square: whether every station has a link to every one, itself included.
             frame: its number.
             extra: [L]: probability that a group frame is lost besides; None is none.
         """
@@ -257,7 +254,7 @@ class Medium(Generic[J, F]):
         settled = self._settled
         is_same = receiver is self._receiver
         old = self._begin, self._receiver, settled.arrays[_WHY]
-        ints[e.C_SQUARE], ints[e.C_FRAME], ints[e.C_EXTRA] = is_square, frame, extra is not None
+        ints[e.C_FRAME], ints[e.C_EXTRA] = frame, extra is not None
         if extra is not None and len(extra) == len(self._extra):
             self._extra[:] = extra
         elif extra is not None:
@@ -691,7 +688,7 @@ def _tables(
     used = sorted({names.index(settings.context_class), names.index(settings.payload_class)})
     classes = [getattr(settings.edca, names[i]) for i in used]
     first, second = classes[0], classes[-1]
-    ints = np.zeros(17, np.int64)
+    ints = np.zeros(16, np.int64)
     values = {
         e.C_STATIONS: n, e.C_AIFSN: first.aifsn, e.C_AIFSN_LOW: second.aifsn, e.C_WINDOW: first.cw_min,
         e.C_WINDOW_LOW: second.cw_min, e.C_LARGEST: first.cw_max, e.C_LARGEST_LOW: second.cw_max,

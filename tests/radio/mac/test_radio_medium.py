@@ -39,7 +39,7 @@ class Bench:
             self.env, config, n, seed, 0, NOISE_DBM, lambda job, now: None, self._end, self._group_end
         )
         gain = 10.0 ** ((power - NOISE_DBM) / 10.0)
-        self.medium.set_links(np.arange(n + 1) * n, np.tile(np.arange(n), n), gain.ravel(), is_square=True, frame=0)
+        self.medium.set_links(np.arange(n + 1) * n, np.tile(np.arange(n), n), gain.ravel(), frame=0)
         self.mcs, self.jobs = mcs, 0
         self.log: list[tuple[float, int, End]] = []
         self.heard: list[tuple[float, int, tuple[int, ...]]] = []
