@@ -170,7 +170,7 @@ class Air:
         if not links.is_square:
             gain = gain[links.by_sender]
             extra = None if extra is None else extra[links.by_sender]
-        self.medium.set_links(*self._link_lists, gain, is_square=links.is_square, frame=self.channel.frame, extra=extra)
+        self.medium.set_links(*self._link_lists, gain, frame=self.channel.frame, extra=extra)
 
     def _retune(self) -> None:
         """The links, or who is there, have changed: find out anew how those with traffic are used."""

@@ -71,19 +71,19 @@ class Broadcasts:
         counters, sender, gone = self._counters, frame.sender, self._gone
         counters.context_wire_bytes += frame.wire_bytes
         living = self._n - 1 - (len(gone - {sender}) if gone else 0)
-        if self._as_lists and not gone:
-            heard: Sequence[int] = self._others[sender]
-            if fates.count(_HEARD) < living:
-                heard = [j for j, fate in zip(receivers.tolist(), fates, strict=True) if fate == _HEARD]
-                self._miss(fates, living - len(heard))
+        if gone:  # what became of it at them does not count
+            of_all = np.frombuffer(fates, np.uint8).copy()
+            of_all[np.isin(receivers, list(gone))] = 0
+            fates = of_all.tobytes()
+        heard: Sequence[int]
+        if not self._as_lists:
+            heard = receivers[np.frombuffer(fates, np.uint8) == _HEARD].tolist()
+        elif gone or fates.count(_HEARD) < living:
+            heard = [j for j, fate in zip(receivers.tolist(), fates, strict=True) if fate == _HEARD]
         else:
-            counted = receivers != sender
-            if gone:
-                counted &= ~np.isin(receivers, list(gone))
-            alive, of_alive = receivers[counted], np.frombuffer(fates, np.uint8)[counted]
-            heard = alive[of_alive == _HEARD].tolist()
-            if len(heard) < living:
-                self._miss(of_alive.tobytes(), living - len(heard))
+            heard = self._others[sender]
+        if len(heard) < living:
+            self._miss(fates, living - len(heard))
         counters.receptions += len(heard)
         frame.on_heard(heard)
 

@@ -29,6 +29,8 @@ CCA = 4_000
 EIFS_EXTRA = SIFS + 44_000
 """After a frame that could not be read: SIFS and an ack at 6 Mb/s, before the AIFS."""
 FAR = 1 << 62
+BLOCK = 32
+"""So many stations are passed over at once if none of them has something to do."""
 ACK, BLOCK_ACK, BLOCK_ACK_LONG, REQUEST_NS, CONTROL = 28_000, 32_000, 40_000, 32_000, 28_000
 """At 24 Mb/s: ack (14 B), block ack of 64 and of 256 frames (32 and 56 B); request (24 B); RTS and CTS (20 and 14 B)."""
 GROUP_CURVE, CONTROL_CURVE = 12, 13
@@ -43,18 +45,20 @@ OVERLAPS = 12
 # what a station sends
 NOTHING, GROUP, DATA, BLOCK_REQUEST, RTS, CTS, ANSWER = range(7)
 
-# columns of a station; what each frame on the air asks of everyone who has a link to its sender comes first
+# columns of a station; first come all those that a frame changes at those who only hear it
 (
     TX_END, RESPONSE_AT, TIMEOUT_AT, GRANT, GRANT_LOW, ARRIVE_AT, LOCK, DEAF,
     LOOKED_AT, IS_BUSY, CANDIDATE, CANDIDATE_AT, CANDIDATE_LINK, TOUCHED, EIFS_UNTIL, SEGMENTS,
-    LOCK_AT, LOCK_LINK, NAV, IDLE_AT, BEGIN, BEGIN_LOW,
+    LOCK_AT, LOCK_LINK, NAV, IDLE_AT, BEGIN, BEGIN_LOW, SLOTS, SLOTS_LOW,
     TX_KIND, TX_TO, TX_ACCESS, TX_COUNT, TX_MCS, TX_NAV, TX_BEGIN, TX_JOB,
     RESPONSE_KIND, RESPONSE_TO, RESPONSE_NS, AWAITS, ACCESS,
-    SLOTS, SLOTS_LOW, WINDOW, WINDOW_LOW, FAILS, FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW,
+    WINDOW, WINDOW_LOW, FAILS, FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW,
     REQUEST, SENT, DRAWN, COMING, TRANSMITTED_NS,
 ) = range(50)  # fmt: skip
-STATION_COLUMNS = 56
+HEARING_COLUMNS, STATION_COLUMNS = 24, 56
 """Whole lines of a processor's cache; the last columns are empty."""
+HEARS, ACTS, SENDS = 1, 2, 3
+"""What may differ between the two states at a station: its columns of hearing; its whole row and its jobs; its links too."""
 NEXT_AT, INCIDENT = range(2)
 """Rows of what all stations are asked at once: when the next thing happens, and how many frames are on the air there."""
 
@@ -73,10 +77,10 @@ FLOW_RATE, FLOW_LOSS, FLOW_BURST = range(3)
 # the settings, as integers and as floats
 (
     C_STATIONS, C_AIFSN, C_AIFSN_LOW, C_WINDOW, C_WINDOW_LOW, C_LARGEST, C_LARGEST_LOW, C_RETRIES, C_BLOCK, C_RTS,
-    C_FRAME, C_BY_FRAME, C_SQUARE, C_PREAMBLE_NS, C_SYMBOL_NS, C_LEARNS, C_EXTRA,
-) = range(17)  # fmt: skip
-# totals
-G_SINCE, G_GROUPS, G_OTHERS, G_GROUP_NS, G_OTHER_NS = range(5)
+    C_FRAME, C_BY_FRAME, C_PREAMBLE_NS, C_SYMBOL_NS, C_LEARNS, C_EXTRA,
+) = range(16)  # fmt: skip
+# totals, and then who is on the air, by ascending id
+G_SINCE, G_GROUPS, G_OTHERS, G_GROUP_NS, G_OTHER_NS, G_SENDERS, G_FIRST = range(7)
 
 F_SENSED, F_PREAMBLE, F_LEGACY_NOISE, F_ENERGY, F_FAINT = range(5)
 """Powers over the noise of the whole channel: weakest preamble; SINR of a preamble; noise in 20 MHz; weakest energy; and
@@ -125,7 +129,7 @@ def renew(s, S, N):
 
 @part
 def mark(s, what, D):
-    """From now on the two states may differ in a station's rows and its jobs', and in its links' if `what` is 2."""
+    """From now on the two states may differ at a station (see `HEARS`)."""
     flag = (D.shape[0] + 1) // 2 + s
     if D[flag] == 0:
         D[0] += 1
@@ -187,10 +191,9 @@ def plan_access(s, S, C):
 
 @part
 def link_of(s, r, begin, receiver, C):
-    """Where the link stands in the list; −1 where none is listed."""
-    if C[C_SQUARE] == 1:
-        return begin[s] + r
-    low, high = begin[s], begin[s + 1]
+    """Where the link stands in the list; −1 where none is listed. The fewer stations lack in a list, the less is searched."""
+    lacking = C[C_STATIONS] - (begin[s + 1] - begin[s])
+    low, high = begin[s] + max(0, r - lacking), min(begin[s] + r, begin[s + 1])
     while low < high:
         middle = (low + high) // 2
         if receiver[middle] < r:
@@ -201,7 +204,7 @@ def link_of(s, r, begin, receiver, C):
 
 
 @part
-def sense(s, S, P, W, F, begin, receiver, C):
+def sense(s, S, P, W, G, F, begin, receiver, C):
     """Whether the medium is busy.
 
     What began while a station itself was sending it notices by its energy alone. What it had waited for before (LOOKED_AT)
@@ -214,8 +217,9 @@ def sense(s, S, P, W, F, begin, receiver, C):
     if S[s, DEAF] == 0 or P[s] >= F[F_ENERGY]:
         return True
     known = 0.0
-    for i in range(C[C_STATIONS]):
-        if S[i, TX_END] != FAR and S[i, TX_BEGIN] <= S[s, LOOKED_AT] and i != s:
+    for x in range(G_FIRST, G_FIRST + G[G_SENDERS]):
+        i = G[x]
+        if S[i, TX_BEGIN] <= S[s, LOOKED_AT] and i != s:
             link = link_of(i, s, begin, receiver, C)
             if link >= 0:
                 known += W[link]
@@ -223,15 +227,15 @@ def sense(s, S, P, W, F, begin, receiver, C):
 
 
 @part
-def crosses(less, more, F):
-    """Whether a change of the power at a station may change what it senses."""
-    return less < F[F_SENSED] <= more or less < F[F_ENERGY] <= more
+def crosses(less, more, sensed, energy):
+    """Whether a change of the power at a station may change what it senses; without a jump, for it is rare and asked often."""
+    return ((less < sensed) & (more >= sensed)) | ((less < energy) & (more >= energy))
 
 
 @part
-def look(s, t, S, N, P, W, C, F, begin, receiver):
+def look(s, t, S, N, P, W, G, C, F, begin, receiver):
     """Bring a station's view of the medium up to now."""
-    busy = sense(s, S, P, W, F, begin, receiver, C)
+    busy = sense(s, S, P, W, G, F, begin, receiver, C)
     if busy and S[s, IS_BUSY] == 0:
         freeze(s, t, S)
         S[s, IS_BUSY] = 1
@@ -307,13 +311,13 @@ def remove(job, t, S, J):
 
 
 @part
-def release(s, t, S, N, P, W, C, F, begin, receiver):
+def release(s, t, S, N, P, W, G, C, F, begin, receiver):
     """An exchange of a station's own is over; the medium is watched again."""
     if S[s, DEAF] == 0:
         S[s, LOOKED_AT] = t
     S[s, AWAITS] = NOTHING
     S[s, TIMEOUT_AT] = FAR
-    if sense(s, S, P, W, F, begin, receiver, C):
+    if sense(s, S, P, W, G, F, begin, receiver, C):
         S[s, IS_BUSY] = 1
         S[s, GRANT] = S[s, GRANT_LOW] = FAR
     else:
@@ -360,29 +364,38 @@ def add_segment(j, t, level, S, SEG_AT, SEG):
 
 
 @part
-def start(starters, count, t, S, N, D, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiver, gain, fade, keys, C, F):
+def start(starters, count, t, S, N, D, P, W, WHY, G, J, SEG_AT, SEG, TOUCH, begin, receiver, gain, fade, keys, C, F):
     """Frames that begin at one instant reach the receivers."""
     touched = 0
+    asked, incident = TOUCH[TOUCH.shape[0] // 3 :], N[INCIDENT]
+    sensed, energy, faint = F[F_SENSED], F[F_ENERGY], F[F_FAINT]
     for x in range(count):
         s = starters[x]
-        mark(s, 2, D)
+        mark(s, SENDS, D)
         group = S[s, TX_KIND] == GROUP
         counter = np.uint64(C[C_FRAME] if C[C_BY_FRAME] == 1 else S[s, SENT])
-        for k in range(begin[s], begin[s + 1]):
-            j = receiver[k]
-            if j == s:
+        # three loops: in short ones the processor waits for many numbers of its memory at once
+        sent = mix(keys[s] + counter)
+        for k in range(np.uint64(begin[s]), np.uint64(begin[s + 1])):
+            W[k] = gain[k] * fade[mix((sent ^ keys[np.uint64(receiver[k])]) + np.uint64(1)) & _LEVEL]
+        near = 0
+        for k in range(np.uint64(begin[s]), np.uint64(begin[s + 1])):
+            j = np.uint64(receiver[k])
+            if j == np.uint64(s):
                 continue
-            power = gain[k] * fade[mix((mix(keys[s] + counter) ^ keys[j]) + np.uint64(1)) & _LEVEL]
-            W[k] = power
-            P[j] += power
-            N[INCIDENT, j] += 1
-            if gain[k] < F[F_FAINT]:
-                WHY[k] = FAINT
-                if crosses(P[j] - power, P[j], F):
-                    mark(j, 1, D)
-                    look(j, t, S, N, P, W, C, F, begin, receiver)
+            power = P[j] + W[k]
+            P[j] = power
+            incident[j] += 1
+            WHY[k] = FAINT
+            asked[np.uint64(near)] = k
+            near += (gain[k] >= faint) | crosses(power - W[k], power, sensed, energy)
+        for y in range(near):
+            k = asked[y]
+            j, power = receiver[k], W[k]
+            mark(j, HEARS, D)
+            if gain[k] < faint:
+                look(j, t, S, N, P, W, G, C, F, begin, receiver)
                 continue
-            mark(j, 1, D)
             WHY[k] = UNKNOWN
             if S[j, TX_END] != FAR:
                 WHY[k] = HALF_DUPLEX
@@ -395,15 +408,15 @@ def start(starters, count, t, S, N, D, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, 
                 if group:
                     WHY[k] = blame(S[j, LOCK], s, begin, receiver, gain, S, C, F)
                 if S[S[j, LOCK], TX_KIND] == GROUP:
-                    mark(S[j, LOCK], 2, D)
+                    mark(S[j, LOCK], SENDS, D)
                     WHY[S[j, LOCK_LINK]] = blame(s, S[j, LOCK], begin, receiver, gain, S, C, F)
-                look(j, t, S, N, P, W, C, F, begin, receiver)
+                look(j, t, S, N, P, W, G, C, F, begin, receiver)
                 continue
             if S[j, CANDIDATE] < 0 or t - S[j, CANDIDATE_AT] > CCA:
                 S[j, CANDIDATE], S[j, CANDIDATE_LINK], S[j, CANDIDATE_AT] = s, k, t
             else:
                 c, link = S[j, CANDIDATE], S[j, CANDIDATE_LINK]
-                mark(c, 2, D)
+                mark(c, SENDS, D)
                 WHY[link] = blame(s, c, begin, receiver, gain, S, C, F)
                 WHY[k] = blame(c, s, begin, receiver, gain, S, C, F)
                 if power > W[link]:
@@ -426,17 +439,18 @@ def start(starters, count, t, S, N, D, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, 
         else:
             S[j, LOCK] = -1
             if WHY[link] == UNKNOWN:
-                mark(S[j, CANDIDATE], 2, D)
+                mark(S[j, CANDIDATE], SENDS, D)
                 WHY[link] = WEAK
                 if power >= F[F_SENSED] and power >= F[F_PREAMBLE] * F[F_LEGACY_NOISE]:
                     c = S[j, CANDIDATE]
-                    for i in range(C[C_STATIONS]):  # spoilt by a frame that it had not locked to
-                        if i != c and S[i, TX_END] != FAR:
+                    for y in range(G_FIRST, G_FIRST + G[G_SENDERS]):  # spoilt by a frame that it had not locked to
+                        i = G[y]
+                        if i != c and i != j:
                             other = link_of(i, j, begin, receiver, C)
-                            if other >= 0 and i != j and W[other] * 4.0 >= others:
+                            if other >= 0 and W[other] * 4.0 >= others:
                                 WHY[link] = blame(i, c, begin, receiver, gain, S, C, F)
                                 break
-        look(j, t, S, N, P, W, C, F, begin, receiver)
+        look(j, t, S, N, P, W, G, C, F, begin, receiver)
     for x in range(count):
         s = starters[x]
         if S[s, IS_BUSY] == 0:
@@ -467,6 +481,12 @@ def transmit(s, t, kind, to, duration, S, G):
     S[s, CANDIDATE] = S[s, LOCK] = -1
     account(t, G)
     G[G_GROUPS if kind == GROUP else G_OTHERS] += 1
+    x = G_FIRST + G[G_SENDERS]
+    while x > G_FIRST and G[x - 1] > s:
+        G[x] = G[x - 1]
+        x -= 1
+    G[x] = s
+    G[G_SENDERS] += 1
 
 
 @part
@@ -570,7 +590,7 @@ def access(s, t, S, N, J, M, T, LI, LS, LF, RATES, LIMITS, ORDER, C, G, keys):
 
 
 @part
-def miss(s, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver):
+def miss(s, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, G, C, F, keys, begin, receiver):
     """No answer has come."""
     a, what, job = S[s, ACCESS], S[s, AWAITS], S[s, TX_JOB]
     fail_window(s, a, S, C)
@@ -592,7 +612,7 @@ def miss(s, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin,
             else:  # ask what has arrived, for as long as it takes
                 S[s, REQUEST] = 1
     draw_backoff(s, a, S, keys)
-    release(s, t, S, N, P, W, C, F, begin, receiver)
+    release(s, t, S, N, P, W, G, C, F, begin, receiver)
     return told
 
 
@@ -742,23 +762,29 @@ def finish(
     seed = mix(mix(keys[s] ^ np.uint64(0x77)) + np.uint64(S[s, SENT]))
     touched = 0
     is_meant, is_answered = False, False
-    mark(s, 2, D)
+    mark(s, SENDS, D)
     if to >= 0:
-        mark(to, 1, D)
-    for k in range(begin[s], begin[s + 1]):
+        mark(to, ACTS, D)
+    asked, incident, near = TOUCH[TOUCH.shape[0] // 3 :], N[INCIDENT], 0
+    sensed, energy = F[F_SENSED], F[F_ENERGY]
+    for k in range(np.uint64(begin[s]), np.uint64(begin[s + 1])):
+        j = np.uint64(receiver[k])
+        if j == np.uint64(s):
+            continue
+        before, others = P[j], incident[j] - 1
+        incident[j] = others
+        power = before - W[k] if others > 0 else 0.0
+        P[j] = power
+        asked[np.uint64(near)] = k
+        near += (WHY[k] != FAINT) | crosses(power, before, sensed, energy)
+    for y in range(near):
+        k = asked[y]
         j = receiver[k]
-        if j == s:
-            continue
+        mark(j, HEARS, D)
+        TOUCH[touched] = j
+        touched += 1
         if WHY[k] == FAINT:
-            N[INCIDENT, j] -= 1
-            before = P[j]
-            P[j] = before - W[k] if N[INCIDENT, j] > 0 else 0.0
-            if crosses(P[j], before, F):
-                mark(j, 1, D)
-                TOUCH[touched] = j
-                touched += 1
             continue
-        mark(j, 1, D)
         if S[j, LOCK] == s:
             S[j, LOCK] = -1
             if kind == GROUP:
@@ -800,18 +826,21 @@ def finish(
             WHY[k] = HALF_DUPLEX  # it began to send meanwhile
         if S[j, CANDIDATE] == s:
             S[j, CANDIDATE] = -1
-        N[INCIDENT, j] -= 1
-        P[j] = P[j] - W[k] if N[INCIDENT, j] > 0 else 0.0
         if S[j, LOCK] >= 0:
             add_segment(j, t, max(0.0, P[j] - W[S[j, LOCK_LINK]]), S, SEG_AT, SEG)
-        TOUCH[touched] = j
-        touched += 1
     S[s, TX_END] = FAR
     S[s, DEAF] = 1
     account(t, G)
     G[G_GROUPS if kind == GROUP else G_OTHERS] -= 1
+    G[G_SENDERS] -= 1
+    x = G_FIRST
+    while G[x] != s:
+        x += 1
+    while x < G_FIRST + G[G_SENDERS]:
+        G[x] = G[x + 1]
+        x += 1
     for x in range(touched):
-        look(TOUCH[x], t, S, N, P, W, C, F, begin, receiver)
+        look(TOUCH[x], t, S, N, P, W, G, C, F, begin, receiver)
     if kind == GROUP:
         S[s, WINDOW + a], S[s, FAILS + a] = C[C_WINDOW + a], 0
         if job >= 0:
@@ -819,15 +848,15 @@ def finish(
             told += 1
             remove(job, t, S, J)
         draw_backoff(s, a, S, keys)
-        release(s, t, S, N, P, W, C, F, begin, receiver)
+        release(s, t, S, N, P, W, G, C, F, begin, receiver)
     elif kind == ANSWER or kind == CTS:
         # the sender that waits for it
         if S[to, AWAITS] != NOTHING and S[to, TX_TO] == s and S[to, TX_END] == FAR and S[to, RESPONSE_AT] == FAR:
             if is_meant and is_answered:
-                told = conclude(to, t, S, N, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver)
+                told = conclude(to, t, S, N, P, W, G, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver)
             elif S[to, TIMEOUT_AT] == FAR:
-                told = miss(to, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver)
-        release(s, t, S, N, P, W, C, F, begin, receiver) if S[s, AWAITS] == NOTHING else renew(s, S, N)
+                told = miss(to, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, G, C, F, keys, begin, receiver)
+        release(s, t, S, N, P, W, G, C, F, begin, receiver) if S[s, AWAITS] == NOTHING else renew(s, S, N)
     else:
         if job >= 0 and J[job, ARRIVED] == J[job, COUNT] and J[job, IS_TOLD] == 0:
             J[job, IS_TOLD] = 1
@@ -849,7 +878,7 @@ def finish(
 
 
 @part
-def conclude(s, t, S, N, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver):
+def conclude(s, t, S, N, P, W, G, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin, receiver):
     """The answer has come."""
     a, what = S[s, ACCESS], S[s, AWAITS]
     S[s, TIMEOUT_AT] = FAR
@@ -873,7 +902,7 @@ def conclude(s, t, S, N, P, W, J, M, T, OUT, told, DROPS, LS, C, F, keys, begin,
         S[s, REQUEST] = 0
         told = settle(s, t, job, True, what == DATA, S, J, M, T, OUT, told, DROPS, C)
     draw_backoff(s, a, S, keys)
-    release(s, t, S, N, P, W, C, F, begin, receiver)
+    release(s, t, S, N, P, W, G, C, F, begin, receiver)
     return told
 
 
@@ -887,7 +916,7 @@ def run(
     Returns: the time reached, and how many rows of OUT are to be told; −1 where the drops must be read.
     """
     n = C[C_STATIONS]
-    starters = TOUCH[TOUCH.shape[0] // 2 :]
+    due, starters = TOUCH[TOUCH.shape[0] // 3 :], TOUCH[TOUCH.shape[0] // 3 * 2 :]
     most_drops = DROPS.shape[0] - 1 - n * C[C_BLOCK]  # at one instant every station may give up a window of fragments
     while True:
         t = FAR
@@ -898,46 +927,29 @@ def run(
         if DROPS[0, 0] > most_drops:
             return t - 1, -1
         told = 0
-        for s in range(n):  # frames that end
-            if N[NEXT_AT, s] <= t and S[s, TX_END] == t:
-                told = finish(
-                    s,
-                    t,
-                    S,
-                    N,
-                    D,
-                    P,
-                    W,
-                    WHY,
-                    G,
-                    J,
-                    M,
-                    T,
-                    SEG_AT,
-                    SEG,
-                    OUT,
-                    told,
-                    DROPS,
-                    begin,
-                    receiver,
-                    gain,
-                    extra,
-                    LI,
-                    LF,
-                    LS,
-                    RATES,
-                    LIMITS,
-                    C,
-                    F,
-                    curves,
-                    keys,
-                    TOUCH,
-                )
-        count = 0
-        for s in range(n):
-            if N[NEXT_AT, s] > t:
+        x = G_FIRST
+        while x < G_FIRST + G[G_SENDERS]:
+            s = G[x]
+            if S[s, TX_END] != t:
+                x += 1
                 continue
-            mark(s, 1, D)
+            told = finish(  # which takes it out
+                s, t, S, N, D, P, W, WHY, G, J, M, T, SEG_AT, SEG, OUT, told, DROPS, begin, receiver, gain, extra, LI, LF, LS,
+                RATES, LIMITS, C, F, curves, keys, TOUCH,
+            )  # fmt: skip
+        waiting = 0
+        for first in range(0, n, BLOCK):
+            soonest = FAR
+            for s in range(first, min(first + BLOCK, n)):
+                soonest = min(soonest, N[NEXT_AT, s])
+            if soonest <= t:
+                for s in range(first, min(first + BLOCK, n)):
+                    due[waiting] = s
+                    waiting += N[NEXT_AT, s] <= t
+        count = 0
+        for x in range(waiting):
+            s = due[x]
+            mark(s, ACTS, D)
             while S[s, ARRIVE_AT] <= t:
                 job = S[s, COMING]
                 S[s, COMING] = J[job, FOLLOWING]
@@ -952,7 +964,7 @@ def run(
                 ):
                     S[s, TIMEOUT_AT] = FAR
                 else:
-                    told = miss(s, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, C, F, keys, begin, receiver)
+                    told = miss(s, t, S, N, J, M, T, OUT, told, DROPS, LS, LI, P, W, G, C, F, keys, begin, receiver)
             if S[s, RESPONSE_AT] <= t:
                 if S[s, RESPONSE_KIND] == DATA:
                     job = S[s, TX_JOB]
@@ -963,7 +975,7 @@ def run(
                         count += 1
                     else:
                         S[s, RESPONSE_AT] = FAR
-                        release(s, t, S, N, P, W, C, F, begin, receiver)
+                        release(s, t, S, N, P, W, G, C, F, begin, receiver)
                 else:
                     duration = CONTROL
                     if S[s, RESPONSE_KIND] == ANSWER:
@@ -987,7 +999,27 @@ def run(
             renew(s, S, N)
         if count > 0:
             start(
-                starters, count, t, S, N, D, P, W, WHY, J, SEG_AT, SEG, TOUCH, begin, receiver, gain, fade, keys, C, F
+                starters,
+                count,
+                t,
+                S,
+                N,
+                D,
+                P,
+                W,
+                WHY,
+                G,
+                J,
+                SEG_AT,
+                SEG,
+                TOUCH,
+                begin,
+                receiver,
+                gain,
+                fade,
+                keys,
+                C,
+                F,
             )
         if told > 0:
             return t, told
@@ -1007,7 +1039,7 @@ def enter(entered, S, N, D, J):
     while before >= 0:
         job, station = before, J[before, STATION]
         before = J[job, FOLLOWING]
-        mark(station, 1, D)
+        mark(station, ACTS, D)
         ahead_of, following = -1, S[station, COMING]
         while following >= 0 and J[following, READY_AT] <= J[job, READY_AT]:
             ahead_of, following = following, J[following, FOLLOWING]
@@ -1029,7 +1061,7 @@ def cancel(job, t, S, N, D, J, requests):
     repeated while there is more for that receiver.
     """
     s = J[job, STATION]
-    mark(s, 1, D)
+    mark(s, ACTS, D)
     before, at = -1, S[s, COMING]
     while at >= 0 and at != job:
         before, at = at, J[at, FOLLOWING]
@@ -1054,7 +1086,7 @@ def cancel(job, t, S, N, D, J, requests):
 def substitute(old, job, S, D, J):
     """A job takes the place of one that waits in its station's queue; false if that one does not wait there."""
     station = J[old, STATION]
-    mark(station, 1, D)
+    mark(station, ACTS, D)
     is_first = S[station, COMING] == old
     before = S[station, HEAD + J[old, JOB_ACCESS]]
     while before >= 0 and J[before, FOLLOWING] != old:
@@ -1093,16 +1125,19 @@ def copy_station(
     s, what, S, W, WHY, J, M, T, SEG_AT, SEG, S2, W2, WHY2, J2, M2, T2, SEG_AT2, SEG2, begin
 ):  # fmt: skip
     """Make a station's rows equal in the second state, with its links' and its jobs'; what is not in use is left out."""
-    copy_bytes(S2[s].ctypes.data, S[s].ctypes.data, 8 * STATION_COLUMNS)
-    if what == 2 and S[s, TX_END] != FAR:
-        for k in range(begin[s], begin[s + 1]):
-            W2[k], WHY2[k] = W[k], WHY[k]
-    if S[s, TX_JOB] >= 0 or S[s, HEAD] >= 0 or S[s, HEAD_LOW] >= 0:
-        copy_bytes(M2[s].ctypes.data, M[s].ctypes.data, M.shape[1])
-        copy_bytes(T2[s].ctypes.data, T[s].ctypes.data, 4 * T.shape[1])
+    copy_bytes(S2[s].ctypes.data, S[s].ctypes.data, 8 * (HEARING_COLUMNS if what == HEARS else STATION_COLUMNS))
     if S[s, LOCK] >= 0:
         for k in range(S[s, SEGMENTS]):
             SEG_AT2[s, k], SEG2[s, k] = SEG_AT[s, k], SEG[s, k]
+    if what == HEARS:
+        return
+    if what == SENDS and S[s, TX_END] != FAR:
+        first, count = begin[s], begin[s + 1] - begin[s]
+        copy_bytes(W2.ctypes.data + 8 * first, W.ctypes.data + 8 * first, 8 * count)
+        copy_bytes(WHY2.ctypes.data + first, WHY.ctypes.data + first, count)
+    if S[s, TX_JOB] >= 0 or S[s, HEAD] >= 0 or S[s, HEAD_LOW] >= 0:
+        copy_bytes(M2[s].ctypes.data, M[s].ctypes.data, M.shape[1])
+        copy_bytes(T2[s].ctypes.data, T[s].ctypes.data, 4 * T.shape[1])
     for column in (COMING, HEAD, HEAD_LOW):
         x = S[s, column]
         while x >= 0:
@@ -1117,6 +1152,8 @@ def copy(
 ):  # fmt: skip
     """Make the second state equal to the first, where they differ: a station that hears nothing costs nothing."""
     for k in range(1, D[0] + 1):  # first of all, for a row may have become another station's
+        if D[(D.shape[0] + 1) // 2 + D[k]] == HEARS:
+            continue
         for column in (COMING, HEAD, HEAD_LOW):
             x = S2[D[k], column]
             while x >= 0:
@@ -1132,7 +1169,7 @@ def copy(
     D[0] = 0
     copy_bytes(N2.ctypes.data, N.ctypes.data, 8 * N.size)
     copy_bytes(P2.ctypes.data, P.ctypes.data, 8 * P.size)
-    copy_bytes(G2.ctypes.data, G.ctypes.data, 8 * G.size)
+    copy_bytes(G2.ctypes.data, G.ctypes.data, 8 * (G_FIRST + G[G_SENDERS]))
     if C[C_LEARNS] == 1:
         for x in range(LS.shape[0]):
             for m in range(LS.shape[1]):
@@ -1145,7 +1182,7 @@ def copy(
 def relink(S, N, D, P, W, WHY, old_begin, old_receiver, old_why, begin, receiver, gain, fade, keys, C):
     """The list of links is another one: find the frames on the air in it."""
     for j in range(C[C_STATIONS]):
-        mark(j, 2, D)
+        mark(j, SENDS, D)
         P[j] = 0.0
         N[INCIDENT, j] = 0
         if S[j, LOCK] >= 0:
@@ -1197,7 +1234,7 @@ def ahead(at, entered, since, until):
     LI = carray(pointer(at[35]), (flows, FLOW_COLUMNS), np.int64)
     LF = carray(pointer(at[36]), (flows, 3), np.float64)
     OUT = carray(pointer(at[37]), (2 * n + 8, 2), np.int64)
-    TOUCH = carray(pointer(at[38]), (2 * n + 2,), np.int64)
+    TOUCH = carray(pointer(at[38]), (3 * n + 3,), np.int64)
     begin = carray(pointer(at[39]), (n + 1,), np.int64)
     receiver = carray(pointer(at[40]), (links,), np.int64)
     gain = carray(pointer(at[41]), (links,), np.float64)
@@ -1207,7 +1244,7 @@ def ahead(at, entered, since, until):
     RATES = carray(pointer(at[45]), (mcs,), np.float64)
     LIMITS = carray(pointer(at[46]), (mcs,), np.int64)
     ORDER = carray(pointer(at[47]), (flows, mcs), np.int64)
-    C = carray(pointer(at[48]), (17,), np.int64)
+    C = carray(pointer(at[48]), (16,), np.int64)
     F = carray(pointer(at[49]), (5,), np.float64)
     curves = carray(pointer(at[50]), (14, 5), np.float64)
     first, goal = SIZES, since
@@ -1217,7 +1254,7 @@ def ahead(at, entered, since, until):
         P = carray(pointer(at[first + 2]), (n,), np.float64)
         W = carray(pointer(at[first + 3]), (links,), np.float64)
         WHY = carray(pointer(at[first + 4]), (links,), np.uint8)
-        G = carray(pointer(at[first + 5]), (5,), np.int64)
+        G = carray(pointer(at[first + 5]), (G_FIRST + n,), np.int64)
         J = carray(pointer(at[first + 6]), (jobs, JOB_COLUMNS), np.int64)
         M = carray(pointer(at[first + 7]), (n, window), np.uint8)
         T = carray(pointer(at[first + 8]), (n, window), np.int32)
@@ -1238,7 +1275,7 @@ def ahead(at, entered, since, until):
         P2 = carray(pointer(at[23]), (n,), np.float64)
         W2 = carray(pointer(at[24]), (links,), np.float64)
         WHY2 = carray(pointer(at[25]), (links,), np.uint8)
-        G2 = carray(pointer(at[26]), (5,), np.int64)
+        G2 = carray(pointer(at[26]), (G_FIRST + n,), np.int64)
         J2 = carray(pointer(at[27]), (jobs, JOB_COLUMNS), np.int64)
         M2 = carray(pointer(at[28]), (n, window), np.uint8)
         T2 = carray(pointer(at[29]), (n, window), np.int32)

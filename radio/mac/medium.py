@@ -179,7 +179,6 @@ class Medium(Generic[J, F]):
         self._at_row: dict[int, J | F] = {}
         self._flows: dict[tuple[int, int], int] = {}
         self._tuned: list[Link | None] = []  # by flow
-        self._is_square = True
         self._settings = settings
         s, order = _tables(e, settings, n, noise_dbm)
         self._ints, self._floats, self._rates, self._limits = s
@@ -202,7 +201,7 @@ class Medium(Generic[J, F]):
         mcs = len(self._rates)
         self._settled = _State(
             (
-                stations, np.vstack([np.full(n, e.FAR), np.zeros(n, np.int64)]), np.zeros(n), np.zeros(0), np.zeros(0, np.uint8), np.zeros(5, np.int64),
+                stations, np.vstack([np.full(n, e.FAR), np.zeros(n, np.int64)]), np.zeros(n), np.zeros(0), np.zeros(0, np.uint8), np.zeros(e.G_FIRST + n, np.int64),
                 np.zeros((_JOBS, e.JOB_COLUMNS), np.int64), np.zeros((n, window), np.uint8),
                 np.zeros((n, window), np.int32), np.zeros((n, e.OVERLAPS), np.int64), np.zeros((n, e.OVERLAPS)),
                 np.zeros((_FLOWS, mcs + 1, 2), np.int64), np.zeros((_DROPS_KEPT + n * window, 2), np.int64),
@@ -218,7 +217,7 @@ class Medium(Generic[J, F]):
         self._out = np.zeros((2 * n + 8, 2), np.int64)
         self._out_rows = memoryview(self._out.reshape(-1).data)
         self._first: list[int] = []  # as `_begin`, in a list
-        self._touch = np.zeros(2 * n + 2, np.int64)
+        self._touch = np.zeros(3 * (n + 1), np.int64)
         self._begin: IntArray = np.zeros(n + 1, np.int64)
         self._receiver: IntArray = np.zeros(0, np.int64)
         self._gain: FloatArray = np.zeros(0)
@@ -238,7 +237,6 @@ class Medium(Generic[J, F]):
         receiver: IntArray,
         gain: FloatArray,
         *,
-        is_square: bool,
         frame: int,
         extra: FloatArray | None = None,
     ) -> None:
@@ -248,7 +246,6 @@ class Medium(Generic[J, F]):
             begin: [N + 1]: the links of station i are begin[i] … begin[i + 1] − 1.
             receiver: [L], rising within a station's links.
             gain: [L]: mean received power over the noise of the whole channel, linear.
-            is_square: whether every station has a link to every one, itself included.
             frame: its number.
             extra: [L]: probability that a group frame is lost besides; None is none.
         """
@@ -257,7 +254,7 @@ class Medium(Generic[J, F]):
         settled = self._settled
         is_same = receiver is self._receiver
         old = self._begin, self._receiver, settled.arrays[_WHY]
-        ints[e.C_SQUARE], ints[e.C_FRAME], ints[e.C_EXTRA] = is_square, frame, extra is not None
+        ints[e.C_FRAME], ints[e.C_EXTRA] = frame, extra is not None
         if extra is not None and len(extra) == len(self._extra):
             self._extra[:] = extra
         elif extra is not None:
@@ -691,7 +688,7 @@ def _tables(
     used = sorted({names.index(settings.context_class), names.index(settings.payload_class)})
     classes = [getattr(settings.edca, names[i]) for i in used]
     first, second = classes[0], classes[-1]
-    ints = np.zeros(17, np.int64)
+    ints = np.zeros(16, np.int64)
     values = {
         e.C_STATIONS: n, e.C_AIFSN: first.aifsn, e.C_AIFSN_LOW: second.aifsn, e.C_WINDOW: first.cw_min,
         e.C_WINDOW_LOW: second.cw_min, e.C_LARGEST: first.cw_max, e.C_LARGEST_LOW: second.cw_max,

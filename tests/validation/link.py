@@ -89,7 +89,7 @@ def fades_db(settings: AirSettings, n: int, frames: int, seed: int = 1, per_fram
     medium = Medium[AirJob, GroupFrame](env, settings, n, seed, 0, -88.0, lambda *_: None, lambda *_: None, end)
     begin, receiver = np.arange(n + 1) * n, np.tile(np.arange(n), n)
     for k in range(frames):
-        medium.set_links(begin, receiver, np.full(n * n, gain), is_square=True, frame=k // per_frame)
+        medium.set_links(begin, receiver, np.full(n * n, gain), frame=k // per_frame)
         for sender in range(n):
             medium.announce(GroupFrame(sender, 1e-4, 334), 1e-3 * sender)
         env.run(until=(k + 1) * 1e-3 * n)
@@ -256,7 +256,7 @@ def _in_the_medium(ppdus_s: tuple[float, float], seconds: float = 60.0) -> float
     medium = Medium[AirJob, GroupFrame](
         env, AirSettings(rician_k_db=40.0), 2, 1, 0, -88.0, lambda *_: None, lambda *_: None, lambda *_: None
     )
-    medium.set_links(np.array([0, 2, 4]), np.array([0, 1, 0, 1]), np.full(4, 1e4), is_square=True, frame=0)
+    medium.set_links(np.array([0, 2, 4]), np.array([0, 1, 0, 1]), np.full(4, 1e4), frame=0)
     for sender, ppdu_s in enumerate(ppdus_s):
         job = AirJob(sender, sender, float("inf"))
         job.flow, job.frames, job.full_bytes, job.last_bytes = medium.flow(sender, 1 - sender), 10**7, 1494, 1494

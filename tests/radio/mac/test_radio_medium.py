@@ -39,7 +39,7 @@ class Bench:
             self.env, config, n, seed, 0, NOISE_DBM, lambda job, now: None, self._end, self._group_end
         )
         gain = 10.0 ** ((power - NOISE_DBM) / 10.0)
-        self.medium.set_links(np.arange(n + 1) * n, np.tile(np.arange(n), n), gain.ravel(), is_square=True, frame=0)
+        self.medium.set_links(np.arange(n + 1) * n, np.tile(np.arange(n), n), gain.ravel(), frame=0)
         self.mcs, self.jobs = mcs, 0
         self.log: list[tuple[float, int, End]] = []
         self.heard: list[tuple[float, int, tuple[int, ...]]] = []
@@ -574,6 +574,32 @@ def test_nobody_begins_to_send_on_a_medium_that_it_senses_busy(traffic: list, po
             if stations[s, edca.IS_BUSY] and not before[s, edca.IS_BUSY]:
                 busy_since[s] = t
         assert ((arrays[2] >= 0.0) & (arrays[2] < 1e9)).all()
+
+
+@pytest.mark.parametrize("power_dbm", [-50.0, -89.0, -100.0])
+def test_accounts_of_who_is_on_the_air_are_those_of_the_stations(power_dbm: float) -> None:
+    """Event by event: the list of senders, and how many and how strong they are at each station. The last power is faint."""
+    b, most = Bench(power_dbm, 6), 0
+    for i in range(6):
+        b.announce(i, in_s=1e-4 * (6 - i))
+    b.submit(2, 100)
+    b.medium._take_in()
+    arrays, table = b.medium._settled.arrays, b.medium._make_table()
+    stations, next_at, power, received, totals = arrays[0], arrays[1], arrays[2], arrays[3].reshape(6, 6), arrays[5]
+    for _ in range(400):  # a payload that nobody hears is sent again and again
+        t = int(next_at[edca.NEXT_AT].min())
+        if t == edca.FAR:
+            break
+        edca.ahead(table, -1, t, t - 1)
+        senders = np.flatnonzero(stations[:, edca.TX_END] != edca.FAR)
+        assert totals[edca.G_FIRST :][: totals[edca.G_SENDERS]].tolist() == senders.tolist()
+        from_others = (np.arange(6) != senders[:, None]).astype(float)
+        assert next_at[edca.INCIDENT].tolist() == from_others.sum(axis=0).tolist()
+        np.testing.assert_allclose(
+            power, (from_others * received[senders]).sum(axis=0), rtol=1e-12, atol=1e-12 * received.max()
+        )
+        most = max(most, len(senders))
+    assert most > (1 if power_dbm == -50.0 else 3)
 
 
 def test_a_frame_that_comes_after_the_plan_is_sent_also_where_somebody_looks_before() -> None:

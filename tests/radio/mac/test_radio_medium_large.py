@@ -32,7 +32,7 @@ class CopiesAll:
 
     def ahead(self, *args: Any) -> Any:
         n = (len(self._medium._differing) - 1) // 2
-        self._medium._differing[:] = [n, *range(n), *[2] * n]
+        self._medium._differing[:] = [n, *range(n), *[edca.SENDS] * n]
         return edca.ahead(*args)
 
 
@@ -84,7 +84,7 @@ def first_frame_s(strangers: int, power_dbm: float) -> float:
     power = np.full((n, n), -200.0)
     power[1:, 0] = power_dbm
     gain = 10.0 ** ((power - NOISE_DBM) / 10.0)
-    medium.set_links(np.arange(n + 1) * n, np.tile(np.arange(n), n), gain.ravel(), is_square=True, frame=0)
+    medium.set_links(np.arange(n + 1) * n, np.tile(np.arange(n), n), gain.ravel(), frame=0)
     for i in range(1, n):
         medium.announce(GroupFrame(i, GROUP_S, 334))
     medium.announce(GroupFrame(0, GROUP_S, 334), 1e-4)
@@ -118,7 +118,7 @@ def test_a_faint_frame_is_lost_to_a_weak_signal_whatever_else_is_on_the_air() ->
     power[2, 1] = AirSettings().preamble_detection_dbm - FAINT_DB - 0.5
     power[0, 2] = power[2, 0] = -200.0
     gain = 10.0 ** ((power - NOISE_DBM) / 10.0)
-    medium.set_links(np.arange(n + 1) * n, np.tile(np.arange(n), n), gain.ravel(), is_square=True, frame=0)
+    medium.set_links(np.arange(n + 1) * n, np.tile(np.arange(n), n), gain.ravel(), frame=0)
     medium.announce(GroupFrame(0, GROUP_S, 334))
     medium.announce(GroupFrame(2, GROUP_S, 334), 1e-4)
     env.run(until=0.1)
