@@ -482,6 +482,12 @@ def _fine_network() -> Tables:
     return fine_network.tables(ROOT / "runs/bench", ROOT / "docs/results/fine_network.png")
 
 
+def _fused_grids() -> Tables:
+    import fused_grids
+
+    return fused_grids.tables()
+
+
 def _trucks() -> Tables:
     import trucks
 
@@ -780,6 +786,7 @@ FIGURES: dict[str, Figure] = {
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
     "fine_network": Figure(7, _fine_network),
+    "fused_grids": Figure(50, _fused_grids),
     "trucks": Figure(1, _trucks),
     "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),
