@@ -26,7 +26,7 @@ MOVES_AT = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """n tracks, each at its own time; world frame ENU."""
+    """n tracks, each at its own time; world frame ENU. Arrays may be shared with other tracks: nobody writes into them."""
 
     owner: Ints
     """[n] the drone that keeps it."""

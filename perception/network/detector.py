@@ -379,13 +379,13 @@ class TorchDetector:
     def _on_their_grids(
         self, maps: Sequence[Share], peers: Sequence[Peer], mine: Sequence[Peer]
     ) -> Iterator[SourceBoxes]:
-        """The boxes of the same maps, fused once more on the grid of each drone that sent one.
+        """The boxes of the same maps, fused once more on the grid of each drone that sent one; they weigh and are as old as its map.
 
         Args:
             maps: the shares that are fused; peers: theirs in the same order, and the silent ones; mine: the ego's own map.
         """
         for k, share in enumerate(maps):
-            first = peers[k]  # of equal weights the first takes the place of an ego's own map
+            first = peers[k]  # of maps that count most, the first takes the place of an ego's own
             fused = fused_map(
                 self._net, first.pose, None, [first, *mine, *peers[:k], *peers[k + 1 :]], self._config.unsent_cells
             )

@@ -7,7 +7,8 @@ from math import inf
 
 from sortie.scenarios.compiled import compiled
 
-# constants of the file itself: kept machine code does not see that another file has changed
+# constants of the file itself: kept machine code does not see that another file has changed; the last two are variances of a
+# cue's place and velocity along each axis
 PERSON, COAST_S, GATE = 2, 2.0, 9.21
 ACCELERATION_DENSITY, CUE_VARIANCE_M2, CUE_SPEED_VARIANCE = 0.5, 1.0, 1.0
 

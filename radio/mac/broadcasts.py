@@ -71,7 +71,7 @@ class Broadcasts:
         counters, sender, gone = self._counters, frame.sender, self._gone
         counters.context_wire_bytes += frame.wire_bytes
         living = self._n - 1 - (len(gone - {sender}) if gone else 0)
-        if gone:  # what became of it at them does not count
+        if gone:  # receptions at drones that are gone do not count
             of_all = np.frombuffer(fates, np.uint8).copy()
             of_all[np.isin(receivers, list(gone))] = 0
             fates = of_all.tobytes()

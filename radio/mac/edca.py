@@ -228,7 +228,7 @@ def sense(s, S, P, W, G, F, begin, receiver, C):
 
 @part
 def crosses(less, more, sensed, energy):
-    """Whether a change of the power at a station may change what it senses; without a jump, for it is rare and asked often."""
+    """Whether a change of the power at a station may change what it senses; no branch, because it is asked often and seldom so."""
     return ((less < sensed) & (more >= sensed)) | ((less < energy) & (more >= energy))
 
 
@@ -374,7 +374,7 @@ def start(starters, count, t, S, N, D, P, W, WHY, G, J, SEG_AT, SEG, TOUCH, begi
         mark(s, SENDS, D)
         group = S[s, TX_KIND] == GROUP
         counter = np.uint64(C[C_FRAME] if C[C_BY_FRAME] == 1 else S[s, SENT])
-        # three loops: in short ones the processor waits for many numbers of its memory at once
+        # three loops: in short ones the processor fetches many values from memory at once
         sent = mix(keys[s] + counter)
         for k in range(np.uint64(begin[s]), np.uint64(begin[s + 1])):
             W[k] = gain[k] * fade[mix((sent ^ keys[np.uint64(receiver[k])]) + np.uint64(1)) & _LEVEL]

@@ -28,10 +28,8 @@ DECISION_S = 10.0
 LOAD_S = 60.0
 """The longest time for a user's file to load."""
 GRACE_S = 5.0
-"""A call that is interrupted must end within this time."""
+"""A call that is interrupted must end within this time. It is interrupted again when half of it is over."""
 TICK_S = 0.1
-_AGAIN_TICKS = 10
-"""Between two interrupts of one call."""
 STUCK = 70
 """Exit code of a process that was ended because a call could not be interrupted."""
 BEAT = "=Qd480s"
@@ -90,16 +88,23 @@ class Guarded:
                 watch.begin()
                 return self.__wrapped__(*args, **kwargs)
             finally:
-                # an interrupt arrives here at the latest, or was lost in the call
-                if watch.end() and not isinstance(sys.exc_info()[1], _Interrupt):
+                late = False
+                while watch.calling:
+                    try:
+                        late = watch.end() or late
+                    except _Interrupt:  # it arrived as the call ended, and the call must still end
+                        late = True
+                watch.go_back()
+                # the interrupt was lost in the call, or arrived here
+                if late and not isinstance(sys.exc_info()[1], _Interrupt):
                     raise _Interrupt
         except SystemExit as stop:
             raise ProgramExitError(f"exit code {stop.code}, must return").with_traceback(stop.__traceback__) from None
-        except _Interrupt as late:
+        except _Interrupt as stop:
             self._late = "no answer" if watch is None else f"no answer within {watch.limit}"
             if watch is not None and self._origin is not None:
                 watch.late[self._origin] = self._late
-            raise TookTooLongError(self._late).with_traceback(late.__traceback__) from None
+            raise TookTooLongError(self._late).with_traceback(stop.__traceback__) from None
         except BaseException as stop:
             if isinstance(stop, Exception | KeyboardInterrupt) or _is_sorties(type(stop)):
                 raise
@@ -180,7 +185,9 @@ class _Watch:
         self._limit_s, self._thread = limit_s, thread
         self._longest_s = limit_s + GRACE_S
         self._error = f"a call of the policy does not return within {limit}, and cannot be interrupted"
-        self._ticks = 0
+        self._ticks = self._first = 0
+        """Of the present call, and when it was late."""
+        self._again_ticks = max(1, round(GRACE_S / 2 / TICK_S))
         self._lock, self._over = threading.Lock(), threading.Event()
         main = threading.current_thread() is threading.main_thread()
         self._here = os.getcwd() if main else None  # of the whole process: no other thread may move it
@@ -198,7 +205,7 @@ class _Watch:
         self._counter.join()
         if self._beat is not None:
             self._beat.rest()
-        self._return()  # from a call that has no limit
+        self.go_back()  # from a call that has no limit
 
     def begin(self) -> None:
         self._process = os.getpid()
@@ -211,10 +218,10 @@ class _Watch:
             _exit(STUCK)
         with self._lock:
             self.calling = False
-        self._return()
         return self._ticks * TICK_S > self._limit_s
 
-    def _return(self) -> None:
+    def go_back(self) -> None:
+        """To the working folder in which the call began."""
         if self._here is not None and _working_folder() != self._here:
             os.chdir(self._here)
 
@@ -227,9 +234,10 @@ class _Watch:
                     continue
                 before_s, self._ticks = self._ticks * TICK_S, self._ticks + 1
                 now_s = self._ticks * TICK_S
-                is_late = before_s <= self._limit_s < now_s
-                # again each second: Python drops what reaches a `__del__` or a callback of its garbage collector
-                if is_late or (before_s > self._limit_s and self._ticks % _AGAIN_TICKS == 0):
+                if before_s <= self._limit_s < now_s:
+                    self._first = self._ticks
+                # and again: Python drops what reaches a `__del__` or a callback of its garbage collector
+                if now_s > self._limit_s and (self._ticks - self._first) % self._again_ticks == 0:
                     ctypes.pythonapi.PyThreadState_SetAsyncExc(
                         ctypes.c_ulong(self._thread), ctypes.py_object(_Interrupt)
                     )

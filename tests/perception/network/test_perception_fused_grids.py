@@ -33,11 +33,8 @@ def same(a: Boxes, b: Boxes) -> bool:
 @pytest.mark.parametrize("roi", [None, Disc(5.0, -5.0, 40.0)])
 @pytest.mark.parametrize("rho", [1.0, 0.1])
 @pytest.mark.parametrize("looked", [True, False])
-def test_on_a_peers_grid_its_map_comes_first(rho: float, roi: Disc | None, looked: bool) -> None:
-    """There the fusion is that of a drone at the peer's place without a look of its own, which hears the ego too.
-
-    The boxes of a grid count as its sender's link does.
-    """
+def test_a_peers_grid_is_that_of_a_drone_there_without_a_look(rho: float, roi: Disc | None, looked: bool) -> None:
+    """Such a drone hears the peer first and the ego too. The boxes of a grid count as its sender's link does."""
     ego = EGO._replace(looked=looked)
     shares = [Share(c, "features", rho, roi, weight) for c, weight in zip(PEERS, (1.0, 0.6), strict=True)]
     whole = [Share(ego, "features", 1.0, None, 1.0)] if looked else []

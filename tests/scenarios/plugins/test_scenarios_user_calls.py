@@ -21,7 +21,16 @@ from sortie.policies.contract import FleetView, PolicyError
 from sortie.policies.registry import parameters, resolve, viewpoint_of
 from sortie.policies.verification.conformance import conform, full_view
 from sortie.scenarios.plugins import user_calls
-from sortie.scenarios.plugins.user_calls import Guarded, ProgramExitError, TookTooLongError, guarded, text_of, watched
+from sortie.scenarios.plugins.user_calls import (
+    Guarded,
+    ProgramExitError,
+    TookTooLongError,
+    _Interrupt,
+    _Watch,
+    guarded,
+    text_of,
+    watched,
+)
 
 POLICY = """
 import os, re, sys, time
@@ -165,6 +174,42 @@ def test_a_call_that_is_late_is_interrupted_and_not_made_again(file: Path, name:
             with pytest.raises(TookTooLongError, match=r"^no answer within 0\.15 s$"):
                 policy(full_view(2))
     assert resolve("worked")(full_view(2)), "nothing arrives later"
+
+
+def test_an_interrupt_that_arrives_as_the_call_ends_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the next one strikes what runs afterwards, and later calls have no limit."""
+    end, arrived = _Watch.end, []
+
+    def interrupted(watch: _Watch) -> bool:
+        if not arrived:
+            arrived.append(watch)
+            raise _Interrupt
+        return end(watch)
+
+    monkeypatch.setattr(_Watch, "end", interrupted)
+    with watched(0.15):
+        with pytest.raises(TookTooLongError):
+            guarded(int)()
+        assert not arrived[0].calling
+        threading.Event().wait(user_calls.GRACE_S)
+        with pytest.raises(TookTooLongError):
+            guarded(threading.Event().wait)(0.5)
+
+
+def test_a_late_call_has_time_to_clean_up() -> None:
+    cleaned = []
+
+    def spins() -> None:
+        try:
+            while True:
+                pass
+        finally:
+            threading.Event().wait(user_calls.GRACE_S / 4)
+            cleaned.append(True)
+
+    with watched(0.85), pytest.raises(TookTooLongError):
+        guarded(spins)()
+    assert cleaned
 
 
 def test_a_users_object_as_text_ends_within_the_limit(file: Path) -> None:
