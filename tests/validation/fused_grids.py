@@ -86,7 +86,7 @@ class Way:
         boxes = {
             "none": "silence",
             "detections": "averaged boxes",
-            "control": "averaged boxes, each drone's of five grids",
+            "control": "averaged boxes, of five grids a drone",
         }
         maps = f"{'codes of 10 B' if self.sent == 'codes' else 'maps'}, ρ = {self.rho:g}"
         return boxes.get(self.sent, maps) + ", all grids" * (self.grids == "all") + ", corrected poses" * self.matched
@@ -165,7 +165,7 @@ def frame_table(found: Found, about: str) -> Table:
             for other in (way.boxes, way.on_own, Way("control"))
         ]
         rows.append([way.label, ap, *over])
-    names = "over averaged boxes, same poses", "by all grids", "over boxes of five grids"
+    names = "over averaged boxes, same poses", "gain from all grids", "over boxes of five grids"
     columns = [Column("shared"), Column("AP@0.5", ".3f"), *(Column(name, "+.1f", factor=100) for name in names)]
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
@@ -180,7 +180,7 @@ def lower_table(scenes: int = LOW_SCENES) -> Table:
     all_usual, all_low = (hits.sum() / cars.sum() for cars, hits in (usual, low))
     rows.append(["all", 1.0, all_usual, 1.0, all_low])
     predicted = float((usual[1] / usual[0] * low[0]).sum() / low[0].sum())
-    rows.append(["all, with the first recalls", None, None, 1.0, predicted])
+    rows.append(["all, predicted by the recall at 55 to 65 m", None, None, 1.0, predicted])
     columns = [Column("drones that see a car")]
     for where in ("55 to 65 m", f"{LOW_M:g} m"):
         columns += [Column(f"cars, {where}", ".0f", " %", 100), Column(f"recall, {where}", ".3f")]
@@ -230,7 +230,7 @@ def flight_table() -> Table:
         over = [None if other == arm else _interval(np.subtract(each, ap[other]).tolist()) for other in others]
         rows.append([arm, _interval(each), *over])
     columns = [Column("policy"), Column("AP of the full scene", ".3f")]
-    columns += [Column(name, "+.1f", factor=100) for name in ("over silence", "over `boxes`, same poses", "by all grids")]  # fmt: skip
+    columns += [Column(name, "+.1f", factor=100) for name in ("over silence", "over `boxes`, same poses", "gain from all grids")]  # fmt: skip
     about = f"`track_target` for 16 s, scored once a second; towns and seeds {TOWNS[0]} to {TOWNS[-1]}; intervals over flights."
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
