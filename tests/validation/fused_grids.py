@@ -245,7 +245,7 @@ def seen_table() -> Table:
     """The shares of the cars that an ego sees, and that any of the five drones sees, in the same flights."""
     shares = [_seen(town) for town in TOWNS]
     rows: list[list[object]] = [[who, _interval(each)] for who, each in zip(("the ego", "any of the five"), np.transpose(shares), strict=True)]  # fmt: skip
-    about = "The flights of the table above, at every scored moment; by straight lines, without any detector; intervals over flights."
+    about = "The flights over towns 101 to 108 above, at every scored moment; by line of sight, without any detector; intervals over flights."
     return Table([Column("who sees a car"), Column("share of the cars", ".1f", " %", 100)], rows, about)  # type: ignore[arg-type]
 
 
