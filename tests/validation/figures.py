@@ -488,6 +488,12 @@ def _fused_grids() -> Tables:
     return fused_grids.tables()
 
 
+def _grid_times() -> Tables:
+    import fused_grids
+
+    return {"grid_times": fused_grids.times()}
+
+
 def _trucks() -> Tables:
     import trucks
 
@@ -785,6 +791,7 @@ FIGURES: dict[str, Figure] = {
     "handshakes": Figure(5, _handshakes),
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
+    "grid_times": Figure(1, _grid_times, timed=True),
     "fine_network": Figure(7, _fine_network),
     "fused_grids": Figure(50, _fused_grids),
     "trucks": Figure(1, _trucks),

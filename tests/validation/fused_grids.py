@@ -26,6 +26,8 @@ Expected:
 
 from __future__ import annotations
 
+import statistics
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +57,7 @@ WEIGHTS = Path("fine.safetensors")
 BENCH_SEED, SCENES, LOW_SCENES, LOW_M = 12, 120, 60, 45.0
 TOWNS = range(101, 109)
 SHORT = ("duration_s=16", "perception.sample_rate_hz=1", f"perception.weights={WEIGHTS}")
+REPEATS = 30
 AREA_M = (-60.0, -60.0, 60.0, 60.0)
 FURTHER_GRIDS = ((0.8, 0.0, 0.0), (0.0, 0.8, 0.0), (0.0, 0.0, np.pi / 4), (0.0, 0.0, np.pi / 2))
 """Shift east and north, m, and turn, of the control's grids."""
@@ -270,6 +273,27 @@ def _seen(town: int) -> tuple[float, float]:
 def _interval(values: Sequence[float]) -> tuple[float, float, float]:
     found = mean_interval(values)
     return found.mean, found.low, found.high
+
+
+def times() -> Table:
+    """One ego that has four whole maps: fusion and detection, on its own grid and on all, in turn."""
+    scene, fleet = _frame(0, Difficulty())
+    job = [(fleet[0], list(_shares(Way("features"), fleet[0], fleet)))]
+    detectors = {grids: TorchDetector(scene, Perception(fused_grids=grids), 0, WEIGHTS) for grids in ("own", "all")}
+    took_s: dict[str, list[float]] = {grids: [] for grids in detectors}
+    for _ in range(REPEATS + 1):
+        for grids, detector in detectors.items():
+            begin_s = time.perf_counter()
+            detector.detect(job)
+            took_s[grids].append(time.perf_counter() - begin_s)
+    median_s = {grids: statistics.median(each[1:]) for grids, each in took_s.items()}  # the first one encodes
+    rows: list[list[object]] = [[grids, took, took / median_s["own"]] for grids, took in median_s.items()]
+    columns = [
+        Column("grids"),
+        Column("one ego with four maps", ".0f", " ms", 1e3),
+        Column("times its own grid", ".1f"),
+    ]
+    return Table(columns, rows, f"Medians of {REPEATS}; the maps are encoded already.")  # type: ignore[arg-type]
 
 
 def tables() -> dict[str, Table]:
