@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sortie.fleet.chart import Chart
 from sortie.fleet.coverage import LOOK_STANDS_S, NOTHING_SEEN, NOVEL_FLAG, TARGET_FLAG, View, placed
-from sortie.fleet.gate import Gate, Payload, make_payload
+from sortie.fleet.gate import FoundLast, Gate, Payload, make_payload
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import FULL, encode_compact
@@ -142,6 +142,7 @@ class Agent:
         guard: Guard | None = None,
         reads: Callable[[FleetView], FleetView] | None = None,
         check: Callable[[Sequence[Directive], FleetView], None] = check_directives,
+        found_last: FoundLast | None = None,
     ) -> None:
         """Put a drone together; `start` begins its process.
 
@@ -160,6 +161,7 @@ class Agent:
             guard: has the last word before the gates; None where there are no invariants.
             reads: gives what the drone reads in place of what it heard; None where that is the same.
             check: refuses a policy's answer that breaks the contract.
+            found_last: gives what the drone found when it last fused; None does not send it.
         """
         self.drone, self.status, self.memory = memory.drone, memory.status, memory
         self.here: Capture | None = None
@@ -177,7 +179,7 @@ class Agent:
         self._sealer = sealer
         self._phase_s = phase_s
         self._handshake_bytes = handshake_bytes
-        self._guard, self._reads, self._check = guard, reads, check
+        self._guard, self._reads, self._check, self._found_last = guard, reads, check, found_last
         self._period_s = rules.descriptor_period_s
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
@@ -491,8 +493,8 @@ class Agent:
             what = (directive.representation, directive.rho, directive.roi, directive.fusion_weight)
             if what not in made:
                 payload = make_payload(
-                    directive, *pose, count_boxes, rules.tile_limit_bytes, tracks_in, people_in, classes=rules.classes,
-                    code_bytes=rules.code_bytes,
+                    directive, *pose, count_boxes, rules.tile_limit_bytes, tracks_in, people_in, self._found_last,
+                    classes=rules.classes, code_bytes=rules.code_bytes,
                 )  # fmt: skip
                 if payload is not None and (self.status.feature_space or self.status.codebook):
                     payload = payload._replace(

@@ -13,7 +13,7 @@ from sortie.fleet import tiles
 from sortie.fleet.messages.wire import directive_bytes
 from sortie.perception import budget
 from sortie.perception.motion import Tracks
-from sortie.perception.types import Boxes
+from sortie.perception.types import Boxes, Found
 from sortie.policies.contract import Directive, Disc, Representation
 from sortie.scenarios.representation import BOXES, NAME_OF
 
@@ -30,6 +30,8 @@ CountBoxes = Callable[[Disc | None], int]
 """Counts the boxes that the drone's own detector reports in a region; None is everywhere."""
 TracksIn = Callable[[Disc | None], Tracks | None]
 """What the drone's own tracker sends of a region; None where it has no tracker."""
+FoundLast = Callable[[], Found | None]
+"""What the drone found when it last fused; None where it did not, or does not send it."""
 PeopleIn = Callable[[Disc | None], Boxes]
 """The people that the drone's thermal camera found in a region."""
 
@@ -60,6 +62,8 @@ class Payload(NamedTuple):
     """Of its codes: digest of the codebook, empty for the fleet's common one."""
     code_bytes: int = 0
     """Of a cell of codes; 0 for other payloads."""
+    found: Found | None = None
+    """What comes with a map: what its sender found when it last fused. Its boxes count in `boxes`."""
 
     @property
     def reliable(self) -> bool:
@@ -76,6 +80,7 @@ def make_payload(
     tile_limit_bytes: int | None = None,
     tracks_in: TracksIn | None = None,
     people_in: PeopleIn | None = None,
+    found_last: FoundLast | None = None,
     *,
     classes: bool = False,
     code_bytes: int = budget.CODE_BYTES,
@@ -87,12 +92,13 @@ def make_payload(
             always are one sample.
         tracks_in: gives the tracks of a region that the drone sends; without a tracker, boxes are counted in their place.
         people_in: gives the people of a region; None without a thermal camera.
+        found_last: gives what goes with a map or codes: a header of its own, and boxes.
         classes: whether each detection names its class.
         code_bytes: of a cell that is sent as a code.
     """
     rung, rho, roi, weight = directive.representation, directive.rho, directive.roi, directive.fusion_weight
     cells = boxes = index_bytes = 0
-    tracks = people = None
+    tracks = people = found = None
     if rung == _NONE:
         return None
     if rung in (_FEATURES, _CODES):
@@ -103,18 +109,22 @@ def make_payload(
             t = tiles.cut(cells, tile_limit_bytes)
             return Payload(rung, rho, roi, weight, cells, 0, t.index_bytes, t.size_bytes, t.cells_each, t.tile_bytes)
         index_bytes = budget.index_bytes(cells)
+        found = None if found_last is None else found_last()
     elif rung == _TRACKS and tracks_in is not None and (tracks := tracks_in(roi)) is not None:
         boxes = len(tracks)
     elif rung != _RAW:
         people = None if people_in is None else people_in(roi)
         boxes = budget.boxes_sent(NAME_OF[rung], count_boxes(roi) + (0 if people is None else len(people)))
     # the directive goes with the payload, so that the receiver has representation, region and fusion weight
-    content_bytes = budget.content_bytes(
+    size_bytes = HEADER_BYTES + directive_bytes(directive) + budget.content_bytes(
         NAME_OF[rung], cells=cells, boxes=boxes, classes=classes, code_bytes=code_bytes
     )  # fmt: skip
+    if found is not None:
+        boxes = found.number
+        size_bytes += HEADER_BYTES + budget.content_bytes("detections", boxes=boxes, classes=classes)
     return Payload(
-        rung, rho, roi, weight, cells, boxes, index_bytes, HEADER_BYTES + directive_bytes(directive) + content_bytes,
-        tracks=tracks, people=people, code_bytes=code_bytes if rung == _CODES else 0,
+        rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes, tracks=tracks, people=people,
+        code_bytes=code_bytes if rung == _CODES else 0, found=found,
     )  # fmt: skip
 
 

@@ -70,7 +70,8 @@ class Share(NamedTuple):
     tracks: Tracks | None = None
     """Of a payload of tracks: the tracks that came. Of boxes: the receiver's own tracks, which say how late boxes move."""
     boxes: Boxes | None = None
-    """The sender's own boxes, best first, where another network than the receiver's made them."""
+    """The sender's boxes, best first, where another network than the receiver's made them, or where it found them by fusing maps
+    (`Found`)."""
     people: Boxes | None = None
     """People that the sender's thermal camera found; None where the payload has none to give."""
     errors: BoxErrors | None = None
@@ -89,6 +90,17 @@ class Share(NamedTuple):
     def is_detected(self) -> bool:
         """Whether it holds boxes that the receiver's detector finds in its capture; tracks bring their own."""
         return self.boxes is None and not self.is_map and (self.representation != "tracks" or self.tracks is None)
+
+
+class Found(NamedTuple):
+    """What a drone found when it last fused the maps that it held; it sends this with its own maps."""
+
+    capture: Capture
+    """Its own look, in whose square it fused."""
+    number: int
+    """Of boxes."""
+    boxes: Boxes | None
+    """The boxes, best first; None where no detector flies, and boxes are only counted."""
 
 
 @dataclass(frozen=True, slots=True)

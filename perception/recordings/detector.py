@@ -48,8 +48,9 @@ class RecordedDetector:
         for option, usual in (("absent_peers", "excluded"), ("fused_grids", "own")):
             if (value := getattr(config, option)) != usual:
                 raise InputError(f"perception.{option} is {value!r}, must be {usual} for a recording")
-        if config.match_poses:
-            raise InputError("perception.match_poses is true, must be false for a recording")
+        for option in ("match_poses", "maps_bring_boxes"):
+            if getattr(config, option):
+                raise InputError(f"perception.{option} is true, must be false for a recording")
         self._recording = rec = open_recording(Path(config.recording or ""))
         self._config = config
         self._fuse = None if config.recorded_fusion is None else resolve("recorded_fusion", config.recorded_fusion)

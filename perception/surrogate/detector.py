@@ -116,8 +116,9 @@ class SurrogateDetector:
             raise InputError(
                 f"perception.absent_peers is {config.absent_peers!r}: {name} was calibrated without them, must be excluded"
             )
-        if config.match_poses:
-            raise InputError(f"perception.match_poses is true: {name} was calibrated without it, must be false")
+        for option in ("match_poses", "maps_bring_boxes"):
+            if getattr(config, option):
+                raise InputError(f"perception.{option} is true: {name} was calibrated without it, must be false")
         for option, usual in (("fused_grids", "own"), ("serve", "grid")):
             if (value := getattr(config, option)) != usual:
                 raise InputError(f"perception.{option} is {value!r}: {name} was calibrated without it, must be {usual}")

@@ -133,6 +133,10 @@ class Perception(Section):
         "own",
         description="On which grids a receiver fuses maps: on its own, or also on that of each drone that sent one (all), and the boxes of all grids are joined (the torch detector's).",
     )
+    maps_bring_boxes: bool = Field(
+        False,
+        description="With each feature map, or codes of one, goes what its sender found when it last fused the maps that it held, as boxes (not the surrogate's).",
+    )
     match_poses: bool = Field(
         False,
         description="Receivers correct the poses of all drones that they hear, and their own, by the cars that these have in common, before they fuse (the torch detector's).",

@@ -14,47 +14,14 @@ import numpy as np
 import simpy
 
 from sortie.fleet.agent import Agent
-from sortie.fleet.memory import Received
-from sortie.perception.budget import MAX_TRACKS
-from sortie.perception.classes import PERSON, vehicle_classes
+from sortie.perception.classes import vehicle_classes
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
-from sortie.perception.motion import Tracks
-from sortie.perception.types import Boxes, Capture, Share
-from sortie.scenarios.disc import Disc
-from sortie.scenarios.representation import DETECTED_NAMES, NAME_OF
+from sortie.perception.types import Boxes, Capture
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
+from sortie.sim.engine.fusing import Fusing, Job, is_flying, of_vehicles, ready
 from sortie.sim.engine.people import People
 from sortie.sim.results.record import Recorder
-
-INSTANT_S = 1e-9
-"""Ages closer together than this are equal but for rounding."""
-
-
-def as_share(received: Received, trust: float = 1.0, age_s: float = 0.0) -> Share:
-    """A received payload in the detector's form, its weight multiplied by the receiver's trust in the sender.
-
-    What its age leaves of it is the detector's to say: it differs between maps and boxes.
-    """
-    payload = received.payload
-    name, weight = NAME_OF[payload.representation], payload.fusion_weight * trust
-    tracks, people = payload.tracks, payload.people
-    return Share(
-        received.capture, name, payload.rho, payload.roi, weight, received.missing, age_s, tracks, people=people
-    )
-
-
-def of_vehicles(share: Share) -> Share:
-    """What a detector takes of a share: it joins vehicles alone."""
-    tracks = share.tracks
-    if tracks is None or not np.any(person := tracks.kind == PERSON):
-        return share
-    return share._replace(tracks=tracks.take(~person), cut=share.cut or len(tracks) >= MAX_TRACKS)
-
-
-Job = tuple[Capture, list[Share]]
-"""An ego's capture, and the shares of its peers."""
-
 
 NOBODY = Boxes.empty()
 WAITING_EGOS = 1024
@@ -113,14 +80,13 @@ class Scorer:
         agents: Sequence[Agent],
         recorder: Recorder,
         planned: Callable[[int, int], Capture],
-        own_tracks: Callable[[int], Tracks],
+        fusing: Fusing,
         people: People,
-        region: Callable[[int, float], Disc | None],
         turns: Iterable[Sequence[int]],
     ) -> None:
         """Args:
         planned: where a drone is in a frame, or would be had it not left the air.
-        own_tracks: what a drone's own tracker follows.
+        fusing: what a drone fuses.
         people: finds, joins and records people; the detector has vehicles alone.
         region: a drone's mission region at a time.
         turns: which drones are scored at each scored moment, ascending.
@@ -129,10 +95,8 @@ class Scorer:
         # here and not in each call: a check against a protocol takes longer than a fusion
         self._many = detector if isinstance(detector, DetectsMany) else None
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
-        self._agents, self._recorder, self._planned, self._own_tracks = agents, recorder, planned, own_tracks
+        self._agents, self._recorder, self._planned, self._fusing = agents, recorder, planned, fusing
         self._people, self._has_trucks = people, scenario.perception.scene.trucks > 0.0
-        self._delays_s = scenario.compute_delays_s
-        self._region = region if scenario.perception.serve == "region_first" else None
         self._turns = turns
         self._waiting: list[Moment] = []
         self._begun: list[Callable[[], list[Boxes]]] = []
@@ -155,17 +119,13 @@ class Scorer:
     def _score(self, frame: int, agents: Sequence[Agent]) -> None:
         now_s = self._env.now
         moment: Moment = now_s, []
-        since_s = (frame - 1.5) * self._scenario.frame_s
         for agent in agents:
-            came_back = agent.here is not None and agent.here.t_s < since_s  # and has not sensed yet
-            if came_back or not agent.status.airborne:
+            if not is_flying(agent, frame, self._scenario.frame_s):
                 moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))
-            elif agent.here is not None and (
-                agent.latest is not None or not agent.status.looks or agent.status.blocked
-            ):
-                shares = self._shares(agent, now_s)
-                job = self._job(agent, agent.here, [of_vehicles(s) for s in shares], now_s)
-                moment[1].append(Ego(agent.here, job, people=self._people.known(agent.here, shares, now_s)))
+            elif (here := ready(agent)) is not None:
+                shares = self._fusing.shares(agent, now_s)
+                job = self._fusing.job(agent, here, [of_vehicles(s) for s in shares], now_s)
+                moment[1].append(Ego(here, job, people=self._people.known(here, shares, now_s)))
         self._waiting.append(moment)
         if self._ahead is not None:
             self._begun.append(self._ahead.begin(jobs_of(moment)))
@@ -207,35 +167,6 @@ class Scorer:
                     [now_s - s.capture.t_s for s in shares], [s.weight for s in shares], len(boxes), len(truth),
                 )
             )  # fmt: skip
-
-    def _shares(self, agent: Agent, now_s: float) -> list[Share]:
-        """What the agent received lately, by ascending peer."""
-        limit_s, memory = self._scenario.perception.max_age_s + INSTANT_S, agent.memory
-        held = [
-            received for _, received in sorted(memory.held.items()) if memory.payload_age_s(received, now_s) <= limit_s
-        ]
-        shares = [as_share(r, memory.trust_in(r.capture.drone), memory.payload_age_s(r, now_s)) for r in held]
-        if (region := self._region) is not None:
-            shares = [s._replace(first=region(s.capture.drone, s.capture.t_s)) for s in shares]
-        if any(s.representation in DETECTED_NAMES for s in shares):
-            own = self._own_tracks(agent.drone)
-            shares = [s._replace(tracks=own) if s.representation in DETECTED_NAMES else s for s in shares]
-        return shares
-
-    def _job(self, agent: Agent, here: Capture, shares: list[Share], now_s: float) -> Job | None:
-        """The agent's capture and its recent shares, where `here` is its present pose.
-
-        Where its own capture is too old it has its present pose alone, and fuses what its peers sent; None where that is
-        nothing.
-        """
-        config, look = self._scenario.perception, agent.latest
-        limit_s = config.max_age_s + INSTANT_S
-        delay_s = self._delays_s[here.drone] + agent.status.slowed_s + config.fusion_delay_s  # of any capture
-        if look is None or now_s - look.t_s > limit_s + delay_s:
-            if not shares:
-                return None
-            look = here._replace(looked=False)
-        return look, shares
 
     def _with_classes(self, truth: Boxes, t_s: float, here: Capture) -> Boxes:
         """The vehicles about an ego with their classes, and the people there."""

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter  # before a user's file may replace it in its module
 from typing import Protocol
 
@@ -38,6 +39,7 @@ from sortie.scenarios.streams import stream
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
+from sortie.sim.engine.fusing import FindingEachFrame, Fusing
 from sortie.sim.engine.garbage import LEFTOVERS, cycles_searched_rarely
 from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
@@ -53,7 +55,7 @@ from sortie.sim.engine.separation import Separation
 from sortie.sim.engine.steering import Steering, area_m
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
-from sortie.sim.engine.world import OwnSenses, World, air_settings
+from sortie.sim.engine.world import OwnSenses, World, air_settings, cars_in_reach
 from sortie.sim.identity import code_version, name_of, own_files, runs_user_code
 from sortie.sim.results import beliefs, disagreement, rosters
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
@@ -252,6 +254,9 @@ def build(
     zeros = scenario.perception.absent_peers == "zeros"  # all drones of one call are peers
     own_boxes: OwnBoxesOf = TargetSeen(scene) if looking is None else OwnBoxes(looking, ahead, one_by_one=zeros)
     tracking = FleetTracking(scenario, people.with_people(own_boxes))
+    fusing, finding = Fusing(scenario, tracking.tracks, plan.region), None
+    if scenario.perception.maps_bring_boxes:
+        finding = FindingEachFrame(env, scenario, detector, partial(cars_in_reach, scene, roi=None))
     agents = [
         Agent(
             env,
@@ -268,15 +273,16 @@ def build(
             guard=pilots[i].guard,
             reads=pilots[i].reads,
             check=pilots[i].check,
+            found_last=None if finding is None else partial(finding.last, i),
         )
         for i in drones
     ]
     scorer = None
     if detector is not None:
         turns = taking_turns(scenario, seed, replication)
-        scorer = Scorer(
-            env, scenario, detector, agents, recorder, capture_of, tracking.tracks, people, plan.region, turns
-        )
+        scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, fusing, people, turns)
+    if finding is not None:
+        finding.start(agents, fusing)
     own_events = OwnEvents(scenario, world, seed, replication)
     schedule(scenario, world, transport, membership, own_events, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)

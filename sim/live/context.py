@@ -81,12 +81,12 @@ def unflown(scenario: Scenario, drone: int) -> Trace:
 
 
 def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) -> list[Trace]:
-    """Fly the scenario without a detector and without lies, and keep each drone's trace.
+    """Fly the scenario without a detector, boxes with maps and lies, and keep each drone's trace.
 
     Raises:
         PolicyError: its policy is unknown, breaks its contract, or takes longer than `limits.decision_s`.
     """
-    perception = scenario.perception.model_copy(update={"detector": "none"})
+    perception = scenario.perception.model_copy(update={"detector": "none", "maps_bring_boxes": False})
     honest = tuple(event for event in scenario.events if not isinstance(event, Lie))
     # a roster would shorten the goodputs to those of its members; the live drone makes its own
     context = scenario.context.model_copy(update={"roster": False})

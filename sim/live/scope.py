@@ -46,6 +46,7 @@ UNUSED = (
     "perception.join",
     "perception.match_poses",
     "perception.fused_grids",
+    "perception.maps_bring_boxes",
     "perception.common_errors",
     "perception.score_threshold",
     "perception.cells_by",

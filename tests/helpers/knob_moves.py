@@ -472,7 +472,7 @@ UNSIGNED: dict[str, str] = {
         f"perception.{name}": _KIND
         for name in (
             "fusion", "fusion_params", "recording", "recorded_fusion", "precision", "motion_compensation", "cells_by", "join", "serve", "unsent_cells", "absent_peers",
-            "codebook", "common_errors", "match_poses", "fused_grids",
+            "codebook", "common_errors", "match_poses", "fused_grids", "maps_bring_boxes",
         )
     },
     **{

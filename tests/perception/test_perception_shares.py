@@ -27,7 +27,7 @@ from sortie.perception.tracking.following import motion_of_boxes
 from sortie.perception.types import Boxes, Share
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception, Scene, Target, Thermal
-from sortie.sim.engine.scoring import of_vehicles
+from sortie.sim.engine.fusing import of_vehicles
 
 BARE = SceneModel(Scene(building_density=0.0, tree_density=0.0), None, (0.0, 0.0, 80.0, 80.0))
 

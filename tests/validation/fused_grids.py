@@ -112,7 +112,7 @@ def frames(scenes: int, ways: Sequence[Way] = WAYS) -> Found:
     found: dict[Way, list[Matched]] = {way: [] for way in ways}
     difficulty = Difficulty()
     for k in range(scenes):
-        scene, fleet = _frame(k, difficulty)
+        scene, fleet = frame(k, difficulty)
         truths = [ground_truth(scene.cars_at(c.t_s).table(), c.true_pose) for c in fleet]
         for grids, matched in dict.fromkeys((way.grids, way.matched) for way in ways):
             config = Perception(fused_grids=grids, match_poses=matched, code_bytes=10)
@@ -123,9 +123,10 @@ def frames(scenes: int, ways: Sequence[Way] = WAYS) -> Found:
     return found
 
 
-def _frame(k: int, difficulty: Difficulty) -> tuple[SceneModel, Sequence[Capture]]:
-    scene = SceneModel(draw_scene(BENCH_SEED, "test", k, difficulty), None, AREA_M)
-    return scene, draw_captures(BENCH_SEED, "test", k, 0, difficulty)
+def frame(k: int, difficulty: Difficulty, seed: int = BENCH_SEED) -> tuple[SceneModel, Sequence[Capture]]:
+    """A scene of the test split, and a fleet's captures in it."""
+    scene = SceneModel(draw_scene(seed, "test", k, difficulty), None, AREA_M)
+    return scene, draw_captures(seed, "test", k, 0, difficulty)
 
 
 def _detected(detector: TorchDetector, way: Way, fleet: Sequence[Capture]) -> list[Boxes]:
@@ -195,7 +196,7 @@ def _recall(scenes: int, difficulty: Difficulty) -> tuple[NDArray[np.float64], N
     """Cars by how many drones see them, 0 … 5, and how many of these are found."""
     cars_by, hits_by = np.zeros(6), np.zeros(6)
     for k in range(scenes):
-        scene, fleet = _frame(k, difficulty)
+        scene, fleet = frame(k, difficulty)
         boxes = _detected(TorchDetector(scene, Perception(), k, WEIGHTS), Way("features"), fleet)
         cars = scene.cars_at(fleet[0].t_s)
         seen_by = np.stack([visible(scene, c, cars) >= SEEN for c in fleet]).sum(axis=0)
@@ -277,7 +278,7 @@ def _interval(values: Sequence[float]) -> tuple[float, float, float]:
 
 def times() -> Table:
     """One ego that has four whole maps: fusion and detection, on its own grid and on all, in turn."""
-    scene, fleet = _frame(0, Difficulty())
+    scene, fleet = frame(0, Difficulty())
     job = [(fleet[0], list(_shares(Way("features"), fleet[0], fleet)))]
     detectors = {grids: TorchDetector(scene, Perception(fused_grids=grids), 0, WEIGHTS) for grids in ("own", "all")}
     took_s: dict[str, list[float]] = {grids: [] for grids in detectors}

@@ -400,6 +400,7 @@ SEEN: dict[str, tuple[str, tuple[str, ...]]] = {
     "perception.cells_by": ("norm", ()),
     "perception.match_poses": ("true", ("policy.name=boxes", "policy.params={}")),
     "perception.fused_grids": ("all", ("policy.name=all-4", "policy.params={}")),
+    "perception.maps_bring_boxes": ("true", ("policy.name=all-4", "policy.params={received_budget: 0.05}")),
     "perception.join": ("nms", ("policy.name=boxes", "policy.params={}")),
     "perception.serve": ("region_first", (TRACK, "policy.name=all-4", "policy.params={received_budget: 0.05}")),
     "perception.unsent_cells": ("zero", ()),

@@ -341,6 +341,7 @@ CHANGED = {
     "perception.codebook": "other.safetensors",
     "perception.match_poses": "true",
     "perception.fused_grids": "all",
+    "perception.maps_bring_boxes": "true",
     "perception.common_errors": "unknown",
     "perception.score_threshold": "0.5",
     "perception.cells_by": "norm",
