@@ -85,7 +85,11 @@ def test_a_drone_that_hears_nobody_keeps_its_pose() -> None:
 
 @pytest.mark.parametrize(
     ("option", "value", "shown", "usual"),
-    [("match_poses", True, "true", "false"), ("fused_grids", "all", "'all'", "own")],
+    [
+        ("match_poses", True, "true", "false"),
+        ("maps_bring_boxes", True, "true", "false"),
+        ("fused_grids", "all", "'all'", "own"),
+    ],
 )
 def test_the_surrogate_and_recordings_refuse_it(option: str, value: object, shown: str, usual: str) -> None:
     scene, on = SceneModel(Scene(), None, (-50, -50, 50, 50)), {option: value}

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import simpy
 from agent_rig import capture, descriptor, memory, payload
+from fusing_rig import Mind, Seer, agent
 from sim_examples import example
 
 from sortie.fleet.flight.steering import GoTo, Velocity
 from sortie.fleet.memory import Received
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
-from sortie.fleet.plane import DroneStatus
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
@@ -29,6 +29,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine import mixed as mixed_module
 from sortie.sim.engine import tracking as tracking_module
 from sortie.sim.engine.events import _Begin
+from sortie.sim.engine.fusing import Fusing
 from sortie.sim.engine.mixed import Mixed, MixedMany, mixed
 from sortie.sim.engine.people import KEPT_S, People
 from sortie.sim.engine.pilot import plan_for
@@ -382,42 +383,6 @@ def test_networks_that_do_many_moments_do_so_where_all_can(kinds: tuple[type[Net
 # --- scoring -----------------------------------------------------------------------------------------
 
 
-class Mind:
-    """What a drone received, and what it thinks of its peers."""
-
-    def __init__(self, held: Sequence[tuple[int, float, float, float, Any]] = ()) -> None:
-        """Args: `held`: of each payload its sender, when it was captured, how old the drone takes it to be, trust, changes."""
-        self._age_s = {peer: age_s for peer, _, age_s, _, _ in held}
-        self._trust = {peer: trust for peer, _, _, trust, _ in held}
-        self.held = {
-            peer: Received(capture(peer, t_s), payload()._replace(fusion_weight=0.5, **more), t_s, t_s, (3,))
-            for peer, t_s, _, _, more in held
-        }
-
-    def payload_age_s(self, received: Received, now_s: float) -> float:
-        return self._age_s[received.capture.drone]
-
-    def trust_in(self, peer: int) -> float:
-        return self._trust[peer]
-
-
-class Seer:
-    """A detector that finds nothing and keeps what it was asked."""
-
-    def __init__(self) -> None:
-        self.jobs: dict[int, Any] = {}
-
-    def detect(self, jobs: Sequence[Any]) -> list[Boxes]:
-        for here, shares in jobs:
-            self.jobs[here.drone] = here, list(shares)
-        return [Boxes(np.zeros((1, 2)), np.ones((1, 2)), np.zeros(1), np.ones(1)) for _ in jobs]
-
-    def truth(self, t_s: float, ego: Capture) -> Boxes:
-        return Boxes(np.zeros((2, 2)), np.full((2, 2), 4.0), np.zeros(2), np.ones(2))
-
-    count_boxes = camera_views = None
-
-
 class Nobody:
     """Stands for the people: one is known of, and none is there."""
 
@@ -426,14 +391,6 @@ class Nobody:
 
     def truth(self, t_s: float, ego: Capture) -> Boxes:
         return Boxes.empty()
-
-
-def _agent(
-    drone: int, here_s: float, latest_s: float | None, mind: Mind, *, airborne: bool = True, looks: bool = True
-) -> Any:
-    status = DroneStatus(airborne=airborne, looks=looks)
-    latest = None if latest_s is None else capture(drone, latest_s)
-    return SimpleNamespace(drone=drone, here=capture(drone, here_s), latest=latest, memory=mind, status=status)
 
 
 def _scored(agents: Sequence[Any], *sets: str, region: Any = None, own: Any = None) -> tuple[Seer, Recorder]:
@@ -445,7 +402,7 @@ def _scored(agents: Sequence[Any], *sets: str, region: Any = None, own: Any = No
     env, seer, recorder = simpy.Environment(), Seer(), Recorder()
     env.run(until=1.1)
     planned = lambda drone, frame: capture(drone, 1000.0 + frame)  # noqa: E731
-    scorer = Scorer(env, scenario, seer, agents, recorder, planned, own, Nobody(), region, [])  # type: ignore[arg-type]
+    scorer = Scorer(env, scenario, seer, agents, recorder, planned, Fusing(scenario, own, region), Nobody(), [])  # type: ignore[arg-type]
     scorer._score(10, agents)
     return seer, recorder
 
@@ -453,7 +410,7 @@ def _scored(agents: Sequence[Any], *sets: str, region: Any = None, own: Any = No
 def test_a_drone_fuses_what_it_takes_to_be_fresh_by_ascending_peer_and_weighs_it_by_its_trust() -> None:
     """How old a payload is the drone judges itself: by the sender's clock, corrected as far as it knows."""
     mind = Mind([(4, 0.9, 0.5, 0.5, {}), (1, 0.2, 0.3, 1.0, {}), (3, 0.9, 0.51, 1.0, {})])
-    seer, recorder = _scored([_agent(0, 1.0, 0.9, mind)])
+    seer, recorder = _scored([agent(0, 1.0, 0.9, mind)])
     here, shares = seer.jobs[0]
     assert here == capture(0, 0.9)
     assert [(s.capture.drone, s.weight, s.age_s, s.missing) for s in shares] == [
@@ -471,14 +428,14 @@ def test_own_tracks_move_boxes_that_come_late_and_nothing_else() -> None:
     boxes = {"representation": Representation.DETECTIONS}
     mind = Mind([(1, 1.0, 0.1, 1.0, {}), (2, 1.0, 0.1, 1.0, boxes)])
     asked: list[int] = []
-    seer, _ = _scored([_agent(3, 1.0, 1.0, mind)], own=lambda drone: asked.append(drone) or own)
+    seer, _ = _scored([agent(3, 1.0, 1.0, mind)], own=lambda drone: asked.append(drone) or own)
     assert [s.tracks is own for s in seer.jobs[3][1]] == [False, True]
     assert asked == [3]
 
 
 def test_cells_of_the_sender_s_region_at_its_capture_come_first() -> None:
     mind = Mind([(1, 0.8, 0.1, 1.0, {}), (2, 0.9, 0.1, 1.0, {})])
-    agents = [_agent(0, 1.0, 1.0, mind)]
+    agents = [agent(0, 1.0, 1.0, mind)]
     seer, _ = _scored(agents, "perception.serve=region_first", region=lambda drone, t_s: Disc(drone, t_s, 1.0))
     assert [s.first for s in seer.jobs[0][1]] == [Disc(1, 0.8, 1.0), Disc(2, 0.9, 1.0)]
     seer, _ = _scored(agents, region=lambda drone, t_s: Disc(drone, t_s, 1.0))
@@ -498,7 +455,7 @@ def test_a_look_that_is_too_old_is_left_out_and_the_drone_is_where_it_is(
     latest_s: float | None, peers: list[int], fuses: str
 ) -> None:
     mind = Mind([(p, 1.0, 0.1, 1.0, {}) for p in peers])
-    seer, recorder = _scored([_agent(0, 1.0, latest_s, mind)])
+    seer, recorder = _scored([agent(0, 1.0, latest_s, mind)])
     if fuses == "own":
         assert seer.jobs[0][0] == capture(0, 0.46)
     elif fuses == "peers alone":
@@ -512,13 +469,13 @@ def test_a_look_that_is_too_old_is_left_out_and_the_drone_is_where_it_is(
 
 def test_a_slow_computer_s_look_may_be_older() -> None:
     slow = "fleet.makes=[{name: a, drones: [2], compute_delay_s: 0.2}]"
-    seer, _ = _scored([_agent(d, 1.0, 0.35, Mind()) for d in (0, 2)], slow)
+    seer, _ = _scored([agent(d, 1.0, 0.35, Mind()) for d in (0, 2)], slow)
     assert seer.jobs.keys() == {2}
 
 
 def test_a_look_that_events_slow_may_be_older() -> None:
     """0.36 s and 0.4 s longer, two events together: the look is as old as it must be, and not too old."""
-    agents = [_agent(d, 1.0, -0.3, Mind()) for d in (0, 1, 2)]
+    agents = [agent(d, 1.0, -0.3, Mind()) for d in (0, 1, 2)]
     agents[1].status.slower_s, agents[2].status.slower_s = {0: 0.36}, {0: 0.36, 1: 0.4}
     seer, _ = _scored(agents)
     assert seer.jobs.keys() == {2}
@@ -527,11 +484,11 @@ def test_a_look_that_events_slow_may_be_older() -> None:
 def test_who_is_gone_or_has_just_come_back_is_scored_where_it_would_be() -> None:
     """A drone that came back has not sensed since the frame before; one that cannot look needs no look."""
     agents = [
-        _agent(0, 1.0, 1.0, Mind(), airborne=False),
-        _agent(1, 0.8, 0.8, Mind()),
-        _agent(2, 0.9, 0.9, Mind()),
-        _agent(3, 1.0, None, Mind([(1, 1.0, 0.1, 1.0, {})]), looks=False),
-        _agent(4, 1.0, None, Mind()),
+        agent(0, 1.0, 1.0, Mind(), airborne=False),
+        agent(1, 0.8, 0.8, Mind()),
+        agent(2, 0.9, 0.9, Mind()),
+        agent(3, 1.0, None, Mind([(1, 1.0, 0.1, 1.0, {})]), looks=False),
+        agent(4, 1.0, None, Mind()),
     ]
     seer, recorder = _scored(agents)
     assert seer.jobs.keys() == {2, 3}
@@ -551,9 +508,10 @@ def test_a_detector_of_many_moments_waits_until_there_are_enough(monkeypatch: py
 
     monkeypatch.setattr("sortie.sim.engine.scoring.WAITING_EGOS", 5)
     env, recorder = simpy.Environment(), Recorder()
-    agents = [_agent(d, 0.0, 0.0, Mind()) for d in (0, 1)]
+    agents = [agent(d, 0.0, 0.0, Mind()) for d in (0, 1)]
     scenario = example("perception={detector: surrogate}", "fleet.drones=2")
-    scorer = Scorer(env, scenario, All(), agents, recorder, None, None, Nobody(), None, [])  # type: ignore[arg-type]
+    fusing = Fusing(scenario, None, None)  # type: ignore[arg-type]
+    scorer = Scorer(env, scenario, All(), agents, recorder, None, fusing, Nobody(), [])  # type: ignore[arg-type]
     rows = []
     for _ in range(4):
         scorer._score(0, agents)
