@@ -161,6 +161,7 @@ class Scorer:
             if not ego.flying:
                 continue
             rows["detections"].append((now_s, drone, boxes))
+            shares = [s for s in shares if s.boxes is None]  # boxes that came with a map are no payload of their own
             rows["fusions"].append(
                 (
                     now_s, drone, [s.capture.drone for s in shares], [s.representation for s in shares],

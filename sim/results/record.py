@@ -117,8 +117,7 @@ ABOUT = {
     "transmissions": "A payload handed to the radio, with its fate. `boxes` of a map came with it (`perception.maps_bring_boxes`). "
     "`partial`: some of its tiles arrived, "
     "`arrived_bytes` of it. The reason `other_feature_space`: delivered feature maps that the receiver's network cannot fuse, or codes of another codebook.",
-    "fusions": "A scored fusion: an ego, and the peers whose payloads it held. A weight is the directive's times trust. A peer "
-    "whose map brought boxes is there twice: with the map, and with `detections`.",
+    "fusions": "A scored fusion: an ego, and the peers whose payloads it held. A weight is the directive's times trust.",
     "detections": "A box that an ego detected, ENU. People among them are from thermal cameras, its own and its peers'.",
     "truths": "A car within an ego's range at a scored fusion, ENU; of a drone that left the air, about the place that "
     "it would have in the formation. Such a drone has no row in `fusions`. `car` is the car's number, the targets first, the "

@@ -156,7 +156,7 @@ def test_in_flight_receivers_join_what_senders_found_before() -> None:
     assert came > 10
     fused = record.tables["fusions"].to_pylist()[-1]
     assert fused["peers"] == sorted(fused["peers"])
-    assert fused["representations"] == ["features", "detections"] * 2
+    assert fused["representations"] == ["features"] * 2, "what came with them is no payload of its own"
     sent = record.tables["transmissions"].to_pandas().query("representation == 'features'")
     assert sent.boxes.max() == 3, "of the own look and two maps"
 
