@@ -491,7 +491,7 @@ def _fused_grids() -> Tables:
 def _sent_boxes() -> Tables:
     import sent_boxes
 
-    return sent_boxes.tables()
+    return sent_boxes.tables(ROOT / "docs/results/sent_boxes.png")
 
 
 def _sent_times() -> Tables:

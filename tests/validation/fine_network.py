@@ -98,7 +98,12 @@ def with_matched_poses(frames: Frames, weights: Path) -> Frames:
 def _way(network: str, row: Row, rows: Sequence[Row]) -> list[object]:
     label = row.way.label
     over = [None if label == other else difference(rows, label, other) for other in (SILENCE, BOXES)]
-    return [network, label, row.kilobytes, (row.ap, row.low, row.high), *over]
+    return [network, _named(label), row.kilobytes, (row.ap, row.low, row.high), *over]
+
+
+def _named(label: str) -> str:
+    """A way by the names of the page's other tables."""
+    return label.replace("features", "maps").replace("detections, averaged", "averaged boxes")
 
 
 def other_fleets(store: Path) -> Table:
@@ -181,12 +186,12 @@ def draw(table: Table, path: Path) -> None:
     for network, colour in (("coarse", "#7a7d85"), ("fine", "#1d6f80")):
         rows = {str(label): (kilobytes, ap) for name, label, kilobytes, ap, *_ in table.rows if name == network}
         axes.axhline(rows[SILENCE][1][0], color=colour, lw=1, ls=":", label=f"{network}: silence")
-        for kind, marker in (("features", "o"), ("codes of 10 B", "^"), (BOXES, "s")):
+        for kind, marker in (("maps", "o"), ("codes of 10 B", "^"), (_named(BOXES), "s")):
             chosen = [v for label, v in rows.items() if label.startswith(kind) and "poses" not in label]
             x, (ap, low, high) = [v[0] for v in chosen], np.array([v[1] for v in chosen]).T
             label = f"{network}: {kind}"
             axes.errorbar(x, ap, yerr=[ap - low, high - ap], color=colour, marker=marker, capsize=2, label=label)
-        for label, marker in ((f"{BOXES}, corrected poses", "D"), (f"{WHOLE}, corrected poses", "*")):
+        for label, marker in ((_named(f"{BOXES}, corrected poses"), "D"), (_named(f"{WHOLE}, corrected poses"), "*")):
             if label in rows:
                 x, (ap, low, high) = rows[label]
                 style = {"color": "#d08a1d", "marker": marker, "ms": 9, "capsize": 2}

@@ -155,6 +155,31 @@ def frame_table(found: Mapping[Way, Found]) -> Table:
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
 
+def draw(table: Table, path: Path) -> None:
+    """AP over the bytes that an ego receives, from the table of frames."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    axes = figure.subplots()
+    rows = {str(label): (received_b * 1e-3, ap) for label, received_b, ap, *_ in table.rows}
+    axes.axhline(rows[Way("none").label][1][0], color="#7a7d85", lw=1, ls=":", label="silence")
+    kinds = {"maps": ("features", "o"), "codes of 10 B": ("codes", "^"), "averaged boxes": ("detections", "s")}
+    for kind, (sent, marker) in kinds.items():
+        for boxes, colour in ((False, "#7a7d85"), (True, "#1d6f80")):
+            ways = (w for w in WAYS if (w.sent, w.boxes, w.grids, w.matched) == (sent, boxes, "own", False))
+            chosen = [rows[way.label] for way in ways]
+            if chosen:
+                x, (ap, low, high) = [v[0] for v in chosen], np.array([v[1] for v in chosen]).T
+                label = kind + ", with boxes of fused maps" * boxes
+                axes.errorbar(x, ap, yerr=[ap - low, high - ap], color=colour, marker=marker, capsize=2, label=label)
+    axes.set_xscale("log")
+    axes.set_xlabel("content that an ego receives in a frame from four peers, kB (logarithmic)")
+    axes.set_ylabel("AP@0.5")
+    axes.grid(alpha=0.3)
+    figure.legend(fontsize=8, ncols=3, loc="outside lower center")
+    figure.savefig(path, dpi=110)
+
+
 BUDGET = "policy.params={received_budget: 0.05}"
 BOXES = "perception.maps_bring_boxes=true"
 ARMS: Mapping[str, tuple[str, ...]] = {
@@ -224,6 +249,8 @@ def times() -> Table:
     return Table(columns, rows, f"Medians of {REPEATS}; the maps are encoded already.")  # type: ignore[arg-type]
 
 
-def tables() -> dict[str, Table]:
-    """All of it but the times."""
-    return {"sent_frames": frame_table(frames(SCENES)), "sent_flights": flight_table()}
+def tables(picture: Path) -> dict[str, Table]:
+    """All of it but the times. Args: `picture`, file of the plot."""
+    found = frame_table(frames(SCENES))
+    draw(found, picture)
+    return {"sent_frames": found, "sent_flights": flight_table()}
