@@ -26,6 +26,10 @@ Boxes of **trucks** are teal (found), brown (missed) and orange (false alarm); t
 Pale spheres are the people themselves.
 """
 
+OF_TURNS = """
+Drones take **turns** at detecting, {scored} of {drones} at a time: one that waits shows no boxes.
+"""
+
 EGO = 0
 """Whose detections are shown until another's are switched on."""
 LEGEND_SHARE = 0.3
@@ -205,5 +209,7 @@ def legend(scenario: Scenario) -> rr.TextDocument:
     seen = "" if scenario.perception.detector == "none" else SEEN.format(ego=EGO)
     if seen and len(scenario.perception.classes) > 1:
         seen += OF_CLASSES
+    if seen and scenario.takes_turns:
+        seen += OF_TURNS.format(scored=scenario.scored_drones, drones=len(scenario.scorable_drones))
     told = {"name": scenario.name, "description": " ".join(scenario.description.split()) or "no description."}
     return rr.TextDocument(LEGEND.format(span=SPAN_M, seen=seen, **told).strip(), media_type=rr.MediaType.MARKDOWN)

@@ -339,6 +339,17 @@ def test_the_legend_tells_of_boxes_where_there_are_any() -> None:
         assert ("**Boxes**" in text, "**trucks**" in text) == (boxes_told, classes_told), overrides
 
 
+def test_the_legend_tells_of_turns_where_drones_take_them() -> None:
+    for overrides, turns in (
+        (("perception={detector: surrogate, egos: 2}",), "2 of 5 at a time"),
+        (("perception={detector: surrogate, egos: 5}",), None),
+        (("perception={detector: none, egos: 2}",), None),
+    ):
+        (text,) = told(layout.legend(example(*overrides)).text)
+        assert ("turns" in text) == (turns is not None)
+        assert turns is None or turns in text
+
+
 def test_labels_of_a_comparison_have_roots_plots_and_names_of_their_own() -> None:
     labels = ["best-2(k=1)", "best-2(k:1)", "worked"]
     assert roots(labels) == ["best-2_k_1", "best-2_k_1_1", "worked"]
