@@ -30,8 +30,8 @@ CountBoxes = Callable[[Disc | None], int]
 """Counts the boxes that the drone's own detector reports in a region; None is everywhere."""
 TracksIn = Callable[[Disc | None], Tracks | None]
 """What the drone's own tracker sends of a region; None where it has no tracker."""
-FoundLast = Callable[[], Found | None]
-"""What the drone found when it last fused; None where it did not, or does not send it."""
+FoundLast = Callable[[Disc | None], Found | None]
+"""What the drone found in a region when it last fused; None where it did not, or too long ago."""
 PeopleIn = Callable[[Disc | None], Boxes]
 """The people that the drone's thermal camera found in a region."""
 
@@ -92,13 +92,15 @@ def make_payload(
             always are one sample.
         tracks_in: gives the tracks of a region that the drone sends; without a tracker, boxes are counted in their place.
         people_in: gives the people of a region; None without a thermal camera.
-        found_last: gives what goes with a map or codes: a header of its own, and boxes.
+        found_last: gives what goes with a map that is one sample, or with codes: a header of its own, and boxes; None sends
+            maps alone.
         classes: whether each detection names its class.
         code_bytes: of a cell that is sent as a code.
     """
     rung, rho, roi, weight = directive.representation, directive.rho, directive.roi, directive.fusion_weight
     cells = boxes = index_bytes = 0
-    tracks = people = found = None
+    tracks = people = None
+    found: Found | None = None
     if rung == _NONE:
         return None
     if rung in (_FEATURES, _CODES):
@@ -109,7 +111,7 @@ def make_payload(
             t = tiles.cut(cells, tile_limit_bytes)
             return Payload(rung, rho, roi, weight, cells, 0, t.index_bytes, t.size_bytes, t.cells_each, t.tile_bytes)
         index_bytes = budget.index_bytes(cells)
-        found = None if found_last is None else found_last()
+        found = None if found_last is None else found_last(roi)
     elif rung == _TRACKS and tracks_in is not None and (tracks := tracks_in(roi)) is not None:
         boxes = len(tracks)
     elif rung != _RAW:

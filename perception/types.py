@@ -98,9 +98,9 @@ class Found(NamedTuple):
     capture: Capture
     """Its own look, in whose square it fused."""
     number: int
-    """Of boxes."""
+    """How many boxes."""
     boxes: Boxes | None
-    """The boxes, best first; None where no detector flies, and boxes are only counted."""
+    """The boxes themselves, best first; None where no detector flies, and they are only counted."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -135,7 +135,7 @@ class Perception(Section):
     )
     maps_bring_boxes: bool = Field(
         False,
-        description="With each feature map, or codes of one, goes what its sender found when it last fused the maps that it held, as boxes (not the surrogate's).",
+        description="With each feature map, or codes of one, go the boxes that its sender found when it last fused the maps that it held (the torch detector's).",
     )
     match_poses: bool = Field(
         False,
@@ -174,6 +174,20 @@ class Perception(Section):
     def classes(self) -> tuple[str, ...]:
         """The classes of targets that drones look for."""
         return "car", *(["truck"] if self.scene.trucks > 0.0 else []), *(["person"] if self.thermal is not None else [])
+
+    @model_validator(mode="after")
+    def _boxes_come_with_maps_that_are_fused(self) -> Perception:
+        if self.maps_bring_boxes:
+            for name, refused in (
+                ("detector", self.detector not in ("torch", "none")),
+                ("fusion", self.fusion in ("none", "late")),  # which fuse no maps
+                ("motion_compensation", not self.motion_compensation),  # else what a drone finds depends on
+                ("absent_peers", self.absent_peers != "excluded"),  # ... which drones are scored at the moment
+            ):
+                if refused:
+                    shown = str(getattr(self, name)).lower()
+                    raise inconsistent(("maps_bring_boxes",), "true", f"false where {name} is {shown}")
+        return self
 
     @model_validator(mode="after")
     def _recording_where_recorded(self) -> Perception:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Sequence
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,11 @@ INSTANT_S = 1e-9
 
 
 def as_share(received: Received, trust: float = 1.0, age_s: float = 0.0) -> Share:
-    """A received payload in the detector's form, its weight multiplied by the receiver's trust in the sender.
+    """A received payload in the detector's form.
+
+    Args:
+        trust: the receiver's in the sender, 0 … 1; it multiplies the payload's weight.
+        age_s: of the capture, as the receiver knows it.
 
     What its age leaves of it is the detector's to say: it differs between maps and boxes.
     """
@@ -42,7 +47,7 @@ def found_in(received: Received, of_map: Share) -> Share | None:
     if found is None:
         return None
     age_s = of_map.age_s + (received.capture.t_s - found.capture.t_s)
-    return Share(found.capture, "detections", 0.0, None, of_map.weight, age_s=age_s, boxes=found.boxes)
+    return Share(found.capture, "detections", 0.0, of_map.roi, of_map.weight, age_s=age_s, boxes=found.boxes)
 
 
 def of_vehicles(share: Share) -> Share:
@@ -126,7 +131,7 @@ class Fusing:
 class FindingEachFrame:
     """What every drone finds in each frame of its own look and the maps that it holds then.
 
-    Boxes that came are left out, or a drone would send others' boxes on. Nothing is computed before somebody asks.
+    Boxes that came are left out, or a drone would send others' boxes on. The detector runs when somebody first asks.
     """
 
     def __init__(
@@ -134,40 +139,50 @@ class FindingEachFrame:
         env: simpy.Environment,
         scenario: Scenario,
         detector: Detector | None,
-        count_boxes: Callable[[Capture], int],
+        fusing: Fusing,
+        count_boxes: Callable[[Capture, Disc | None], int],
     ) -> None:
-        """Args: `count_boxes` gives the number of boxes where no detector flies."""
-        self._env, self._scenario, self._detector, self._count_boxes = env, scenario, detector, count_boxes
+        """Args: `count_boxes` gives the number of boxes in a region where no detector flies."""
+        self._env, self._scenario, self._detector, self._fusing = env, scenario, detector, fusing
+        self._count_boxes = count_boxes
+        self._limit_s = scenario.perception.max_age_s + INSTANT_S
         self._jobs: list[Job] = []
-        self._found: dict[int, Found] | None = None  # of these jobs
+        self._found: dict[int, tuple[Capture, Boxes | None]] | None = None  # of these jobs
 
-    def start(self, agents: Sequence[Agent], fusing: Fusing) -> None:
+    def start(self, agents: Sequence[Agent]) -> None:
         """Begin the process; call once."""
-        self._env.process(self._run(agents, fusing))
+        self._env.process(self._run(agents))
 
-    def _run(self, agents: Sequence[Agent], fusing: Fusing) -> Generator[simpy.Event, Any, None]:
-        scenario, frame = self._scenario, 0
-        while True:
-            yield self._env.timeout(frame * scenario.frame_s + scenario.perception.fusion_delay_s - self._env.now)
-            self._jobs, self._found = [*self._each(agents, fusing, frame)], None
-            frame += 1
+    def _run(self, agents: Sequence[Agent]) -> Generator[simpy.Event, Any, None]:
+        frame_s, delay_s = self._scenario.frame_s, self._scenario.perception.fusion_delay_s
+        for frame in count():
+            yield self._env.timeout(frame * frame_s + delay_s - self._env.now)
+            self._jobs, self._found = [*self._each(agents, frame)], None
 
-    def _each(self, agents: Sequence[Agent], fusing: Fusing, frame: int) -> Iterator[Job]:
-        now_s = self._env.now
+    def _each(self, agents: Sequence[Agent], frame: int) -> Iterator[Job]:
+        now_s, fusing = self._env.now, self._fusing
         for agent in agents:
             if is_flying(agent, frame, self._scenario.frame_s) and (here := ready(agent)) is not None:
                 job = fusing.job(agent, here, fusing.maps(agent, now_s), now_s)
                 if job is not None and job[0].looked:
                     yield job
 
-    def last(self, drone: int) -> Found | None:
-        """What the drone found last; None before the first time, and where it had no look of its own."""
+    def last(self, drone: int, roi: Disc | None) -> Found | None:
+        """What the drone found last in a region.
+
+        None before it first fused, where it had no look of its own then, and of a look that receivers would find too old.
+        """
         if self._found is None:
             boxes: Sequence[Boxes | None] = [None] * len(self._jobs)
             if self._detector is not None:
                 boxes = self._detector.detect(self._jobs)
-            self._found = {
-                look.drone: Found(look, self._count_boxes(look) if each is None else len(each), each)
-                for (look, _), each in zip(self._jobs, boxes, strict=True)
-            }
-        return self._found.get(drone)
+            self._found = {look.drone: (look, each) for (look, _), each in zip(self._jobs, boxes, strict=True)}
+        if drone not in self._found:
+            return None
+        look, each = self._found[drone]
+        if self._env.now - look.t_s > self._limit_s:
+            return None
+        if each is None:
+            return Found(look, self._count_boxes(look, roi), None)
+        inside = each.inside(roi)
+        return Found(look, len(inside), inside)

@@ -88,7 +88,6 @@ class Scorer:
         planned: where a drone is in a frame, or would be had it not left the air.
         fusing: what a drone fuses.
         people: finds, joins and records people; the detector has vehicles alone.
-        region: a drone's mission region at a time.
         turns: which drones are scored at each scored moment, ascending.
         """
         self._env, self._scenario, self._detector = env, scenario, detector
@@ -148,8 +147,8 @@ class Scorer:
             detections = self._many.detect_many([jobs_of(moment) for moment in waiting])
             truths = self._many.truth_many([t_s for t_s, _ in egos_scored], [ego.here for _, ego in egos_scored])
         else:
-            ready = begun or [partial(detector.detect, jobs_of(moment)) for moment in waiting]
-            detections = (boxes for wait in ready for boxes in wait())
+            computed = begun or [partial(detector.detect, jobs_of(moment)) for moment in waiting]
+            detections = (boxes for wait in computed for boxes in wait())
             truths = (detector.truth(t_s, ego.here) for t_s, ego in egos_scored)
         each = iter(detections)
         for (now_s, ego), truth in zip(egos_scored, truths, strict=True):

@@ -175,6 +175,8 @@ class Parts:
     detector: Detector | None
     scorer: Scorer | None
     """None without a detector."""
+    finding: FindingEachFrame | None
+    """None where maps bring no boxes."""
     audit: Audit
     notes: AgentNotes
     journal: Journal | None
@@ -256,7 +258,7 @@ def build(
     tracking = FleetTracking(scenario, people.with_people(own_boxes))
     fusing, finding = Fusing(scenario, tracking.tracks, plan.region), None
     if scenario.perception.maps_bring_boxes:
-        finding = FindingEachFrame(env, scenario, detector, partial(cars_in_reach, scene, roi=None))
+        finding = FindingEachFrame(env, scenario, detector, fusing, partial(cars_in_reach, scene))
     agents = [
         Agent(
             env,
@@ -281,14 +283,12 @@ def build(
     if detector is not None:
         turns = taking_turns(scenario, seed, replication)
         scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, fusing, people, turns)
-    if finding is not None:
-        finding.start(agents, fusing)
     own_events = OwnEvents(scenario, world, seed, replication)
     schedule(scenario, world, transport, membership, own_events, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(
         scenario, env, recorder, scene, batteries, air, world, transport, membership, own_events, choreography, steering, pilots, agents, detector, scorer,
-        audit, notes, journal,
+        finding, audit, notes, journal,
     )  # fmt: skip
 
 
@@ -317,6 +317,8 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
         agent.start()
     if scorer is not None:
         scorer.start()
+    if parts.finding is not None:
+        parts.finding.start(parts.agents)
     parts.env.run(until=parts.scenario.duration_s)
     world.drain()
     world.write_receptions()

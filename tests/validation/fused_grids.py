@@ -231,8 +231,8 @@ def flight_table() -> Table:
     for arm, each in ap.items():
         its_boxes = "boxes" + ", corrected poses" * arm.endswith("poses")
         others = "silence", its_boxes, arm.replace(", all grids", "")
-        over = [None if other == arm else _interval(np.subtract(each, ap[other]).tolist()) for other in others]
-        rows.append([arm, _interval(each), *over])
+        over = [None if other == arm else interval(np.subtract(each, ap[other]).tolist()) for other in others]
+        rows.append([arm, interval(each), *over])
     columns = [Column("policy"), Column("AP of the full scene", ".3f")]
     columns += [Column(name, "+.1f", factor=100) for name in ("over silence", "over `boxes`, same poses", "gain from all grids")]  # fmt: skip
     about = f"`track_target` for 16 s, scored once a second; towns and seeds {TOWNS[0]} to {TOWNS[-1]}; intervals over flights."
@@ -248,7 +248,7 @@ def _flown(town: int, policy: str, *changes: str) -> float:
 def seen_table() -> Table:
     """The shares of the cars that an ego sees, and that any of the five drones sees, in the same flights."""
     shares = [_seen(town) for town in TOWNS]
-    rows: list[list[object]] = [[who, _interval(each)] for who, each in zip(("the ego", "any of the five"), np.transpose(shares), strict=True)]  # fmt: skip
+    rows: list[list[object]] = [[who, interval(each)] for who, each in zip(("the ego", "any of the five"), np.transpose(shares), strict=True)]  # fmt: skip
     about = "The flights over towns 101 to 108 above, at every scored moment; by line of sight, without any detector; intervals over flights."
     return Table([Column("who sees a car"), Column("share of the cars", ".1f", " %", 100)], rows, about)  # type: ignore[arg-type]
 
@@ -271,7 +271,8 @@ def _seen(town: int) -> tuple[float, float]:
     return float(cars_seen[1] / cars_seen[0]), float(cars_seen[2] / cars_seen[0])
 
 
-def _interval(values: Sequence[float]) -> tuple[float, float, float]:
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """The mean over flights, with its interval."""
     found = mean_interval(values)
     return found.mean, found.low, found.high
 

@@ -69,8 +69,8 @@ ROOMS = {
         ))),
     ),
     "sim": Room(
-        ("sim/results/outcome.py", "sim/results/mission_outcome.py", "sim/results/regions.py", "sim/engine/scoring.py"),
-        ("tests/sim/results", "tests/sim/engine/test_sim_joints.py", "tests/sim/engine/test_sim_scoring_times.py"),
+        ("sim/results/outcome.py", "sim/results/mission_outcome.py", "sim/results/regions.py", "sim/engine/scoring.py", "sim/engine/fusing.py"),
+        ("tests/sim/results", "tests/sim/engine/test_sim_joints.py", "tests/sim/engine/test_sim_scoring_times.py", "tests/sim/engine/test_sim_fusing.py", "tests/sim/engine/test_sim_engine_handover_joints.py"),
     ),
 }  # fmt: skip
 

@@ -33,7 +33,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from fused_grids import SHORT, WEIGHTS, frame
+from fused_grids import SHORT, WEIGHTS, frame, interval
 from stored import Column, Table, points
 
 from sortie.perception import budget
@@ -43,7 +43,7 @@ from sortie.perception.metrics.ap import Matched, average_precision, match
 from sortie.perception.metrics.bootstrap import compare, rank
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.types import Boxes, Capture, Share
-from sortie.scenarios.intervals import mean_interval, percentile_interval, resamples
+from sortie.scenarios.intervals import percentile_interval, resamples
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Perception
 from sortie.sim.engine.sortie import run_sortie
@@ -140,13 +140,11 @@ def frame_table(found: Mapping[Way, Found]) -> Table:
     rows: list[list[object]] = []
     for way, its in found.items():
         ap = average_precision(its.matched), *percentile_interval(rank(its.matched, scene).ap(resamples(egos // 5)))
-        others = Way("detections"), replace(way, boxes=False), Way("features", grids="all")
-        over: list[object] = [
+        others = Way("detections", matched=way.matched), replace(way, boxes=False), Way("features", grids="all")
+        over = [
             points(compare(found[other].matched, its.matched, scene)) if other != way and way.sent != "none" else None
             for other in others
         ]
-        same_poses = Way("detections", matched=way.matched)
-        over[0] = None if way in (Way("none"), same_poses) else points(compare(found[same_poses].matched, its.matched, scene))  # fmt: skip
         rows.append([way.label, float(np.mean(its.received_b)), ap, *over])
     columns = [Column("shared"), Column("an ego receives in a frame", ",.1f", " kB", 1e-3), Column("AP@0.5", ".3f")]
     names = "over averaged boxes, same poses", "gain from the boxes", "over whole maps on all grids"
@@ -181,13 +179,14 @@ def draw(table: Table, path: Path) -> None:
 
 
 BUDGET = "policy.params={received_budget: 0.05}"
+ALL_GRIDS = "all-4, ρ = 0.05, all grids"
 BOXES = "perception.maps_bring_boxes=true"
 ARMS: Mapping[str, tuple[str, ...]] = {
     "silence": ("silence",),
     "boxes": ("boxes",),
     "all-4, ρ = 0.05": ("all-4", BUDGET),
     "all-4, ρ = 0.05, with boxes": ("all-4", BUDGET, BOXES),
-    "all-4, ρ = 0.05, all grids": ("all-4", BUDGET, "perception.fused_grids=all"),
+    ALL_GRIDS: ("all-4", BUDGET, "perception.fused_grids=all"),
     "codes, ρ = 0.05": ("codes", BUDGET),
     "codes, ρ = 0.05, with boxes": ("codes", BUDGET, BOXES),
 }
@@ -199,11 +198,14 @@ def flight_table() -> Table:
     ap = {arm: [each for each, _ in its] for arm, its in flown.items()}
     rows: list[list[object]] = []
     for arm, each in ap.items():
-        others = "silence", "boxes", arm.replace(", with boxes", "")
-        over = [None if other == arm else _interval(np.subtract(each, ap[other]).tolist()) for other in others]
-        rows.append([arm, float(np.mean([mbps for _, mbps in flown[arm]])), _interval(each), *over])
+        others = "silence", "boxes", arm.replace(", with boxes", ""), ALL_GRIDS
+        over = [None if other == arm else interval(np.subtract(each, ap[other]).tolist()) for other in others]
+        rows.append([arm, float(np.mean([mbps for _, mbps in flown[arm]])), interval(each), *over])
     columns = [Column("policy"), Column("the fleet sends", ".2f", " MB/s"), Column("AP of the full scene", ".3f")]
-    columns += [Column(name, "+.1f", factor=100) for name in ("over silence", "over `boxes`", "gain from the boxes")]
+    columns += [
+        Column(name, "+.1f", factor=100)
+        for name in ("over silence", "over `boxes`", "gain from the boxes", "over all grids")
+    ]
     about = f"`track_target` for 16 s, scored once a second; towns and seeds {TOWNS[0]} to {TOWNS[-1]}; intervals over flights."
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
@@ -215,11 +217,6 @@ def _flown(town: int, policy: str, *changes: str) -> tuple[float, float]:
     record = run_sortie(scenario, None, town)
     sent_b = record.tables["transmissions"]["payload_bytes"].to_numpy().sum()
     return float(outcome(record)["ap50"]["full_scene"]), float(sent_b / scenario.duration_s * 1e-6)
-
-
-def _interval(values: Sequence[float]) -> tuple[float, float, float]:
-    found = mean_interval(values)
-    return found.mean, found.low, found.high
 
 
 def times() -> Table:
@@ -250,7 +247,7 @@ def times() -> Table:
 
 
 def tables(picture: Path) -> dict[str, Table]:
-    """All of it but the times. Args: `picture`, file of the plot."""
+    """What is found on still frames. Args: `picture`, file of the plot."""
     found = frame_table(frames(SCENES))
     draw(found, picture)
-    return {"sent_frames": found, "sent_flights": flight_table()}
+    return {"sent_frames": found}

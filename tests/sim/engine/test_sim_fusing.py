@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -16,11 +17,12 @@ from sim_examples import example
 from sortie.fleet.gate import HEADER_BYTES, make_payload
 from sortie.fleet.messages.wire import directive_bytes
 from sortie.perception.types import Boxes, Found, Share
-from sortie.policies.contract import Directive, Representation
+from sortie.policies.contract import Directive, Disc, Representation
 from sortie.scenarios.reading.nodes import ScenarioError
 from sortie.sim.engine.fusing import FindingEachFrame, Fusing, Job
 from sortie.sim.engine.sortie import run_sortie
 
+REGION = Disc(1.0, 2.0, 30.0)
 CONFIG = "perception={max_age_s: 0.5, fusion_delay_s: 0.05}"
 
 
@@ -35,7 +37,7 @@ def test_maps_and_codes_bring_a_header_and_boxes_and_nothing_else_does(rung: Rep
     found = Found(capture(0, 0.3), 7, boxes(7))
     plain, bringing = (
         make_payload(directive, 0.0, 0.0, 0.0, lambda roi: 3, found_last=last, classes=classes)
-        for last in (None, lambda: found)
+        for last in (None, lambda roi: found)
     )
     assert plain is not None
     assert bringing is not None
@@ -44,30 +46,52 @@ def test_maps_and_codes_bring_a_header_and_boxes_and_nothing_else_does(rung: Rep
         assert bringing == plain._replace(
             boxes=7, size_bytes=plain.size_bytes + HEADER_BYTES + 7 * (24 + classes), found=found
         )
-        nothing_yet = make_payload(directive, 0.0, 0.0, 0.0, lambda roi: 3, found_last=lambda: None, classes=classes)
+        nothing_yet = make_payload(
+            directive, 0.0, 0.0, 0.0, lambda roi: 3, found_last=lambda roi: None, classes=classes
+        )
         assert nothing_yet == plain
     else:
         assert bringing == plain
 
 
-def test_tiles_bring_none() -> None:
-    with pytest.raises(
-        ScenarioError, match=r"perception.maps_bring_boxes: true, must be false where radio.framing is tiles"
-    ):
-        example("perception.maps_bring_boxes=true", "radio.framing=tiles")
-    example("radio.framing=tiles")
+def test_a_payload_asks_for_the_boxes_in_its_region() -> None:
+    asked: list[Disc | None] = []
+    for roi in (None, Disc(3.0, 4.0, 8.0)):
+        directive = Directive(0, 1, Representation.CODES, 0.05, roi)
+        make_payload(directive, 0.0, 0.0, 0.0, lambda roi: 3, found_last=lambda roi: asked.append(roi))  # type: ignore[func-returns-value]
+    assert asked == [None, Disc(3.0, 4.0, 8.0)]
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        ("radio.framing=tiles", "radio.framing is tiles"),
+        ("perception.detector=surrogate", "detector is surrogate"),
+        ("perception.fusion=late", "fusion is late"),
+        ("perception.fusion=none", "fusion is none"),
+        ("perception.motion_compensation=false", "motion_compensation is false"),
+        ("perception.absent_peers=zeros", "absent_peers is zeros"),
+    ],
+)
+def test_it_is_refused_where_it_would_mean_nothing(other: str, named: str) -> None:
+    on = "perception={detector: torch, maps_bring_boxes: true}"
+    example(on)
+    with pytest.raises(ScenarioError, match=f"perception.maps_bring_boxes: true, must be false where {named}$"):
+        example(on, other)
 
 
 def test_boxes_that_came_with_a_map_follow_it_and_are_as_old_as_their_look() -> None:
     found = Found(capture(1, 0.7), 2, boxes(2))
-    mind = Mind([(4, 0.9, 0.1, 1.0, {}), (1, 0.9, 0.2, 0.5, {"found": found})])
+    mind = Mind([(4, 0.9, 0.1, 1.0, {}), (1, 0.9, 0.2, 0.5, {"found": found, "roi": REGION})])
     shares = Fusing(example(CONFIG), lambda drone: None, None).shares(agent(0, 1.0, 1.0, mind), 1.0)  # type: ignore[arg-type]
     assert [(s.capture.drone, s.representation, s.weight) for s in shares] == [
         (1, "features", 0.25),
         (1, "detections", 0.25),
         (4, "features", 0.5),
     ]
-    assert shares[1] == Share(found.capture, "detections", 0.0, None, 0.25, age_s=pytest.approx(0.4), boxes=found.boxes)
+    assert shares[1] == Share(
+        found.capture, "detections", 0.0, REGION, 0.25, age_s=pytest.approx(0.4), boxes=found.boxes
+    )
 
 
 @pytest.mark.parametrize(("look_s", "fresh"), [(0.65, True), (0.64, False)])
@@ -99,28 +123,69 @@ def test_a_drone_finds_by_its_own_look_and_maps_alone_once_a_frame_and_only_when
         agent(2, 0.0, None, Mind([(1, 0.0, 0.1, 1.0, {})]), looks=False),
         agent(3, 0.0, None, Mind()),
     ]
-    finding = FindingEachFrame(env, scenario, seer, lambda look: 99)  # type: ignore[arg-type]
-    finding.start(agents, Fusing(scenario, None, None))  # type: ignore[arg-type]
-    assert finding.last(0) is None, "before the first time"
+    finding = FindingEachFrame(env, scenario, seer, Fusing(scenario, None, None), lambda look, roi: 99)  # type: ignore[arg-type]
+    finding.start(agents)
+    assert finding.last(0, None) is None, "before the first time"
     calls = seer.calls
     env.run(until=0.06)
     assert seer.calls == calls
-    first = finding.last(0)
+    first = finding.last(0, None)
     assert first is not None
     assert (first.capture, first.number, len(first.boxes or ())) == (capture(0, 0.0), 3, 3)
     assert [s.representation for s in seer.jobs[0][1]] == ["features", "features"]
     assert seer.jobs.keys() == {0}
     calls = seer.calls
-    assert finding.last(0) is first
-    assert [finding.last(drone) for drone in (1, 2, 3)] == [None] * 3
-    assert seer.calls == calls
+    assert [finding.last(drone, None) for drone in (1, 2, 3)] == [None] * 3
     agents[0].here = agents[0].latest = capture(0, 0.1)
     env.run(until=0.14)
-    assert finding.last(0) is first, "until it fuses again"
+    assert finding.last(0, None) == first, "until it fuses again"
     env.run(until=0.16)
     assert seer.calls == calls
-    assert finding.last(0) is not first
+    assert (finding.last(0, None) or first).capture == capture(0, 0.1)
     assert seer.calls == calls + 1
+    agents[0].status.airborne = False
+    env.run(until=0.26)
+    assert finding.last(0, None) is None, "gone"
+
+
+class Places(Seer):
+    """Three boxes of each look, 0, 10 and 20 m east of the origin."""
+
+    def detect(self, jobs: Sequence[Any]) -> list[Boxes]:
+        return [replace(boxes(3), xy_m=np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]])) for _ in jobs]
+
+
+def _finding(detector: Seer | None, *agents: Any) -> tuple[simpy.Environment, FindingEachFrame]:
+    env, scenario = simpy.Environment(), example(CONFIG)
+    counted = lambda look, roi: 7 if roi is None else 2  # noqa: E731
+    finding = FindingEachFrame(env, scenario, detector, Fusing(scenario, None, None), counted)  # type: ignore[arg-type]
+    finding.start(agents)
+    return env, finding
+
+
+def test_boxes_outside_the_region_stay_behind() -> None:
+    disc = Disc(10.0, 0.0, 10.5)
+    for detector, numbers in ((Places(), (3, 3, 1)), (None, (7, 2, 2))):
+        env, finding = _finding(detector, agent(0, 0.0, 0.0, Mind()))
+        env.run(until=0.06)
+        found = [finding.last(0, roi) for roi in (None, disc, disc._replace(radius_m=9.5))]
+        assert tuple(f.number for f in found if f is not None) == numbers
+        for each in found:
+            assert each is not None
+            assert (None if each.boxes is None else len(each.boxes)) == (None if detector is None else each.number)
+
+
+def test_boxes_of_a_look_that_receivers_find_too_old_are_not_sent() -> None:
+    """The drone looks once and no more."""
+    drone = agent(0, 0.0, 0.0, Mind())
+    env, finding = _finding(Places(), drone)
+    for k in range(1, 5):
+        env.run(until=0.1 * k)
+        drone.here = capture(0, 0.1 * k)
+    env.run(until=0.5)
+    assert finding.last(0, None) is not None
+    env.run(until=0.52)
+    assert finding.last(0, None) is None
 
 
 SENDING = ("policy.name=all-4", "policy.params={received_budget: 0.05}", "fleet.drones=3", "duration_s=2")
