@@ -494,12 +494,6 @@ def _sent_boxes() -> Tables:
     return sent_boxes.tables(ROOT / "docs/results/sent_boxes.png")
 
 
-def _sent_times() -> Tables:
-    import sent_boxes
-
-    return {"sent_times": sent_boxes.times()}
-
-
 def _grid_times() -> Tables:
     import fused_grids
 
@@ -804,10 +798,9 @@ FIGURES: dict[str, Figure] = {
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
     "grid_times": Figure(1, _grid_times, timed=True),
-    "sent_times": Figure(1, _sent_times, timed=True),
     "fine_network": Figure(7, _fine_network),
     "fused_grids": Figure(50, _fused_grids),
-    "sent_boxes": Figure(60, _sent_boxes),
+    "sent_boxes": Figure(20, _sent_boxes),
     "trucks": Figure(1, _trucks),
     "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),
