@@ -6,6 +6,8 @@ STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
 COMPILED := .venv-compiled
+# compiled files are kept: otherwise each of hundreds of processes compiles what it imports, and each worker all tests
+export PYTHONDONTWRITEBYTECODE :=
 SOURCES := $(shell find -L sortie -type f -not -path "*/__pycache__/*")
 
 

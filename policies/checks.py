@@ -171,22 +171,25 @@ def find_wrong_type(d: object) -> str | None:
     """The first field of a directive that is of a wrong type, as an error text; None if all types are right."""
     if type(d) is not Directive:
         return f"a policy returns Directive, got {type(d).__name__}"
-    where = _where(d)
+    wrong = _wrong_field(d)
+    return None if wrong is None else f"{_where(d)}: {wrong}"
+
+
+def _wrong_field(d: Directive) -> str | None:
     for name in ("source", "destination"):
         if not _is_honest(getattr(d, name)) or not _is_id(getattr(d, name)):
-            return f"{where}: {name} is {_told(getattr(d, name))}, must be a drone's id, a whole number"
+            return f"{name} is {_told(getattr(d, name))}, must be a drone's id, a whole number"
     for name, (high, kind) in DIRECTIVE_BOUNDS.items():
         value = getattr(d, name)
         if not _is_honest(value) or not _compares(value, 0.0, high) or (kind != "a number" and not _is_whole(value)):
             bounds = "" if name == "representation" else f"in [0, {high:g}], "
-            return f"{where}: {name} is {_told(value)}, must be {bounds}{kind}"
+            return f"{name} is {_told(value)}, must be {bounds}{kind}"
     if not (d.roi is None or type(d.roi) is Disc):
-        return f"{where}: roi is {text_of(d.roi)}, must be a Disc or None"
+        return f"roi is {text_of(d.roi)}, must be a Disc or None"
     for name, value in () if d.roi is None else d.roi._asdict().items():
         if not _is_honest(value) or not _compares(value, -_FAR_M, _FAR_M):
-            return f"{where}: roi.{name} is {_told(value)}, must be a number"
-    fault = _reason_fault(d.reason)
-    return f"{where}: {fault}" if fault else None
+            return f"roi.{name} is {_told(value)}, must be a number"
+    return _reason_fault(d.reason)
 
 
 def _find_fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
@@ -194,22 +197,26 @@ def _find_fault(d: Directive, view: FleetView, seen: set[int]) -> str | None:
     wrong = find_wrong_type(d)
     if wrong is not None:
         return wrong
-    where = _where(d)
+    wrong = _wrong_value(d, view, seen)
+    return None if wrong is None else f"{_where(d)}: {wrong}"
+
+
+def _wrong_value(d: Directive, view: FleetView, seen: set[int]) -> str | None:
     if d.source != view.ego:
-        return f"{where}: source is {d.source}, must be the ego {view.ego}"
+        return f"source is {d.source}, must be the ego {view.ego}"
     if d.destination == view.ego or d.destination not in view.descriptors:
-        return f"{where}: destination {d.destination} is not a peer in the view {list(view.peers)}"
+        return f"destination {d.destination} is not a peer in the view {list(view.peers)}"
     for name, bound in DIRECTIVE_BOUNDS.items():
         wrong = bound.breaks(name, getattr(d, name))
         if wrong is not None:
-            return f"{where}: {wrong}"
+            return wrong
     if d.roi is not None:
         if not d.roi.radius_m > 0:
-            return f"{where}: roi.radius_m is {d.roi.radius_m!r}, must be > 0"
+            return f"roi.radius_m is {d.roi.radius_m!r}, must be > 0"
         for name, value in d.roi._asdict().items():
             if not -_FAR_M <= value <= _FAR_M:
-                return f"{where}: roi.{name} is {value!r}, must be finite in 32 bits"
-    return f"{where}: second directive for the same link" if d.destination in seen else None
+                return f"roi.{name} is {value!r}, must be finite in 32 bits"
+    return "second directive for the same link" if d.destination in seen else None
 
 
 def _where(d: Directive) -> str:

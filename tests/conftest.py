@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+import os
 import signal
 
 import pytest
+import typer.main
+import typer.testing
 from hypothesis import settings
+
+# torch's threads wait in a busy loop by themselves, which takes the cores from other workers; read when torch is loaded
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+# typer reads all commands of the app anew at each call in this process, which takes longer than most of the calls
+typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # begun in the background: children would ignore Ctrl-C as well
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -37,10 +37,10 @@ class Drawn:
         self._own = len(own)
         views = [
             *(draw_view(seed, number) for number in range(count)),
-            *(draw_view(seed, count + number, LISTED_IDS) for number in range(TRIED_LISTED if count else 0)),
+            *(_large(seed, count + number, LISTED_IDS) for number in range(TRIED_LISTED if count else 0)),
             *own,
             *(
-                _largest(seed, count + TRIED_LISTED + k, heard)
+                _large(seed, count + TRIED_LISTED + k, LARGEST, heard)
                 for k, heard in enumerate(TRIED_LARGEST if count else ())
             ),
         ]
@@ -129,7 +129,7 @@ def _judged(prop: Property, policy: Policy, view: RepeatableView) -> str | None:
         raise Stopped(f"; a view of {drones:,} drones takes more than {LARGE_S:g} s") from None
 
 
-@lru_cache(maxsize=len(TRIED_LARGEST))
-def _largest(seed: int, number: int, heard: float) -> FleetView:
-    """A view of the largest fleet, frozen: each policy is tried on the same one."""
-    return draw_view(seed, number, LARGEST, heard).frozen
+@lru_cache(maxsize=TRIED_LISTED + len(TRIED_LARGEST))
+def _large(seed: int, number: int, drones: int, heard: float | None = None) -> FleetView:
+    """A view of a large fleet, frozen: each policy is tried on the same ones."""
+    return draw_view(seed, number, drones, heard).frozen

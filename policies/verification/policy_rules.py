@@ -176,7 +176,10 @@ def age_monotone(policy: Policy, view: FleetView) -> str | None:
     """
     before = decide(policy, view)
     for who, add_s, older in older_views(view):
-        raised = raised_part(before, decide(policy, older), decide(policy, without_detached(view, older)))
+        after = decide(policy, older)
+        if raised_part(before, after) is None:  # mostly, and then a third decision changes nothing
+            continue
+        raised = raised_part(before, after, decide(policy, without_detached(view, older)))
         if raised is not None:
             return f"drone {', '.join(map(str, who))} {add_s:g} s older: {raised}"
     return None

@@ -362,16 +362,14 @@ def test_the_real_command_gives_no_traceback(scenario: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
 
 
-def test_a_users_policy_flies_from_a_file(scenario: Path, tmp_path: Path) -> None:
+def test_a_users_policy_flies_from_a_file(scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(
         "from sortie.policies.contract import Directive, Representation\n"
         "def decide(view, *, rate=5.0):\n"
         "    return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=rate, reason='mine') for p in view.peers]\n"
     )
-    done = sortie(
-        "fly", scenario, "--policy", "mine.py:decide(rate=2.0)", "--no-recording", "--out", "run", cwd=tmp_path
-    )
-    assert done.returncode == 0, done.stderr
+    assert command("fly", scenario, "--policy", "mine.py:decide(rate=2.0)", "--no-recording", "--out", "run") == 0
     rows = pq.read_table(tmp_path / "run" / "directives.parquet").to_pylist()
     assert {(r["representation"], r["rate_hz"], r["reason"]) for r in rows} == {("detections", 2.0, "mine")}
 
@@ -417,13 +415,13 @@ def test_what_fails_in_any_of_several_scenarios_fails_the_check(order: str, tmp_
     assert (done.exit_code, done.stderr) == ((1, f"{2 * bad} expectations failed\n") if bad else (0, ""))
 
 
-def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: Path, tmp_path: Path) -> None:
+def test_compare_puts_policies_side_by_side_and_says_why_they_differ(
+    scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "README.md").write_text("# Mine\n\n<!-- compare:begin -->old<!-- compare:end -->\n\nSee below.\n")
-    done = sortie(
-        "compare", scenario, "--policies", "worked,all-4(received_budget=0.1),silence", "--out", "c.json", "--readme", "README.md",
-        cwd=tmp_path,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    policies = ("--policies", "worked,all-4(received_budget=0.1),silence")
+    assert command("compare", scenario, *policies, "--out", "c.json", "--readme", "README.md") == 0
     readme = (tmp_path / "README.md").read_text()
     assert readme.startswith("# Mine\n\n<!-- compare:begin -->\n")
     assert readme.endswith("<!-- compare:end -->\n\nSee below.\n")
@@ -431,7 +429,7 @@ def test_compare_puts_policies_side_by_side_and_says_why_they_differ(scenario: P
     assert "- **silence**: sent nothing" in readme
     assert "accuracy" not in readme  # no detector flew
     assert "old" not in readme
-    assert "sent nothing; every drone saw with its own eyes only" in done.stdout
+    assert "sent nothing; every drone saw with its own eyes only" in " ".join(capsys.readouterr().out.split())
     kept = json.loads((tmp_path / "c.json").read_text())
     assert kept["gains"] == []  # no detector flew
     sent = {sortie["policy"]: sortie["outcome"]["bytes"]["data_sent"] for sortie in kept["sorties"]}
@@ -502,13 +500,10 @@ def test_another_policy_flies_to_the_end_and_says_so(scenario: Path, tmp_path: P
     assert run_folder.load(tmp_path / "run").totals["policy_changes"] == 5
 
 
-def test_weights_that_are_not_there_are_one_line(tmp_path: Path) -> None:
+def test_weights_that_are_not_there_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     missing = tmp_path / "none.safetensors"
-    done = sortie(
-        "fly", "track_target", "--set", f"perception.weights={missing}", "--set", "duration_s=1", cwd=tmp_path
-    )
-    assert done.returncode == 2
-    assert done.stderr.strip() == f"error: {missing}: no such weights file; `sortie train` makes one"
+    asked = ("fly", "track_target", "--set", f"perception.weights={missing}", "--set", "duration_s=1")
+    assert refusal(tmp_path, asked, capsys) == f"error: {missing}: no such weights file; `sortie train` makes one\n"
 
 
 @pytest.mark.parametrize(
@@ -522,7 +517,8 @@ def test_weights_that_are_not_there_are_one_line(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_the_surrogate_cannot_do_is_one_line(field: str, value: str, told: str, tmp_path: Path) -> None:
+def test_what_the_surrogate_cannot_do_is_one_line(
+    field: str, value: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     asked = ("--set", "perception.detector=surrogate", "--set", f"perception.{field}={value}", "--set", "duration_s=1")
-    done = sortie("fly", "track_target", *asked, cwd=tmp_path)
-    assert (done.returncode, done.stderr.strip()) == (2, f"error: {told}")
+    assert refusal(tmp_path, ("fly", "track_target", *asked), capsys) == f"error: {told}\n"

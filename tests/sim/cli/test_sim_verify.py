@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from cli_examples import command
 from sortie.policies.contract import TaskPhase
 from sortie.policies.registry import resolve
 from sortie.policies.verification.policy_rules import RULES
+from sortie.policies.verification.proof import prove
 from sortie.policies.verification.subject import own_invariants
 from sortie.policies.verification.views import draw_views, from_json, to_json
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
@@ -41,6 +43,12 @@ def forgetful(view):
 QUICK = ("--views", 10, "--drones", 2)
 
 
+@pytest.fixture(autouse=True)
+def _few_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command tries a policy on a thousand drawn views; most of these tests ask what it makes of the verdicts."""
+    monkeypatch.setattr("sortie.sim.cli.verify.prove", functools.partial(prove, views=50))
+
+
 @pytest.fixture
 def faulty(tmp_path: Path) -> Path:
     path = tmp_path / "faulty.py"
@@ -70,7 +78,10 @@ def test_counterexamples_replace_counterexamples_and_nothing_else(
     assert mine.read_text() == "[]"
 
 
-def test_the_worked_policy_passes_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_worked_policy_passes_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()  # on all views
     assert command("verify", "worked(rho=0.25)", *QUICK, "--out", tmp_path) == 0
     printed = capsys.readouterr().out
     assert "when battery < 0.6: rate_hz <= 5" in printed

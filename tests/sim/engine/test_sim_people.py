@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -143,12 +144,14 @@ SCORED = ("perception.detector=surrogate", "events=[]", "policy.shield=false", "
 APART = "fleet.formation.spacing_m=45"
 
 
+@functools.cache
 def shared(policy: object, *overrides: str) -> SortieRecord:
-    """With places that are true, so that what is missed was not seen."""
+    """With places that are true, so that what is missed was not seen. Several tests compare with the same sortie."""
     sure = "perception.thermal={position_error_m: 0.1, false_alarms_per_min: 0}"
     return run_sortie(load("person_crossing", [*SCORED, APART, sure, *overrides]), policy)  # type: ignore[arg-type]
 
 
+@functools.cache
 def sends(rung: Representation, rate_hz: float = 10.0, weight: float = 1.0) -> Policy:
     def decide(view: FleetView) -> list[Directive]:
         return [
