@@ -231,7 +231,7 @@ def times() -> Table:
     found = forward_ms()
     rows = [[name, ms, ms / found["coarse"], flight_speed(NETWORKS[name])] for name, ms in found.items()]
     columns = [Column("network"), Column("one ego and four maps", ".1f", " ms"), Column("times the coarse one", ".2f")]
-    columns.append(Column("a flight, times real time", ".1f"))
+    columns.append(Column("speed of a flight, simulated seconds a second", ".1f"))
     return Table(
         columns,
         rows,

@@ -148,8 +148,9 @@ def frame_table(found: Mapping[Way, Found]) -> Table:
         others = Way("detections", matched=way.matched), replace(way, boxes=False), Way("features", grids="all")
         over = [
             points(compare(found[other].matched, its.matched, scene)) if other != way and way.sent != "none" else None
-            for other in others
+            for other in others[: 2 if way.matched else 3]
         ]
+        over += [None] * (3 - len(over))
         rows.append([way.label, float(np.mean(its.received_b)), ap, *over])
     columns = [Column("shared"), Column("an ego receives in a frame", ",.1f", " kB", 1e-3), Column("AP@0.5", ".3f")]
     names = "over averaged boxes, same poses", "gain from the boxes", "over whole maps on all grids"
