@@ -494,6 +494,12 @@ def _sent_boxes() -> Tables:
     return sent_boxes.tables(ROOT / "docs/results/sent_boxes.png")
 
 
+def _sent_own_look() -> Tables:
+    import sent_boxes
+
+    return {"sent_own_look": sent_boxes.own_look_table()}
+
+
 def _grid_times() -> Tables:
     import fused_grids
 
@@ -801,6 +807,7 @@ FIGURES: dict[str, Figure] = {
     "fine_network": Figure(7, _fine_network),
     "fused_grids": Figure(50, _fused_grids),
     "sent_boxes": Figure(20, _sent_boxes),
+    "sent_own_look": Figure(10, _sent_own_look),
     "trucks": Figure(1, _trucks),
     "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),
