@@ -494,6 +494,12 @@ def _sent_boxes() -> Tables:
     return sent_boxes.tables(ROOT / "docs/results/sent_boxes.png")
 
 
+def _sent_flights() -> Tables:
+    import sent_boxes
+
+    return {"sent_flights": sent_boxes.flight_table()}
+
+
 def _sent_own_look() -> Tables:
     import sent_boxes
 
@@ -808,6 +814,7 @@ FIGURES: dict[str, Figure] = {
     "fused_grids": Figure(50, _fused_grids),
     "sent_boxes": Figure(20, _sent_boxes),
     "sent_own_look": Figure(10, _sent_own_look),
+    "sent_flights": Figure(30, _sent_flights),
     "trucks": Figure(1, _trucks),
     "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),
