@@ -92,8 +92,10 @@ def test_a_drone_that_hears_nobody_keeps_its_pose() -> None:
     ],
 )
 def test_the_surrogate_and_recordings_refuse_it(option: str, value: object, shown: str, usual: str) -> None:
+    """Also where a configuration was changed after it was read, as comparisons by several detectors do."""
     scene, on = SceneModel(Scene(), None, (-50, -50, 50, 50)), {option: value}
+    recorded = Perception.model_validate({"detector": "recorded", "recording": "seen.npz"})
     with pytest.raises(InputError, match=rf"perception.{option} is {shown}: .* calibrated without it, must be {usual}"):
-        SurrogateDetector(scene, Perception.model_validate({"detector": "surrogate", **on}), 1)
+        SurrogateDetector(scene, Perception(detector="surrogate").model_copy(update=on), 1)
     with pytest.raises(InputError, match=rf"perception\.{option} is {shown}, must be {usual} for a recording"):
-        RecordedDetector(Perception.model_validate({"detector": "recorded", "recording": "seen.npz", **on}))
+        RecordedDetector(recorded.model_copy(update=on))
