@@ -506,6 +506,12 @@ def _sent_own_look() -> Tables:
     return {"sent_own_look": sent_boxes.own_look_table()}
 
 
+def _sent_times() -> Tables:
+    import sent_boxes
+
+    return {"sent_times": sent_boxes.times()}
+
+
 def _grid_times() -> Tables:
     import fused_grids
 
@@ -810,6 +816,7 @@ FIGURES: dict[str, Figure] = {
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
     "grid_times": Figure(1, _grid_times, timed=True),
+    "sent_times": Figure(1, _sent_times, timed=True),
     "fine_network": Figure(7, _fine_network),
     "fused_grids": Figure(50, _fused_grids),
     "sent_boxes": Figure(20, _sent_boxes),
