@@ -494,7 +494,7 @@ class Agent:
             if what not in made:
                 payload = make_payload(
                     directive, *pose, count_boxes, rules.tile_limit_bytes, tracks_in, people_in, self._found_last,
-                    classes=rules.classes, code_bytes=rules.code_bytes,
+                    classes=rules.classes, code_bytes=rules.code_bytes, bring_look=rules.maps_bring_looks,
                 )  # fmt: skip
                 if payload is not None and (self.status.feature_space or self.status.codebook):
                     payload = payload._replace(

@@ -84,6 +84,7 @@ def make_payload(
     *,
     classes: bool = False,
     code_bytes: int = budget.CODE_BYTES,
+    bring_look: bool = False,
 ) -> Payload | None:
     """The payload that a directive allows for a capture at this estimated pose; None where nothing is to be sent.
 
@@ -96,6 +97,7 @@ def make_payload(
             maps alone.
         classes: whether each detection names its class.
         code_bytes: of a cell that is sent as a code.
+        bring_look: whether the boxes of this capture go with a map that is one sample, or with codes.
     """
     rung, rho, roi, weight = directive.representation, directive.rho, directive.roi, directive.fusion_weight
     cells = boxes = index_bytes = 0
@@ -111,6 +113,7 @@ def make_payload(
             t = tiles.cut(cells, tile_limit_bytes)
             return Payload(rung, rho, roi, weight, cells, 0, t.index_bytes, t.size_bytes, t.cells_each, t.tile_bytes)
         index_bytes = budget.index_bytes(cells)
+        boxes = count_boxes(roi) if bring_look else 0
         found = None if found_last is None else found_last(roi)
     elif rung == _TRACKS and tracks_in is not None and (tracks := tracks_in(roi)) is not None:
         boxes = len(tracks)
@@ -121,9 +124,11 @@ def make_payload(
     size_bytes = HEADER_BYTES + directive_bytes(directive) + budget.content_bytes(
         NAME_OF[rung], cells=cells, boxes=boxes, classes=classes, code_bytes=code_bytes
     )  # fmt: skip
+    if cells:
+        size_bytes += budget.content_bytes("detections", boxes=boxes, classes=classes)
     if found is not None:
-        boxes = found.number
-        size_bytes += HEADER_BYTES + budget.content_bytes("detections", boxes=boxes, classes=classes)
+        boxes += found.number
+        size_bytes += HEADER_BYTES + budget.content_bytes("detections", boxes=found.number, classes=classes)
     return Payload(
         rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes, tracks=tracks, people=people,
         code_bytes=code_bytes if rung == _CODES else 0, found=found,

@@ -72,6 +72,8 @@ class PlaneRules:
     """Frames from one descriptor to the next. Staleness counts in periods of that length."""
     form: Form = FULL
     """The resolution of descriptors on the wire."""
+    maps_bring_looks: bool = False
+    """Whether the boxes of a drone's own look go with its maps, by which receivers correct poses."""
     code_bytes: int = CODE_BYTES
     """Of a cell that is sent as a code."""
     roster: bool = False

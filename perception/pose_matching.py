@@ -6,7 +6,6 @@ An object pose graph, as CoAlign has it (Lu et al., ICRA 2023), in two dimension
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,20 +46,19 @@ def matched_poses(poses: ArrayLike, places_m: Sequence[NDArray[np.floating]]) ->
     """
     believed = np.asarray(poses, np.float64)
     n = len(believed)
+    of = np.repeat(np.arange(n), [len(places) for places in places_m])
+    at_m = np.concatenate([np.empty((0, 2)), *places_m])
+    i, j = _of_one_car(at_m, of, n)
+    slope = _slopes(at_m, believed[of])
+    seen = np.zeros((len(i), 2, n, 3))
+    pair = np.arange(len(i))
+    seen[pair, :, of[i]], seen[pair, :, of[j]] = slope[i], -slope[j]
+    by_error, apart_m = seen.reshape(-1, 3 * n), (at_m[i] - at_m[j]).ravel()
     prior = np.tile([POSITION_SIGMA_M**-2, POSITION_SIGMA_M**-2, HEADING_SIGMA_RAD**-2], n)
-    information, seen = np.diag(prior), np.zeros(3 * n)
-    trees = [KDTree(places) for places in places_m]
     # squares of the differences of n places, over n, are those of their distances from the mean
     weight = 1.0 / (n * BOX_SIGMA_M**2)
-    for a, b in combinations(range(n), 2):
-        at_a, at_b = _pairs(trees[a], trees[b])
-        if not len(at_a):
-            continue
-        slope = np.concatenate([_slope(at_a, believed[a]), -_slope(at_b, believed[b])], axis=2).reshape(-1, 6)
-        of = np.r_[3 * a : 3 * a + 3, 3 * b : 3 * b + 3]
-        information[np.ix_(of, of)] += weight * slope.T @ slope
-        seen[of] += weight * slope.T @ (at_a - at_b).ravel()
-    return np.asarray(believed - np.linalg.solve(information, seen).reshape(n, 3))
+    errors = np.linalg.solve(np.diag(prior) + weight * by_error.T @ by_error, weight * by_error.T @ apart_m)
+    return np.asarray(believed - errors.reshape(n, 3))
 
 
 def sure(boxes: Boxes) -> Boxes:
@@ -68,18 +66,20 @@ def sure(boxes: Boxes) -> Boxes:
     return boxes.take((boxes.score >= MIN_SCORE) & (boxes.kind != PERSON))
 
 
-def _pairs(a: KDTree, b: KDTree) -> tuple[Floats, Floats]:
-    """The places of two drones that are each other's nearest, [k, 2] each."""
-    if not a.n or not b.n:
-        return np.empty((0, 2)), np.empty((0, 2))
-    away_m, nearest = b.query(a.data)
-    back = a.query(b.data)[1]
-    of_one = (away_m < GATE_M) & (back[nearest] == np.arange(a.n))
-    return a.data[of_one], b.data[nearest[of_one]]
+def _of_one_car(at_m: Floats, of: NDArray[np.intp], n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pairs (i, j) of places [m, 2] that are taken to be of one car; `of` tells each one's drone, of n."""
+    near = KDTree(at_m).query_pairs(GATE_M, output_type="ndarray")
+    i, j = near[of[near[:, 0]] != of[near[:, 1]]].T
+    away_m = np.linalg.norm(at_m[i] - at_m[j], axis=1)
+    nearest_m = np.full((len(of), n), np.inf)  # of each drone's, to each place
+    np.minimum.at(nearest_m, (i, of[j]), away_m)
+    np.minimum.at(nearest_m, (j, of[i]), away_m)
+    nearest = (away_m == nearest_m[i, of[j]]) & (away_m == nearest_m[j, of[i]])
+    return i[nearest], j[nearest]
 
 
-def _slope(places_m: Floats, pose: Floats) -> Floats:
-    """[k, 2, 3]: how places move with the error of the pose that placed them."""
-    x, y = (places_m - pose[:2]).T
+def _slopes(at_m: Floats, poses: Floats) -> Floats:
+    """[m, 2, 3]: how places [m, 2] move with the errors of the poses [m, 3] that placed them."""
+    x, y = (at_m - poses[:, :2]).T
     one, none = np.ones_like(x), np.zeros_like(x)
     return np.stack([np.stack([one, none, -y], axis=1), np.stack([none, one, x], axis=1)], axis=1)

@@ -163,8 +163,8 @@ class TorchDetector:
         seen = [c for ego, shares in jobs for c in (ego, *(s.capture for s in shares if s.is_map or s.is_detected))]
         known = self._encode([c for c in seen if c.looked])
         shared = [s for _, shares in jobs for s in shares if s.weight > 0.0]
-        look = {s.capture for s in shared if s.is_detected}
         match = self._config.match_poses
+        look = {s.capture for s in shared if s.is_detected or (match and self._is_fused(s))}
         alone = [e for e, shares in jobs if match or not any(self._is_fused(s) and s.weight > 0.0 for s in shares)]
         look |= {ego for ego in alone if ego.looked}
         for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
@@ -176,7 +176,7 @@ class TorchDetector:
             if share.representation == "codes":
                 self._read_codes(share, known)
         for share in shared:
-            if share.is_map and (self._shares == "boxes" or match):
+            if share.is_map and self._shares == "boxes":
                 self._head_in_part(share, known)
         now = {ego.drone: ego for ego, _ in jobs}
         # a copy: later requests queue behind these tasks, and no task may wait for them
@@ -249,7 +249,7 @@ class TorchDetector:
         def spread() -> Tensor:
             with self._autocast():
                 maps: Tensor = self._net.spread(features.result()[None])[0]
-            return maps.float()
+            return maps.float().permute(1, 2, 0).contiguous().permute(2, 0, 1)  # as they are read: cell by cell
 
         return self._task(spread)
 
@@ -337,13 +337,20 @@ class TorchDetector:
     def _matched(
         self, ego: Capture, maps: Sequence[Share], places: Sequence[Pose], late: Sequence[SourceBoxes], known: Known
     ) -> tuple[Pose, list[Pose], list[SourceBoxes]]:
-        """The poses of an ego and of the maps that came, and the boxes that came, where all fit together."""
+        """The poses of an ego and of the maps that came, and the boxes that came, where all fit together.
+
+        With a map came the boxes of the same look (`PlaneRules.maps_bring_looks`); of pictures the receiver finds them.
+        """
+
+        def look(capture: Capture) -> Boxes:
+            alone = known[capture].boxes if capture.looked else None
+            return Boxes.empty() if alone is None else alone.result()
+
         seen = [
-            self._place(known[s.capture].in_part[_part(s)].result(), at) for s, at in zip(maps, places, strict=True)
+            look(s.capture).inside(_part(s)[1]).moved(s.capture.est_pose, at)
+            for s, at in zip(maps, places, strict=True)
         ]
-        seen += [boxes_at_fusion(source) for source in late]
-        own = known[ego].boxes if ego.looked else None
-        seen.append(Boxes.empty() if own is None else own.result())
+        seen += [*map(boxes_at_fusion, late), look(ego)]
         believed = [*places, *(source.pose for source in late), ego.est_pose]
         fitted: list[Pose] = [
             tuple(row) for row in matched_poses(believed, [sure(boxes).xy_m for boxes in seen]).tolist()

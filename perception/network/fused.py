@@ -57,37 +57,50 @@ def fused_map(net: CarNet, pose: Pose, own: Tensor | None, peers: Sequence[Peer]
     offset = under.offset.flatten(1, 2)
     taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), offset, under.turn[:, None], strict=True))
 
-    def said(at: Tensor) -> list[Tensor]:
-        """What each peer says in those cells; one peer after another, so that it stays in the cache."""
-        out = []
-        for table, cells, shares, lies, turn in taps:
+    def said(at: Tensor, out: Tensor) -> Tensor:
+        """What each peer says in those cells, into `out` [k, p, c]; one peer after another, so that it stays in the cache."""
+        for (table, cells, shares, lies, turn), into in zip(taps, out, strict=True):
             moved = rows(table, cells.index_select(0, at), shares.index_select(0, at))
-            out.append(net.aligned(moved[None], lies.index_select(0, at)[None], turn)[0])
+            net.aligned(moved[None], lies.index_select(0, at)[None], turn, into[None])
         return out
 
     if own is None:
         return _without_own(net, said, part[0, 1:], arrived, weight[0])
-    whole = [each if p.whole is None else p.whole for p, each in zip(peers, theirs, strict=True)]
-    weight = net.fusion.weigh(own[None], torch.stack(whole)[None], weight)
-    return net.fusion.fuse(own, said, part[0], F.pad(weight[0], (1, 0), value=1.0))
+    if net.fusion.weighs:
+        whole = [each if p.whole is None else p.whole for p, each in zip(peers, theirs, strict=True)]
+        weight = net.fusion.weigh(own[None], torch.stack(whole)[None], weight)
+    return _with_ego(net, own, said, part[0], weight[0])
 
 
-def _without_own(
-    net: CarNet, said: Callable[[Tensor], list[Tensor]], part: Tensor, arrived: Tensor, weight: Tensor
-) -> Tensor:
+Said = Callable[[Tensor, Tensor], Tensor]
+
+
+def _with_ego(net: CarNet, own: Tensor, said: Said, part: Tensor, weight: Tensor) -> Tensor:
+    """An ego's map [c, h, w] and what its k peers say; `part` [1 + k, h, w] and `weight` [k] as for `Fusion.fuse`."""
+    table = own.permute(1, 2, 0).reshape(-1, len(own))
+
+    def agents(at: Tensor) -> Tensor:
+        out = torch.empty(len(part), len(at), len(own))
+        torch.index_select(table, 0, at, out=out[0])
+        said(at, out[1:])
+        return out
+
+    return net.fusion.fuse(own, agents, part, F.pad(weight, (1, 0), value=1.0))
+
+
+def _without_own(net: CarNet, said: Said, part: Tensor, arrived: Tensor, weight: Tensor) -> Tensor:
     """Peers alone: in each cell the one that counts most takes the ego's place.
 
     Args:
-        said: as `features` of `Fusion.fuse`.
         part, arrived: [k, h, w] which peer takes part in which cell, and which cells it sent; weight: [k].
     """
     k, height, width = part.shape
+    channels = net.config.fused_channels
     lead = (weight[:, None, None] * arrived).argmax(dim=0)  # of equals the first
-    own = torch.stack(said(torch.arange(height * width))).view(k, height, width, -1)
-    own = own.gather(0, lead[None, ..., None].expand(1, -1, -1, own.shape[-1]))[0].permute(2, 0, 1)
+    own = said(torch.arange(height * width), torch.empty(k, height * width, channels)).view(k, height, width, -1)
+    own = own.gather(0, lead[None, ..., None].expand(1, -1, -1, channels))[0].permute(2, 0, 1)
     own = own * arrived.any(dim=0)
     follows = part & (torch.arange(k)[:, None, None] != lead)
     if not bool(follows.any()):
         return own[None]
-    there = torch.cat([torch.ones_like(part[:1]), follows])
-    return net.fusion.fuse(own, said, there, F.pad(weight / weight.max(), (1, 0), value=1.0))
+    return _with_ego(net, own, said, torch.cat([torch.ones_like(part[:1]), follows]), weight / weight.max())

@@ -187,19 +187,23 @@ class Align(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, said: Tensor, offset: Tensor, turn: Tensor) -> Tensor:
+    def forward(self, said: Tensor, offset: Tensor, turn: Tensor, out: Tensor | None = None) -> Tensor:
         """[k, p, c] → the same; cells of zeros, where nothing was sent, stay zeros.
 
         Args:
             offset: [k, p, 2], how far the cell's centre lies from that of the peer's cell below it, −0.5 … 0.5 cells.
             turn: [k], the peer's heading minus the ego's, radians.
+            out: [k, p, c], where the result goes; None makes one.
         """
         x = self.said(said)
         x += self.offset(offset)
         x += self.turn(torch.stack([turn.sin(), turn.cos()], dim=-1))[:, None]
-        out: Tensor = self.out(F.relu(x, inplace=True))
-        out += said
-        return out * (said.sum(dim=-1, keepdim=True) > 0.0)  # all are at least 0; `any` takes longer
+        corrected: Tensor = self.out(F.relu(x, inplace=True))
+        corrected += said
+        some = (said.sum(dim=-1, keepdim=True) > 0.0).to(
+            said.dtype
+        )  # all are at least 0; `any` takes longer, as do bools
+        return torch.mul(corrected, some, out=out)
 
 
 class ShallowTrunk(nn.Module):
@@ -268,10 +272,12 @@ class CarNet(nn.Module):
         wide = cells.view(-1, CELLS, CELLS).repeat_interleave(times, dim=1).repeat_interleave(times, dim=2)
         return wide.flatten(1)
 
-    def aligned(self, said: Tensor, offset: Tensor, turn: Tensor) -> Tensor:
-        """What peers say [k, p, c] as `Align` corrects it; a coarse network leaves it."""
-        out: Tensor = said if self.align is None else self.align(said, offset, turn)
-        return out
+    def aligned(self, said: Tensor, offset: Tensor, turn: Tensor, out: Tensor | None = None) -> Tensor:
+        """What peers say [k, p, c] as `Align` corrects it; a coarse network leaves it. Into `out`, where that is given."""
+        if self.align is None:
+            return said if out is None else out.copy_(said)
+        corrected: Tensor = self.align(said, offset, turn, out)
+        return corrected
 
 
 def _fusion(config: ModelConfig) -> Fusion:

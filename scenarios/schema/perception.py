@@ -139,7 +139,7 @@ class Perception(Section):
     )
     match_poses: bool = Field(
         False,
-        description="Receivers correct the poses of all drones that they hear, and their own, by the cars that these have in common, before they fuse (the torch detector's).",
+        description="Receivers correct the poses of all drones that they hear, and their own, by the cars that these have in common, before they fuse; boxes of the sender's own look go with its maps for that (the torch detector's).",
     )
     common_errors: Literal["fitted", "unknown"] = Field(
         "fitted",

@@ -75,8 +75,9 @@ class Scenario(Section):
             until_s = getattr(event, "until_s", None)
             if until_s is not None and until_s <= event.at_s:
                 raise inconsistent(("events", i, "until_s"), f"{until_s:g}", f"above at_s = {event.at_s:g}")
-        if self.perception.maps_bring_boxes and self.radio.framing == "tiles":
-            raise inconsistent(("perception", "maps_bring_boxes"), "true", "false where radio.framing is tiles")
+        for name in ("maps_bring_boxes", "match_poses"):
+            if getattr(self.perception, name) and self.radio.framing == "tiles":
+                raise inconsistent(("perception", name), "true", "false where radio.framing is tiles")
         self._stations_stay()
         # What is done at an instant must have its instant. Phases and expected decisions may lie beyond the end: missions
         # are flown shortened, and an expectation of a time that was not flown fails.

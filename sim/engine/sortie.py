@@ -381,6 +381,7 @@ def _rules(scenario: Scenario) -> PlaneRules:
         trust=context.trust,
         people=scenario.perception.thermal is not None,
         classes=len(scenario.perception.classes) > 1,
+        maps_bring_looks=scenario.perception.match_poses,
         code_bytes=scenario.perception.code_bytes,
         publish_every=context.publish_every,
         form=Form(**context.form.model_dump()),

@@ -86,7 +86,8 @@ def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) 
     Raises:
         PolicyError: its policy is unknown, breaks its contract, or takes longer than `limits.decision_s`.
     """
-    perception = scenario.perception.model_copy(update={"detector": "none", "maps_bring_boxes": False})
+    alone = {"detector": "none", "maps_bring_boxes": False, "match_poses": False}
+    perception = scenario.perception.model_copy(update=alone)
     honest = tuple(event for event in scenario.events if not isinstance(event, Lie))
     # a roster would shorten the goodputs to those of its members; the live drone makes its own
     context = scenario.context.model_copy(update={"roster": False})

@@ -97,44 +97,46 @@ class Found:
     """What an ego received, without headers."""
 
 
-def frames(scenes: int) -> Mapping[Way, Found]:
+def frames(scenes: int, ways: Sequence[Way] = WAYS, seed: int = BENCH_SEED) -> Mapping[Way, Found]:
     """Every way on the test frames."""
-    found = {way: Found([], []) for way in WAYS}
+    found = {way: Found([], []) for way in ways}
     for k in range(scenes):
-        scene, fleet = frame(k, Difficulty(), BENCH_SEED)
+        scene, fleet = frame(k, Difficulty(), seed)
         truths = [ground_truth(scene.cars_at(c.t_s).table(), c.true_pose) for c in fleet]
         alone: list[Boxes] = []
-        for grids, matched in dict.fromkeys((way.grids, way.matched) for way in WAYS):
+        for grids, matched in dict.fromkeys((way.grids, way.matched) for way in ways):
             config = Perception(fused_grids=grids, match_poses=matched, code_bytes=CODE_BYTES)
             detector = TorchDetector(scene, config, k, WEIGHTS)
             alone = alone or detector.detect([(ego, []) for ego in fleet])
-            for way in (w for w in WAYS if (w.grids, w.matched) == (grids, matched)):
-                sent = alone if way.sent == "detections" else None
-                fused = detector.detect([(ego, list(_shares(way, ego, fleet))) for ego in fleet])
+            for way in (w for w in ways if (w.grids, w.matched) == (grids, matched)):
+                looks = alone if way.sent == "detections" or (way.matched and way.sent != "none") else None
+                sent = None
+                fused = detector.detect([(ego, list(shares(way, ego, fleet))) for ego in fleet])
                 if way.boxes:
                     sent, egos = fused, range(len(fleet))
-                    fused = detector.detect([(fleet[i], [*_shares(way, fleet[i], fleet), *_found(i, fleet, sent)]) for i in egos])  # fmt: skip
+                    fused = detector.detect([(fleet[i], [*shares(way, fleet[i], fleet), *found_by_others(i, fleet, sent)]) for i in egos])  # fmt: skip
                 found[way].matched.extend(match(b, truth) for b, truth in zip(fused, truths, strict=True))
-                found[way].received_b.extend(_received_b(way, i, sent, len(fleet)) for i in range(len(fleet)))
+                found[way].received_b.extend(_received_b(way, i, (looks, sent), len(fleet)) for i in range(len(fleet)))
     return found
 
 
-def _shares(way: Way, ego: Capture, fleet: Sequence[Capture]) -> Iterator[Share]:
+def shares(way: Way, ego: Capture, fleet: Sequence[Capture]) -> Iterator[Share]:
+    """What the peers of an ego send it."""
     for peer in fleet if way.sent != "none" else ():
         if peer is not ego:
             yield Share(peer, way.sent, way.rho, None, 1.0)
 
 
-def _found(ego: int, fleet: Sequence[Capture], found: Sequence[Boxes]) -> list[Share]:
+def found_by_others(ego: int, fleet: Sequence[Capture], found: Sequence[Boxes]) -> list[Share]:
     """The boxes that the peers found and sent."""
     return [Share(c, "detections", 0.0, None, 1.0, boxes=found[i]) for i, c in enumerate(fleet) if i != ego]
 
 
-def _received_b(way: Way, ego: int, sent: Sequence[Boxes] | None, drones: int) -> float:
+def _received_b(way: Way, ego: int, sent: Sequence[Sequence[Boxes] | None], drones: int) -> float:
     maps_b = 0
     if way.sent in ("features", "codes"):
         maps_b = budget.content_bytes(way.sent, cells=budget.cells_in(way.rho), code_bytes=CODE_BYTES)
-    boxes = 0 if sent is None else sum(len(b) for i, b in enumerate(sent) if i != ego)
+    boxes = sum(len(b) for each in sent if each is not None for i, b in enumerate(each) if i != ego)
     return (drones - 1) * maps_b + budget.content_bytes("detections", boxes=boxes)
 
 
@@ -173,13 +175,13 @@ def own_look_table(scenes: int = SCENES) -> Table:
         detector = TorchDetector(scene, Perception(code_bytes=CODE_BYTES), k, WEIGHTS)
 
         def joined(way: Way, boxes: Sequence[Boxes]) -> list[Boxes]:
-            jobs = [(ego, [*_shares(way, ego, fleet), *_found(i, fleet, boxes)]) for i, ego in enumerate(fleet)]  # noqa: B023
+            jobs = [(ego, [*shares(way, ego, fleet), *found_by_others(i, fleet, boxes)]) for i, ego in enumerate(fleet)]  # noqa: B023
             return detector.detect(jobs)  # noqa: B023
 
         alone = detector.detect([(ego, []) for ego in fleet])
         made = {Way("detections").label: joined(Way("none"), alone)}
         for way in ways:
-            fused = detector.detect([(ego, list(_shares(way, ego, fleet))) for ego in fleet])
+            fused = detector.detect([(ego, list(shares(way, ego, fleet))) for ego in fleet])
             made[f"{way.label}, with boxes of the own look"] = joined(way, alone)
             made[f"{way.label}, with boxes"] = joined(way, fused)
         for label, each in made.items():
@@ -239,13 +241,13 @@ ARMS: Mapping[str, tuple[str, ...]] = {
 
 def flight_table() -> Table:
     """AP of the full scene in flight."""
-    flown = {arm: [_flown(town, *changes) for town in TOWNS] for arm, changes in ARMS.items()}
-    ap = {arm: [each for each, _ in its] for arm, its in flown.items()}
+    flights = {arm: [flown(town, *changes) for town in TOWNS] for arm, changes in ARMS.items()}
+    ap = {arm: [each for each, _ in its] for arm, its in flights.items()}
     rows: list[list[object]] = []
     for arm, each in ap.items():
         others = "silence", "boxes", arm.replace(", with boxes", ""), ALL_GRIDS
         over = [None if other == arm else interval(np.subtract(each, ap[other]).tolist()) for other in others]
-        rows.append([arm, float(np.mean([mbps for _, mbps in flown[arm]])), interval(each), *over])
+        rows.append([arm, float(np.mean([mbps for _, mbps in flights[arm]])), interval(each), *over])
     columns = [Column("policy"), Column("the fleet sends", ".2f", " MB/s"), Column("AP of the full scene", ".3f")]
     columns += [
         Column(name, "+.1f", factor=100)
@@ -255,7 +257,7 @@ def flight_table() -> Table:
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
 
-def _flown(town: int, policy: str, *changes: str) -> tuple[float, float]:
+def flown(town: int, policy: str, *changes: str) -> tuple[float, float]:
     """AP of the full scene, and the payloads that the fleet sends, MB/s."""
     first = ("policy.params={}", f"policy.name={policy}", f"perception.scene.seed={town}")
     scenario = load("track_target", [*SHORT, *first, *changes])
@@ -268,21 +270,21 @@ def times() -> Table:
     """One ego that has four whole maps: fusion and detection, without and with the boxes of its peers, in turn."""
     scene, fleet = frame(0, Difficulty(), BENCH_SEED)
     whole = Way("features")
-    maps = list(_shares(whole, fleet[0], fleet))
+    maps = list(shares(whole, fleet[0], fleet))
     coarse, fine = (
         TorchDetector(scene, Perception(), 0, weights) for weights in (Path("disconet.safetensors"), WEIGHTS)
     )
-    sent = fine.detect([(ego, list(_shares(whole, ego, fleet))) for ego in fleet])
+    sent = fine.detect([(ego, list(shares(whole, ego, fleet))) for ego in fleet])
     each = {
         "coarse network": (coarse, maps),
         "fine network": (fine, maps),
-        "fine network, with boxes": (fine, [*maps, *_found(0, fleet, sent)]),
+        "fine network, with boxes": (fine, [*maps, *found_by_others(0, fleet, sent)]),
     }
     took_s: dict[str, list[float]] = {what: [] for what in each}
     for _ in range(REPEATS + 1):
-        for what, (detector, shares) in each.items():
+        for what, (detector, its) in each.items():
             begin_s = time.perf_counter()
-            detector.detect([(fleet[0], shares)])
+            detector.detect([(fleet[0], its)])
             took_s[what].append(time.perf_counter() - begin_s)
     median_s = {what: statistics.median(its[1:]) for what, its in took_s.items()}  # the first one encodes
     rows: list[list[object]] = [[what, took, *(took / median_s[other] for other in ("coarse network", "fine network"))] for what, took in median_s.items()]  # fmt: skip

@@ -33,24 +33,24 @@ class Fusion(nn.Module):
     """One line for lists."""
     shares: ClassVar[Shares] = "features"
     """What its peers send; `none` and late fusion leave the ego's features alone."""
+    weighs: ClassVar[bool] = False
+    """Whether `weigh` changes weights. If not, nobody has to stack whole maps for it."""
     reach_cells: ClassVar[int] = 0
     """How far a peer's cell acts on the fused map: 0 where each cell is fused by itself."""
 
     def forward(self, agents: Tensor, takes_part: Tensor, weight: Tensor) -> Tensor:
         raise NotImplementedError
 
-    def fuse(
-        self, own: Tensor, features: Callable[[Tensor], list[Tensor]], takes_part: Tensor, weight: Tensor
-    ) -> Tensor:
+    def fuse(self, own: Tensor, features: Callable[[Tensor], Tensor], takes_part: Tensor, weight: Tensor) -> Tensor:
         """One ego's fused map [1, c, h, w].
 
         Args:
             own: [c, h, w]; takes_part: [1 + k, h, w] and weight: [1 + k], as for `forward`.
-            features: gives each peer's features on cells of the ego's grid, [p] row by row → k times [p, c].
+            features: gives the agents' features on cells of the ego's grid, its own first, [p] row by row → [1 + k, p, c].
         """
         channels, height, width = own.shape
-        peers = [each.view(height, width, channels).permute(2, 0, 1) for each in features(torch.arange(height * width))]
-        out: Tensor = self(torch.stack([own, *peers])[None], takes_part[None], weight[None])
+        agents = features(torch.arange(height * width)).view(-1, height, width, channels).permute(0, 3, 1, 2)
+        out: Tensor = self(agents[None], takes_part[None], weight[None])
         return out
 
     def weigh(self, own: Tensor, peers: Tensor, weight: Tensor) -> Tensor:
@@ -98,14 +98,11 @@ class PerCell(Fusion):
         own = agents[:, 0].permute(0, 2, 3, 1).reshape(-1, channels)
         return own.index_copy(0, at, mixed).view(n, height, width, channels).permute(0, 3, 1, 2)
 
-    def fuse(
-        self, own: Tensor, features: Callable[[Tensor], list[Tensor]], takes_part: Tensor, weight: Tensor
-    ) -> Tensor:
+    def fuse(self, own: Tensor, features: Callable[[Tensor], Tensor], takes_part: Tensor, weight: Tensor) -> Tensor:
         part = takes_part.flatten(1)
         at = part[1:].any(dim=0).nonzero().squeeze(1)
+        mixed = self.mix(features(at), part.index_select(1, at), weight[:, None].expand(-1, len(at)))
         rows = own.permute(1, 2, 0).reshape(-1, len(own))
-        agents = torch.stack([rows.index_select(0, at), *features(at)])
-        mixed = self.mix(agents, part.index_select(1, at), weight[:, None].expand(-1, len(at)))
         return rows.index_copy(0, at, mixed).view(1, *own.shape[1:], -1).permute(0, 3, 1, 2)
 
     def mix(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:

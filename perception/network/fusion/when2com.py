@@ -48,6 +48,7 @@ class When2com(PerCell):
     """The mean of the maps by attention, over the agents that take part in a cell."""
 
     name = "when2com"
+    weighs = True
     about = "mean by attention from a handshake of learned keys and queries (When2com, Who2com)"
 
     def __init__(self) -> None:
