@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sortie.perception.compiled import compiled
 from sortie.perception.geometry import CELLS
 
 
@@ -35,11 +38,23 @@ def support(ego_pose: Tensor, peer_pose: Tensor, cell_m: float, n: int = CELLS) 
     c, s = torch.cos(peer_pose[:, 2]), torch.sin(peer_pose[:, 2])
     tx, ty = c * delta[:, 0] + s * delta[:, 1], c * delta[:, 1] - s * delta[:, 0]
     cd, sd = torch.cos(delta[:, 2]), torch.sin(delta[:, 2])
-    # a point (x, y) of the ego's grid lies at R(Δψ)(x, y) + t in the peer's; in cells, from the centre of cell (0, 0)
     middle = (n - 1) / 2
-    axis = torch.arange(n, device=peer_pose.device) - middle
+    place = cd, sd, tx / cell_m + middle, ty / cell_m + middle
+    if peer_pose.device.type != "cpu":
+        return Support(*_laid(place, n), -delta[:, 2])
+    k = len(peer_pose)
+    cells, weights = torch.empty(k, n, n, 4, dtype=torch.long), torch.empty(k, n, n, 4)
+    inside, offset = torch.empty(k, n, n, dtype=torch.bool), torch.empty(k, n, n, 2)
+    _lay(*(v.numpy() for v in (*place, cells, weights, inside, offset)))
+    return Support(cells, weights, inside, offset, -delta[:, 2])
+
+
+def _laid(place: Sequence[Tensor], n: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`_lay` by tensors, for accelerators."""
+    # a point (x, y) of the ego's grid lies at R(Δψ)(x, y) + t in the peer's; in cells, from the centre of cell (0, 0)
+    cd, sd, tx, ty = (v[:, None, None] for v in place)
+    axis = torch.arange(n, device=cd.device) - (n - 1) / 2
     x, y = (plane[None] for plane in torch.meshgrid(axis, axis, indexing="ij"))
-    cd, sd, tx, ty = (v[:, None, None] for v in (cd, sd, tx / cell_m + middle, ty / cell_m + middle))
     row, column = cd * x - sd * y + tx, sd * x + cd * y + ty
     half = n - 0.5
     inside = (row >= -0.5) & (row <= half) & (column >= -0.5) & (column <= half)
@@ -47,7 +62,7 @@ def support(ego_pose: Tensor, peer_pose: Tensor, cell_m: float, n: int = CELLS) 
     cells = [i * n + j for i, _ in down for j, _ in across]
     weights = [part * share for _, part in down for _, share in across]
     offset = torch.stack([row - row.round(), column - column.round()], dim=-1)
-    return Support(torch.stack(cells, dim=-1), torch.stack(weights, dim=-1), inside, offset, -delta[:, 2])
+    return torch.stack(cells, dim=-1), torch.stack(weights, dim=-1), inside, offset
 
 
 def _beside(at: Tensor, n: int) -> list[tuple[Tensor, Tensor]]:
@@ -65,8 +80,16 @@ def arriving(under: Support, sent: Tensor) -> tuple[Tensor, Tensor]:
 
     A cell counts as sent where at least half of its support was.
     """
-    k = len(sent)
-    weights = under.weights * sent.gather(1, under.cells.view(k, -1)).view(under.cells.shape)
+    if sent.device.type != "cpu":
+        return _arrived(under, sent)
+    weights, arrived = torch.empty_like(under.weights), torch.empty_like(under.inside)
+    _arrive(*(v.numpy() for v in (under.cells, under.weights, under.inside, sent, weights, arrived)))
+    return weights, arrived
+
+
+def _arrived(under: Support, sent: Tensor) -> tuple[Tensor, Tensor]:
+    """`_arrive` by tensors, for accelerators."""
+    weights = under.weights * sent.gather(1, under.cells.flatten(1)).view(under.cells.shape)
     share = weights.sum(dim=-1, keepdim=True)
     arrived = (share[..., 0] >= 0.5) & under.inside
     return weights / share.clamp_min(0.5) * arrived[..., None], arrived
@@ -109,3 +132,48 @@ def moved(features: Tensor, under: Support, weights: Tensor) -> Tensor:
     taps = under.cells + torch.arange(k, device=features.device)[:, None, None, None] * n**2
     out = rows(features.permute(0, 2, 3, 1).reshape(k * n**2, channels), taps.view(-1, 4), weights.view(-1, 4))
     return out.view(k, n, n, channels).permute(0, 3, 1, 2)
+
+
+_HALF, _ONE, _NONE = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+
+
+@compiled
+def _lay(cd: Any, sd: Any, tx: Any, ty: Any, cells: Any, weights: Any, inside: Any, offset: Any) -> None:
+    """Fill a `Support` of k peers: turns and shifts [k], shifts in cells from the centre of cell (0, 0); rounded as tensors are."""
+    n = cells.shape[1]
+    middle, last, half = np.float32((n - 1) / 2), np.float32(n - 1), np.float32(n - 0.5)
+    at, on, part = np.empty(2, np.float32), np.empty((2, 2), np.int64), np.empty((2, 2), np.float32)
+    for k in range(len(cd)):
+        for i in range(n):
+            x = np.float32(i) - middle
+            for j in range(n):
+                y = np.float32(j) - middle
+                at[0], at[1] = cd[k] * x - sd[k] * y + tx[k], sd[k] * x + cd[k] * y + ty[k]
+                for axis in range(2):
+                    low = np.floor(at[axis])
+                    for side in range(2):
+                        cell = low + np.float32(side)
+                        kept = min(max(cell, _NONE), last)
+                        on[axis, side] = np.int64(kept)
+                        part[axis, side] = _ONE - abs(at[axis] - cell) if cell == kept else _NONE
+                    offset[k, i, j, axis] = at[axis] - np.rint(at[axis])
+                inside[k, i, j] = -_HALF <= at[0] <= half and -_HALF <= at[1] <= half
+                for corner in range(4):
+                    down, across = corner // 2, corner % 2
+                    cells[k, i, j, corner] = on[0, down] * n + on[1, across]
+                    weights[k, i, j, corner] = part[0, down] * part[1, across]
+
+
+@compiled
+def _arrive(cells: Any, weights: Any, inside: Any, sent: Any, out: Any, arrived: Any) -> None:
+    """Fill what `arriving` returns."""
+    for k in range(cells.shape[0]):
+        for i in range(cells.shape[1]):
+            for j in range(cells.shape[2]):
+                share = _NONE
+                for corner in range(4):
+                    out[k, i, j, corner] = weights[k, i, j, corner] if sent[k, cells[k, i, j, corner]] else _NONE
+                    share += out[k, i, j, corner]
+                arrived[k, i, j] = share >= _HALF and inside[k, i, j]
+                for corner in range(4):
+                    out[k, i, j, corner] = out[k, i, j, corner] / share if arrived[k, i, j] else _NONE

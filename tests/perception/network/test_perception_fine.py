@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from perception_examples import cross
 from torch import Tensor
 
 from sortie.perception.benchmark.dataset import Frames
 from sortie.perception.evaluation.contract import Exchange
 from sortie.perception.evaluation.instrument import CarNetInstrument, CarNetView
+from sortie.perception.network import warp
 from sortie.perception.network.checkpoint import load_weights, read_config, save_weights
 from sortie.perception.network.decode import decode
 from sortie.perception.network.detector import TorchDetector
@@ -72,6 +78,28 @@ def test_where_cells_lie_between_a_peers_cells() -> None:
     assert under.turn.tolist() == pytest.approx([0.0, -0.5, 0.3])
     level = support(torch.zeros(3), torch.tensor([[0.4, -0.6, 0.0]]), 1.6, 128)
     assert level.offset[0, 64, 64].tolist() == pytest.approx([-0.25, 0.375], abs=1e-5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([(3.2, 64), (1.6, 128)]), st.floats(0.0, 300.0))
+def test_compiled_loops_lay_cells_as_tensors_do(seed: int, grid: tuple[float, int], spread_m: float) -> None:
+    """Bit for bit, also where grids hardly overlap or not at all."""
+    cell_m, n = grid
+    rng = np.random.default_rng(seed)
+    poses = torch.from_numpy(np.column_stack([rng.normal(0, spread_m, (3, 2)), rng.uniform(-7, 7, 3)])).float()
+    sent = torch.from_numpy(rng.random((2, n * n)) < rng.random((2, 1)))
+    seen: list[Sequence[Tensor]] = []
+
+    def laid(place: Sequence[Any], *into: Any) -> None:
+        seen.append([torch.from_numpy(v.copy()) for v in place])
+
+    under = support(poses[0], poses[1:], cell_m, n)
+    with mock.patch.object(warp, "_lay", lambda *of: laid(of[:4])):
+        support(poses[0], poses[1:], cell_m, n)
+    for compiled, plain in zip(under, warp._laid(seen[0], n), strict=False):
+        assert torch.equal(compiled, plain)
+    for compiled, plain in zip(arriving(under, sent), warp._arrived(under, sent), strict=True):
+        assert torch.equal(compiled, plain)
 
 
 def test_the_correction_begins_as_none_and_leaves_silence() -> None:

@@ -243,6 +243,11 @@ def test_who2com_asks_one_and_when2com_whoever_has_attention() -> None:
     assert asked(attention, 0.2).tolist() == [[False, False], [True, True]]
 
 
+@pytest.mark.parametrize("name", FUSIONS)
+def test_a_method_says_whether_it_weighs_by_a_handshake(name: str) -> None:
+    assert FUSIONS[name].weighs == (FUSIONS[name].weigh is not Fusion.weigh)
+
+
 @pytest.mark.parametrize("name", [n for n in FUSIONS if n != "when2com"])
 def test_without_a_handshake_weights_are_the_directives(name: str) -> None:
     agents, _ = maps(12, 3)

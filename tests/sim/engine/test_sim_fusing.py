@@ -62,6 +62,40 @@ def test_a_payload_asks_for_the_boxes_in_its_region() -> None:
     assert asked == [None, Disc(3.0, 4.0, 8.0)]
 
 
+@pytest.mark.parametrize("classes", [False, True])
+@pytest.mark.parametrize("rung", list(Representation)[1:])
+def test_maps_and_codes_bring_the_boxes_of_their_look_where_poses_are_corrected(
+    rung: Representation, classes: bool
+) -> None:
+    is_map = rung in (Representation.FEATURES, Representation.CODES)
+    directive = Directive(0, 1, rung, 0.05 if is_map else 0.0, REGION)
+    asked: list[Disc | None] = []
+
+    def count(roi: Disc | None) -> int:
+        asked.append(roi)
+        return 3
+
+    def made(bring_look: bool, **of: Any) -> Any:
+        return make_payload(directive, 0.0, 0.0, 0.0, count, classes=classes, bring_look=bring_look, **of)
+
+    plain, bringing = made(False), made(True)
+    if not is_map:
+        assert bringing == plain
+        return
+    assert asked == [REGION], "only where they are sent"
+    assert bringing == plain._replace(boxes=3, size_bytes=plain.size_bytes + 3 * (24 + classes))
+    last = Found(capture(0, 0.3), 7, boxes(7))
+    both, one = (made(look, found_last=lambda roi: last) for look in (True, False))
+    assert both == one._replace(boxes=10, size_bytes=one.size_bytes + 3 * (24 + classes))
+
+
+def test_corrected_poses_are_refused_with_tiles() -> None:
+    with pytest.raises(
+        ScenarioError, match=r"perception\.match_poses: true, must be false where radio\.framing is tiles$"
+    ):
+        example("perception.match_poses=true", "radio.framing=tiles")
+
+
 @pytest.mark.parametrize(
     ("other", "named"),
     [
@@ -224,6 +258,24 @@ def test_in_flight_receivers_join_what_senders_found_before() -> None:
     assert fused["representations"] == ["features"] * 2, "what came with them is no payload of its own"
     sent = record.tables["transmissions"].to_pandas().query("representation == 'features'")
     assert sent.boxes.max() == 3, "of the own look and two maps"
+
+
+def test_corrected_poses_send_as_many_boxes_with_maps_as_there_are_cars_in_reach(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without a detector."""
+    monkeypatch.setattr("sortie.sim.engine.world.cars_in_reach", lambda scene, capture, roi: 5 + capture.drone)
+    on, off = (
+        run_sortie(example(f"perception={{detector: none, match_poses: {match}}}", *SENDING))
+        .tables["transmissions"]
+        .to_pandas()
+        .query("representation == 'features'")
+        for match in ("true", "false")
+    )
+    assert off.boxes.eq(0).all()
+    assert on.boxes.eq(5 + on.drone).all()
+    maps_b = dict(off[["cells", "payload_bytes"]].drop_duplicates().to_numpy().tolist())
+    assert (on.payload_bytes - on.cells.map(maps_b)).eq(24 * on.boxes).all()
 
 
 def test_without_a_detector_as_many_go_as_there_are_cars_in_reach(monkeypatch: pytest.MonkeyPatch) -> None:
