@@ -114,7 +114,7 @@ ABOUT = {
     "violations": "A time in which the directives that a drone's gates enforce break an invariant; from the first to the last "
     "decision at which they did. Peer −1: its links together. `cause` is the step that broke the line: `policy`, `staleness`, "
     "`damping`, or `no peer` (a line over all links while no peer is attached).",
-    "transmissions": "A payload handed to the radio, with its fate. `boxes` of a map came with it (`perception.maps_bring_boxes`). "
+    "transmissions": "A payload handed to the radio, with its fate. `boxes` of a map came with it (`perception.match_poses`, `perception.maps_bring_boxes`). "
     "`partial`: some of its tiles arrived, "
     "`arrived_bytes` of it. The reason `other_feature_space`: delivered feature maps that the receiver's network cannot fuse, or codes of another codebook.",
     "fusions": "A scored fusion: an ego, and the peers whose payloads it held. A weight is the directive's times trust.",
