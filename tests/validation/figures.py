@@ -506,22 +506,10 @@ def _sent_own_look() -> Tables:
     return {"sent_own_look": sent_boxes.own_look_table()}
 
 
-def _sent_times() -> Tables:
-    import sent_boxes
-
-    return {"sent_times": sent_boxes.times()}
-
-
 def _corrected_frames() -> Tables:
     import corrected_boxes
 
     return corrected_boxes.frame_tables()
-
-
-def _corrected_flights() -> Tables:
-    import corrected_boxes
-
-    return {"corrected_flights": corrected_boxes.flight_table()}
 
 
 def _corrected_times() -> Tables:
@@ -834,7 +822,6 @@ FIGURES: dict[str, Figure] = {
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
     "grid_times": Figure(1, _grid_times, timed=True),
-    "sent_times": Figure(1, _sent_times, timed=True),
     "corrected_times": Figure(1, _corrected_times, timed=True),
     "fine_network": Figure(7, _fine_network),
     "fused_grids": Figure(50, _fused_grids),
@@ -842,7 +829,6 @@ FIGURES: dict[str, Figure] = {
     "sent_own_look": Figure(10, _sent_own_look),
     "sent_flights": Figure(30, _sent_flights),
     "corrected_frames": Figure(10, _corrected_frames),
-    "corrected_flights": Figure(30, _corrected_flights),
     "trucks": Figure(1, _trucks),
     "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),

@@ -12,7 +12,8 @@ split of benchmark seed 0, in two scenes of seed 12, and in 6 s over town 101.
 - Flights. `track_target` for 16 s, scored once a second, in eight towns, 111 to 118, with as many seeds: `silence`, `boxes`, and
   with a received budget of a twentieth `all-4` and `codes`, without and with `perception.maps_bring_boxes`; `all-4` on all
   grids. AP of the full scene; the unit is the flight.
-- Time. One ego with four whole maps, without and with the boxes of its four peers, and with the coarse network, in turn.
+- Time. One ego with four whole maps, without and with the boxes of its four peers, and with the coarse network, in turn (now in
+  `corrected_boxes.py`).
 
 Expected:
 1. Whole maps with boxes beat averaged boxes by 3 points; where poses are corrected, by 2.
@@ -31,8 +32,6 @@ Time:
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,7 +56,6 @@ from sortie.sim.results.outcome import outcome
 BENCH_SEED, SCENES = 13, 120
 TOWNS = range(111, 119)
 CODE_BYTES = 10
-REPEATS = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,33 +262,6 @@ def flown(town: int, policy: str, *changes: str) -> tuple[float, float]:
     record = run_sortie(scenario, None, town)
     sent_b = record.tables["transmissions"]["payload_bytes"].to_numpy().sum()
     return float(outcome(record)["ap50"]["full_scene"]), float(sent_b / scenario.duration_s * 1e-6)
-
-
-def times() -> Table:
-    """One ego that has four whole maps: fusion and detection, without and with the boxes of its peers, in turn."""
-    scene, fleet = frame(0, Difficulty(), BENCH_SEED)
-    whole = Way("features")
-    maps = list(shares(whole, fleet[0], fleet))
-    coarse, fine = (
-        TorchDetector(scene, Perception(), 0, weights) for weights in (Path("disconet.safetensors"), WEIGHTS)
-    )
-    sent = fine.detect([(ego, list(shares(whole, ego, fleet))) for ego in fleet])
-    each = {
-        "coarse network": (coarse, maps),
-        "fine network": (fine, maps),
-        "fine network, with boxes": (fine, [*maps, *found_by_others(0, fleet, sent)]),
-    }
-    took_s: dict[str, list[float]] = {what: [] for what in each}
-    for _ in range(REPEATS + 1):
-        for what, (detector, its) in each.items():
-            begin_s = time.perf_counter()
-            detector.detect([(fleet[0], its)])
-            took_s[what].append(time.perf_counter() - begin_s)
-    median_s = {what: statistics.median(its[1:]) for what, its in took_s.items()}  # the first one encodes
-    rows: list[list[object]] = [[what, took, *(took / median_s[other] for other in ("coarse network", "fine network"))] for what, took in median_s.items()]  # fmt: skip
-    columns = [Column("fused"), Column("one ego with four maps", ".0f", " ms", 1e3)]
-    columns += [Column(f"times the {network} one", ".2f") for network in ("coarse", "fine")]
-    return Table(columns, rows, f"Medians of {REPEATS}; the maps are encoded already.")  # type: ignore[arg-type]
 
 
 def tables(picture: Path) -> dict[str, Table]:
