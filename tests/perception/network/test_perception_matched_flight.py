@@ -38,33 +38,39 @@ def erring() -> list[Capture]:
 REGION = Disc(5.0, 5.0, 40.0)
 
 
+@pytest.fixture(scope="module")
+def detectors() -> dict[bool, TorchDetector]:
+    """One that corrects poses, and one that does not, over one scene."""
+    scene = SceneModel(Scene(), None, (-50, -50, 50, 50))
+    return {match: TorchDetector(scene, Perception(match_poses=match), 1, FINE) for match in (False, True)}
+
+
 def found(
-    scene: SceneModel, captures: list[Capture], match: bool, sent: str, rho: float = 1.0, roi: Disc | None = None
+    detector: TorchDetector, captures: list[Capture], sent: str, rho: float = 1.0, roi: Disc | None = None
 ) -> np.ndarray:
     """Boxes and scores of the first drone, which hears the others."""
-    detector = TorchDetector(scene, Perception(match_poses=match), 1, FINE)
     ego, *peers = captures
     (boxes,) = detector.detect([(ego, [Share(c, sent, rho, roi, 1.0) for c in peers])])
     return np.column_stack([boxes.table(), boxes.score])
 
 
-@pytest.mark.parametrize("looked", [True, False])
 @pytest.mark.parametrize(
-    ("sent", "rho", "roi"),
+    ("sent", "rho", "roi", "looked"),
     [
-        ("features", 1.0, None), ("features", 0.02, None), ("features", 1.0, REGION), ("codes", 0.02, None),
-        ("raw", 0.0, REGION), ("detections", 0.0, None), ("uncertain_boxes", 0.0, None),
+        ("features", 1.0, None, True), ("features", 1.0, REGION, False), ("features", 0.02, None, False),
+        ("codes", 0.02, None, True), ("raw", 0.0, REGION, True),
+        *((boxes, 0.0, None, looked) for boxes in ("detections", "uncertain_boxes") for looked in (True, False)),
     ],
 )  # fmt: skip
 def test_it_fuses_as_if_drones_had_believed_the_corrected_poses(
-    sent: str, rho: float, roi: Disc | None, looked: bool
+    detectors: dict[bool, TorchDetector], sent: str, rho: float, roi: Disc | None, looked: bool
 ) -> None:
     """A drone without a look of its own, as a ground station is, corrects those that it hears.
 
     However few cells came, it goes by all boxes of the sender's look, in the region where one was asked for. Pictures show all.
     """
-    scene, fleet = SceneModel(Scene(), None, (-50, -50, 50, 50)), erring()
-    alone = TorchDetector(scene, Perception(), 1, FINE).detect([(c, ()) for c in fleet])
+    fleet = erring()
+    alone = detectors[False].detect([(c, ()) for c in fleet])
     assert min(map(len, alone)) > 5
     fleet[0] = fleet[0]._replace(looked=looked)
     order = [1, 2, 0]  # peers first, as the detector has them: the sums are the same to the last digit
@@ -73,18 +79,15 @@ def test_it_fuses_as_if_drones_had_believed_the_corrected_poses(
     seen[2] = seen[2] if looked else seen[2][:0]
     fitted = matched_poses([fleet[k].est_pose for k in order], seen)
     corrected = [believing(fleet[k], tuple(fitted[order.index(k)].tolist())) for k in range(3)]
-    wanted, got = found(scene, corrected, False, sent, rho, roi), found(scene, fleet, True, sent, rho, roi)
+    wanted, got = found(detectors[False], corrected, sent, rho, roi), found(detectors[True], fleet, sent, rho, roi)
     np.testing.assert_allclose(got, wanted, atol=0.01)
     assert len(got) >= 5
-    assert np.abs(got[:5, :2] - found(scene, fleet, False, sent, rho, roi)[:5, :2]).max() > 0.02
+    assert np.abs(got[:5, :2] - found(detectors[False], fleet, sent, rho, roi)[:5, :2]).max() > 0.02
 
 
-def test_a_drone_that_hears_nobody_keeps_its_pose() -> None:
-    scene = SceneModel(Scene(), None, (-50, -50, 50, 50))
+def test_a_drone_that_hears_nobody_keeps_its_pose(detectors: dict[bool, TorchDetector]) -> None:
     ego = cross(10.0, 20.0, 0.3)[0]
-    (plain,), (matched,) = (
-        TorchDetector(scene, Perception(match_poses=match), 1, FINE).detect([(ego, ())]) for match in (False, True)
-    )
+    (plain,), (matched,) = (detectors[match].detect([(ego, ())]) for match in (False, True))
     np.testing.assert_array_equal(matched.table(), plain.table())
 
 
