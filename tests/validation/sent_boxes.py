@@ -159,25 +159,29 @@ def frame_table(found: Mapping[Way, Found]) -> Table:
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
 
-OWN = "maps, ρ = 1", "codes of 10 B, ρ = 0.02"
+OWN = Way("features"), Way("codes", 0.02)
 """Ways that are measured with the boxes of each sender's own look as well."""
 
 
-def own_look_table(scenes: int = SCENES) -> Table:
-    """Maps and codes with the boxes of the sender's own look, beside those of fused maps, on the same frames."""
-    ways = [way for way in MAPS if way.label in OWN]
+def own_look_table(ways: Sequence[Way] = OWN, seed: int = BENCH_SEED, scenes: int = SCENES) -> Table:
+    """Maps and codes with the boxes of the sender's own look, beside those of fused maps, on the same frames.
+
+    Args: `ways`, all with estimated poses or all with corrected ones.
+    """
+    matched = ways[0].matched
+    averaged = Way("detections", matched=matched).label
     found: dict[str, list[Matched]] = {}
     for k in range(scenes):
-        scene, fleet = frame(k, Difficulty(), BENCH_SEED)
+        scene, fleet = frame(k, Difficulty(), seed)
         truths = [ground_truth(scene.cars_at(c.t_s).table(), c.true_pose) for c in fleet]
-        detector = TorchDetector(scene, Perception(code_bytes=CODE_BYTES), k, WEIGHTS)
+        detector = TorchDetector(scene, Perception(code_bytes=CODE_BYTES, match_poses=matched), k, WEIGHTS)
 
         def joined(way: Way, boxes: Sequence[Boxes]) -> list[Boxes]:
             jobs = [(ego, [*shares(way, ego, fleet), *found_by_others(i, fleet, boxes)]) for i, ego in enumerate(fleet)]  # noqa: B023
             return detector.detect(jobs)  # noqa: B023
 
         alone = detector.detect([(ego, []) for ego in fleet])
-        made = {Way("detections").label: joined(Way("none"), alone)}
+        made = {averaged: joined(Way("none"), alone)}
         for way in ways:
             fused = detector.detect([(ego, list(shares(way, ego, fleet))) for ego in fleet])
             made[f"{way.label}, with boxes of the own look"] = joined(way, alone)
@@ -190,7 +194,7 @@ def own_look_table(scenes: int = SCENES) -> Table:
         ap = average_precision(its), *percentile_interval(rank(its, scene_of).ap(resamples(scenes)))
         own = f"{label} of the own look"
         over = [points(compare(found[other], its, scene_of)) if other in found and other != label else None
-                for other in (Way("detections").label, own)]  # fmt: skip
+                for other in (averaged, own)]  # fmt: skip
         rows.append([label, ap, *over])
     names = "over averaged boxes", "over boxes of the own look"
     columns = [Column("shared"), Column("AP@0.5", ".3f"), *(Column(name, "+.1f", factor=100) for name in names)]
