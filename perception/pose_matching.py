@@ -49,15 +49,19 @@ def matched_poses(poses: ArrayLike, places_m: Sequence[NDArray[np.floating]]) ->
     of = np.repeat(np.arange(n), [len(places) for places in places_m])
     at_m = np.concatenate([np.empty((0, 2)), *places_m])
     i, j = _of_one_car(at_m, of, n)
-    slope = _slopes(at_m, believed[of])
-    seen = np.zeros((len(i), 2, n, 3))
-    pair = np.arange(len(i))
-    seen[pair, :, of[i]], seen[pair, :, of[j]] = slope[i], -slope[j]
-    by_error, apart_m = seen.reshape(-1, 3 * n), (at_m[i] - at_m[j]).ravel()
-    prior = np.tile([POSITION_SIGMA_M**-2, POSITION_SIGMA_M**-2, HEADING_SIGMA_RAD**-2], n)
+    slope, apart_m = _slopes(at_m, believed[of]), at_m[i] - at_m[j]
+    prior = np.array([POSITION_SIGMA_M**-2, POSITION_SIGMA_M**-2, HEADING_SIGMA_RAD**-2])
+    information, seen = np.zeros((n, n, 3, 3)), np.zeros((n, 3))
+    information[np.arange(n), np.arange(n)] = np.diag(prior)
     # squares of the differences of n places, over n, are those of their distances from the mean
     weight = 1.0 / (n * BOX_SIGMA_M**2)
-    errors = np.linalg.solve(np.diag(prior) + weight * by_error.T @ by_error, weight * by_error.T @ apart_m)
+    for one, sign in ((i, 1.0), (j, -1.0)):
+        np.add.at(seen, of[one], sign * weight * np.einsum("kxa,kx->ka", slope[one], apart_m))
+        for other, way in ((i, sign), (j, -sign)):
+            np.add.at(
+                information, (of[one], of[other]), way * weight * np.einsum("kxa,kxb->kab", slope[one], slope[other])
+            )
+    errors = np.linalg.solve(information.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n), seen.ravel())
     return np.asarray(believed - errors.reshape(n, 3))
 
 
@@ -67,7 +71,10 @@ def sure(boxes: Boxes) -> Boxes:
 
 
 def _of_one_car(at_m: Floats, of: NDArray[np.intp], n: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pairs (i, j) of places [m, 2] that are taken to be of one car; `of` tells each one's drone, of n."""
+    """Pairs (i, j) of places [m, 2] that are taken to be of one car; `of` tells each one's drone, of n.
+
+    Where several are equally near, all of them pair.
+    """
     near = KDTree(at_m).query_pairs(GATE_M, output_type="ndarray")
     i, j = near[of[near[:, 0]] != of[near[:, 1]]].T
     away_m = np.linalg.norm(at_m[i] - at_m[j], axis=1)

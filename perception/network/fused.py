@@ -32,7 +32,7 @@ class Peer(NamedTuple):
 
 
 def fused_map(net: CarNet, pose: Pose, own: Tensor | None, peers: Sequence[Peer], unsent: UnsentCells) -> Tensor | None:
-    """The fused map [1, channels, n, n] on the ego's grid; None where no peer takes part in any cell.
+    """The fused map [1, channels, n, n] on the ego's grid; None where no peer takes part in any cell. For inference mode.
 
     Args:
         pose: x, y, yaw of the ego, ENU.

@@ -33,6 +33,9 @@ def support(ego_pose: Tensor, peer_pose: Tensor, cell_m: float, n: int = CELLS) 
     """The cells of k peers under the ego's grid, by estimated poses [3] or [k, 3] and [k, 3] (x, y, yaw in ENU).
 
     Args: `cell_m` and `n`, a cell's side and how many there are along a side of the grids.
+
+    Raises:
+        ValueError: a pose that is not finite, on a CPU.
     """
     delta = ego_pose - peer_pose
     c, s = torch.cos(peer_pose[:, 2]), torch.sin(peer_pose[:, 2])
@@ -42,6 +45,8 @@ def support(ego_pose: Tensor, peer_pose: Tensor, cell_m: float, n: int = CELLS) 
     place = cd, sd, tx / cell_m + middle, ty / cell_m + middle
     if peer_pose.device.type != "cpu":
         return Support(*_laid(place, n), -delta[:, 2])
+    if not all(bool(v.isfinite().all()) for v in place):
+        raise ValueError(f"poses are {ego_pose.tolist()} and {peer_pose.tolist()}, must be finite")
     k = len(peer_pose)
     cells, weights = torch.empty(k, n, n, 4, dtype=torch.long), torch.empty(k, n, n, 4)
     inside, offset = torch.empty(k, n, n, dtype=torch.bool), torch.empty(k, n, n, 2)

@@ -177,16 +177,13 @@ class Perception(Section):
 
     @model_validator(mode="after")
     def _boxes_come_with_maps_that_are_fused(self) -> Perception:
-        if self.maps_bring_boxes:
-            for name, refused in (
-                ("detector", self.detector not in ("torch", "none")),
-                ("fusion", self.fusion in ("none", "late")),  # which fuse no maps
-                ("motion_compensation", not self.motion_compensation),  # else what a drone finds depends on
-                ("absent_peers", self.absent_peers != "excluded"),  # ... which drones are scored at the moment
-            ):
-                if refused:
-                    shown = str(getattr(self, name)).lower()
-                    raise inconsistent(("maps_bring_boxes",), "true", f"false where {name} is {shown}")
+        unsupported = {"detector": self.detector not in ("torch", "none"), "fusion": self.fusion in ("none", "late")}
+        here_only = {  # else what a drone finds depends on which drones are scored at the moment
+            "motion_compensation": not self.motion_compensation, "absent_peers": self.absent_peers != "excluded",
+        }  # fmt: skip
+        for option, refused in (("match_poses", unsupported), ("maps_bring_boxes", unsupported | here_only)):
+            for name in (name for name, is_refused in refused.items() if is_refused and getattr(self, option)):
+                raise inconsistent((option,), "true", f"false where {name} is {str(getattr(self, name)).lower()}")
         return self
 
     @model_validator(mode="after")

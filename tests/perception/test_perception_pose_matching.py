@@ -97,3 +97,33 @@ def test_boxes_move_with_their_drones_pose() -> None:
     np.testing.assert_allclose(moved.xy_m, placed(local, np.zeros(3), np.array(new)), atol=1e-4)
     np.testing.assert_allclose(moved.yaw_rad, np.arange(6) + 0.02, atol=1e-6)
     assert boxes.moved(old, old) is boxes
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 12])
+def test_it_is_what_least_squares_over_pairs_found_one_by_one_give(n: int) -> None:
+    """Poses far from the origin; some drones see nothing."""
+    rng = np.random.default_rng(n)
+    poses = np.column_stack([5000.0 + rng.uniform(-40, 40, (n, 2)), rng.uniform(-3, 3, n)])
+    cars = 5000.0 + rng.uniform(-50, 50, (25, 2))
+    places = [cars[rng.random(25) < 0.6] if k % 4 != 3 else cars[:0] for k in range(n)]
+    places = [each + rng.normal(0.0, 0.5, each.shape) for each in places]
+    sigmas = np.tile([POSITION_SIGMA_M, POSITION_SIGMA_M, HEADING_SIGMA_RAD], n)
+    rows, right = [*np.diag(1.0 / sigmas)], [0.0] * (3 * n)
+    for a in range(n):
+        for b in range(a + 1, n):
+            for p in places[a]:
+                for q in places[b]:
+                    is_nearest = all(np.hypot(*(p - o)) >= np.hypot(*(p - q)) for o in places[b])
+                    is_nearest &= all(np.hypot(*(q - o)) >= np.hypot(*(p - q)) for o in places[a])
+                    if is_nearest and np.hypot(*(p - q)) < GATE_M:
+                        for axis in range(2):
+                            row = np.zeros((n, 3))
+                            for drone, place, sign in ((a, p, 1.0), (b, q, -1.0)):
+                                row[drone, axis] = sign
+                                turn = place - poses[drone, :2]
+                                row[drone, 2] = sign * (-turn[1], turn[0])[axis]
+                            rows.append(row.ravel() / (BOX_SIGMA_M * np.sqrt(n)))
+                            right.append((p - q)[axis] / (BOX_SIGMA_M * np.sqrt(n)))
+    assert len(rows) > 3 * n + 20 or n == 1
+    errors = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0].reshape(n, 3)
+    np.testing.assert_allclose(matched_poses(poses, places), poses - errors, rtol=0, atol=1e-9)

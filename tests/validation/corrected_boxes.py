@@ -137,7 +137,7 @@ def times() -> Table:
     ]
     columns = [Column("fused"), Column("one ego with four maps", ".0f", " ms", 1e3)]
     columns += [Column(f"times the {network} one", ".2f") for network in ("coarse", "fine")]
-    about = f"Medians of {REPEATS} rounds; ratios within each round. What each drone finds by its own look is there already."
+    about = f"Medians of {REPEATS} rounds, also of the ratios, which are of one round each. Every drone's own map and boxes are computed before."
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
 

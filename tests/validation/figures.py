@@ -512,6 +512,18 @@ def _corrected_frames() -> Tables:
     return corrected_boxes.frame_tables()
 
 
+def _corrected_own_look() -> Tables:
+    import corrected_boxes
+
+    return {"corrected_own_look": corrected_boxes.own_look()}
+
+
+def _corrected_flights() -> Tables:
+    import corrected_boxes
+
+    return {"corrected_flights": corrected_boxes.flight_table()}
+
+
 def _corrected_times() -> Tables:
     import corrected_boxes
 
@@ -829,6 +841,8 @@ FIGURES: dict[str, Figure] = {
     "sent_own_look": Figure(10, _sent_own_look),
     "sent_flights": Figure(30, _sent_flights),
     "corrected_frames": Figure(10, _corrected_frames),
+    "corrected_own_look": Figure(5, _corrected_own_look),
+    "corrected_flights": Figure(30, _corrected_flights),
     "trucks": Figure(1, _trucks),
     "score_threshold": Figure(4, _score_threshold),
     "fine_fleets": Figure(5, _fine_fleets),

@@ -38,12 +38,13 @@ class OwnFusion(Fusion):
         self.model = found
 
     def forward(self, agents: Tensor, takes_part: Tensor, weight: Tensor) -> Tensor:
-        """As `Fusion.forward`. The model gets copies, so that it may change them.
+        """As `Fusion.forward`. The model gets copies, so that it may change them, and contiguous ones, so that it may `view` them.
 
         Raises:
             PluginError: the model fails, or returns no tensor, another shape, or a number that is not finite.
         """
-        fused = checked_call("fusion", self.model, agents.clone(), takes_part.clone(), weight.clone())
+        copies = (given.clone(memory_format=torch.contiguous_format) for given in (agents, takes_part, weight))
+        fused = checked_call("fusion", self.model, *copies)
         name, shape = f"fusion {name_of(self.model)}", (len(agents), *agents.shape[2:])
         if not isinstance(fused, Tensor):
             raise PluginError(f"{name}: returns {type(fused).__name__}, must be a torch tensor")

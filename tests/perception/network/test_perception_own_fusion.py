@@ -125,6 +125,17 @@ def test_a_fusion_cannot_change_the_maps_and_the_weights_of_others(models: str) 
     assert all(bool(each.all()) for each in given)
 
 
+def test_a_fusion_gets_contiguous_maps(models: str) -> None:
+    """However they lay in memory, so it may use `view`."""
+    seen = []
+    fusion = OwnFusion(f"{models}:largest")
+    fusion.model = lambda *given: (seen.extend(given), given[0][:, 0])[1]
+    by_cell = torch.ones(1, 2, 4, 4, 3).permute(0, 1, 4, 2, 3)
+    fusion(by_cell, torch.ones(1, 2, 4, 4, dtype=torch.bool), torch.ones(1, 1).expand(1, 2))
+    assert not by_cell.is_contiguous()
+    assert all(each.is_contiguous() for each in seen)
+
+
 def fused(reference: str, params: dict[str, object]) -> torch.Tensor:
     agents, takes_part = torch.zeros(1, 2, 80, 64, 64), torch.ones(1, 2, 64, 64, dtype=torch.bool)
     out: torch.Tensor = OwnFusion(reference, params)(agents, takes_part, torch.ones(1, 2))

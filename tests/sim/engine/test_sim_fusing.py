@@ -89,11 +89,20 @@ def test_maps_and_codes_bring_the_boxes_of_their_look_where_poses_are_corrected(
     assert both == one._replace(boxes=10, size_bytes=one.size_bytes + 3 * (24 + classes))
 
 
-def test_corrected_poses_are_refused_with_tiles() -> None:
-    with pytest.raises(
-        ScenarioError, match=r"perception\.match_poses: true, must be false where radio\.framing is tiles$"
-    ):
-        example("perception.match_poses=true", "radio.framing=tiles")
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        ("radio.framing=tiles", "radio.framing is tiles"),
+        ("perception.detector=surrogate", "detector is surrogate"),
+        ("perception.fusion=late", "fusion is late"),
+        ("perception.fusion=none", "fusion is none"),
+    ],
+)
+def test_corrected_poses_are_refused_where_no_map_is_fused(other: str, named: str) -> None:
+    on = "perception={detector: torch, match_poses: true}"
+    example(on, "perception.motion_compensation=false")
+    with pytest.raises(ScenarioError, match=f"perception.match_poses: true, must be false where {named}$"):
+        example(on, other)
 
 
 @pytest.mark.parametrize(
