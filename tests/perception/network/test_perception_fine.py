@@ -104,6 +104,13 @@ def test_compiled_loops_lay_cells_as_tensors_do(seed: int, grid: tuple[float, in
         assert torch.equal(compiled, plain)
 
 
+@pytest.mark.parametrize("odd", [math.nan, math.inf])
+def test_poses_that_are_not_finite_are_an_error(odd: float) -> None:
+    peers = torch.tensor([[1.0, 2.0, 0.5], [odd, 0.0, 0.0]])
+    with pytest.raises(ValueError, match=rf"^poses are \[0\.0, 0\.0, 0\.0\] and \[.*{odd}.*\], must be finite$"):
+        support(torch.zeros(3), peers, 1.6, 128)
+
+
 def test_the_correction_begins_as_none_and_leaves_silence() -> None:
     torch.manual_seed(0)
     align = Align(8)
