@@ -37,7 +37,7 @@ from pathlib import Path
 
 import numpy as np
 from fused_grids import WEIGHTS, frame, interval
-from sent_boxes import BOXES, BUDGET, Found, Way, flown, found_by_others, frames, own_look_table, shares
+from sent_boxes import BOXES, BUDGET, Way, flown, found_by_others, frames, own_look_table, shares
 from stored import Column, Table, points
 
 from sortie.perception.benchmark.difficulty import Difficulty
@@ -51,15 +51,15 @@ BENCH_SEED, SCENES = 14, 120
 TOWNS = range(121, 129)
 REPEATS = 60
 SENT = ("features", 1.0), ("features", 0.05), ("codes", 0.05)
-AVERAGED = Way("detections", matched=True)
 WAYS = (
     Way("none"), Way("detections"), *(Way("features", boxes=boxes) for boxes in (False, True)),
-    AVERAGED, *(Way(sent, rho, boxes, matched=True) for sent, rho in SENT for boxes in (False, True)),
+    Way("detections", matched=True), *(Way(sent, rho, boxes, matched=True) for sent, rho in SENT for boxes in (False, True)),
 )  # fmt: skip
 
 
-def frame_table(found: Mapping[Way, Found]) -> Table:
-    """AP of each way, and its differences."""
+def frame_table() -> Table:
+    """AP of each way on still frames, and its differences."""
+    found = frames(SCENES, WAYS, BENCH_SEED)
     egos = len(found[WAYS[0]].matched)
     scene = np.repeat(np.arange(egos // 5), 5)
     rows: list[list[object]] = []
@@ -139,11 +139,6 @@ def times() -> Table:
     columns += [Column(f"times the {network} one", ".2f") for network in ("coarse", "fine")]
     about = f"Medians of {REPEATS} rounds, also of the ratios, which are of one round each. Every drone's own map and boxes are computed before."
     return Table(columns, rows, about)  # type: ignore[arg-type]
-
-
-def frame_tables() -> dict[str, Table]:
-    """What is found on still frames."""
-    return {"corrected_frames": frame_table(frames(SCENES, WAYS, BENCH_SEED))}
 
 
 def own_look() -> Table:

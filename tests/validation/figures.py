@@ -509,7 +509,7 @@ def _sent_own_look() -> Tables:
 def _corrected_frames() -> Tables:
     import corrected_boxes
 
-    return corrected_boxes.frame_tables()
+    return {"corrected_frames": corrected_boxes.frame_table()}
 
 
 def _corrected_own_look() -> Tables:
