@@ -186,7 +186,7 @@ class Agent:
         self._links: dict[int, _OutgoingLink] = {}
         self._answer: Sequence[Directive] = ()  # what the policy answered last; it was checked
         self._asked_of: dict[int, Directive] = {}  # the same by peer
-        self._ids: NDArray[np.int64] | None = None  # `memory.ids` as it was then
+        self._ids: NDArray[np.int64] | None = None  # `memory.ids` as it was then, None where that is no answer of now
         table, row = memory.table, memory.row
         self._heard_s = table.heard_s[row]
         self._busy, self._at_rest, self._blamed = table.busy[row], table.at_rest[row], table.blamed[row]
@@ -375,15 +375,20 @@ class Agent:
         directives = self._policy(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns
         is_heard = view is heard
-        changed = differing(self._answer, directives, view) if is_heard and self._ids is memory.ids else None
+        known, changed = self._ids, None
+        if is_heard and known is not None:
+            changed = differing(self._answer, directives, view, self._asked_of)
         if changed is None:
             self._check(directives, view)
             self._asked_of = {d.destination: d for d in directives}
-            self._ids = memory.ids if is_heard else None
             peers = [peer for peer in view.age_s if peer != me]
         else:
-            peers = sorted({*self._overdue(ages, now_s), *[d.destination for d in changed]})
+            due = {*self._overdue(ages, now_s), *[d.destination for d in changed]}
+            if known is not memory.ids:
+                due.update([peer for peer in view.age_s if peer != me and peer not in links])
+            peers = sorted(due)
             self._asked_of.update([(d.destination, d) for d in changed])
+        self._ids = memory.ids if is_heard else None
         self._answer = tuple(directives)
         asked_of = self._asked_of
         for peer in peers:

@@ -6,7 +6,7 @@ import math
 import operator
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import compress
 from typing import Any
 
@@ -50,26 +50,36 @@ def check_directives(directives: Sequence[Directive], view: FleetView) -> None:
         seen.add(d.destination)
 
 
-def differing(before: Sequence[Directive], directives: Sequence[Directive], view: FleetView) -> list[Directive] | None:
+def differing(
+    before: Sequence[Directive], directives: Sequence[Directive], view: FleetView, linked: Mapping[int, Directive]
+) -> list[Directive] | None:
     """Those of a policy's directives that are other objects than in its answer before; most of the time it repeats itself.
 
     Args:
-        before: the answer before, which was checked by a view of the same peers.
+        before: the answer before, which was checked by a view of the same peers or some of them.
         directives: the answer now.
         view: that it was given to.
+        linked: the answer before, by destination.
 
     Returns:
         The directives that are new, checked against the contract; None where the whole answer must be checked.
     """
-    if (type(directives) is not tuple and type(directives) is not list) or len(before) != len(directives):
+    if type(directives) is not tuple and type(directives) is not list:
         return None
-    moved = list(map(operator.is_not, directives, before))
-    changed, were = compress(directives, moved), list(compress(before, moved))
+    changed, were = directives, before
+    if len(before) == len(directives):
+        moved = list(map(operator.is_not, directives, before))
+        changed, were = list(compress(directives, moved)), list(compress(before, moved))
     gone = dict(zip(map(id, were), were, strict=True))
     new = [d for d in changed if gone.pop(id(d), None) is None]  # others have only another place in the answer
-    if not _is_plainly_valid(new, view) or {d.destination for d in new} != {d.destination for d in gone.values()}:
+    if not _is_plainly_valid(new, view):
         return None
-    return new
+    renewed = {d.destination for d in gone.values()}
+    added = {d.destination for d in new}
+    is_once_each = renewed <= added and linked.keys().isdisjoint(
+        added - renewed
+    )  # no link lost its directive or has two
+    return new if is_once_each else None
 
 
 def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
