@@ -385,8 +385,8 @@ class Agent:
         else:
             due = {*self._overdue(ages, now_s), *[d.destination for d in changed]}
             if known is not memory.ids:
-                due.update([peer for peer in view.age_s if peer != me and peer not in links])
-            peers = sorted(due)
+                due.update(np.setdiff1d(memory.ids, known, assume_unique=True).tolist())
+            peers = sorted(due - {me})
             self._asked_of.update([(d.destination, d) for d in changed])
         self._ids = memory.ids if is_heard else None
         self._answer = tuple(directives)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import statistics
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +16,10 @@ from sortie.scenarios.report_text import number, percent, size
 from sortie.sim.results.sentences import losses_in_words, turns_in_words
 
 MAX_TRANSITIONS = 24
+MAX_LINKS = 24
+"""Of one row of transitions."""
+MAX_CHARGES = 24
+"""Drones of a fleet for which the charge left of each is printed."""
 PLURAL = {"car": "cars", "truck": "trucks", "person": "people"}
 WIDTH = 110
 """Columns of a summary as plain text."""
@@ -97,8 +102,7 @@ def outcome_table(result: dict[str, Any]) -> Table:
     energy = result["energy_j"]
     causes = ", ".join(f"{c} {energy[c] / 1e3:.1f}" for c in energy if c != "total" and energy[c] > 0)
     table.add_row("energy", f"{energy['total'] / 1e3:.1f} kJ ({causes})")
-    left = "  ".join(f"{i}: {percent(b['soc'])}{'' if b['airborne'] else ' down'}" for i, b in result["drones"].items())
-    table.add_row("charge left", left)
+    table.add_row("charge left", _charges_in_words(result["drones"]))
     if result["descriptor_drops"]:
         table.add_row("descriptors refused", ", ".join(f"{n} {r}" for r, n in result["descriptor_drops"].items()))
     table.add_row("switches", f"{number(result['switches'], '.2f')} a link-minute")
@@ -106,9 +110,9 @@ def outcome_table(result: dict[str, Any]) -> Table:
         "decision",
         f"{number(result['policy_eval_us']['p50'], '.0f', 'µs')} median, {number(result['policy_eval_us']['p99'], '.0f', 'µs')} p99",
     )
-    table.add_row(
-        "wall time", f"{number(result['wall_s'], '.2f', 's')}, {number(result['realtime_factor'], '.1f')} × real time"
-    )
+    speed = result["realtime_factor"]
+    speed_form = ".2g" if speed is not None and speed < 1.0 else ".1f"
+    table.add_row("wall time", f"{number(result['wall_s'], '.2f', 's')}, {number(speed, speed_form)} × real time")
     if result["disagreement"]["share"] is not None:
         table.add_row("disagreement", disagreement_in_words(result["disagreement"]))
     for name, value in result["metrics"].items():
@@ -128,6 +132,17 @@ def disagreement_in_words(figures: Mapping[str, Any]) -> str:
     why = ", ".join(f"{cause} {percent(share)}" for cause, share in sorted(causes.items(), key=lambda c: -c[1]))
     lasts = f"mean {figures['mean_s']:.2f} s, p99 {figures['p99_s']:.2f} s, longest {figures['longest_s']:.1f} s"
     return f"{told}; {figures['episodes']} episodes, {lasts}; by cause: {why}"
+
+
+def _charges_in_words(drones: Mapping[str, Any]) -> str:
+    """Charge left of each drone; of a large fleet the lowest, the median and how many are down."""
+    if len(drones) <= MAX_CHARGES:
+        return "  ".join(f"{i}: {percent(d['soc'])}{'' if d['airborne'] else ' down'}" for i, d in drones.items())
+    lowest = min(drones, key=lambda i: drones[i]["soc"])
+    middle = statistics.median(d["soc"] for d in drones.values())
+    down = sum(not d["airborne"] for d in drones.values())
+    least = f"lowest {percent(drones[lowest]['soc'])} (drone {lowest}), median {percent(middle)}"
+    return f"{least}; {down} of {len(drones)} drones down"
 
 
 def _mission_in_words(mission: dict[str, Any]) -> str:
@@ -152,14 +167,24 @@ def _people_in_words(people: dict[str, Any]) -> str:
     return f"{percent(people['located_share'])} of those in a drone's region located, {alone} by the drone's own camera"
 
 
+def _links_in_words(links: list[tuple[int, int]]) -> str:
+    """Links by their drone; the first of many, and how many more there are."""
+    by_drone: dict[int, list[str]] = {}
+    for drone, peer in sorted(links)[:MAX_LINKS]:
+        by_drone.setdefault(drone, []).append(str(peer))
+    told = "  ".join(f"{drone}→{','.join(peers)}" for drone, peers in by_drone.items())
+    more = len(links) - MAX_LINKS
+    return f"{told}  and {more} more" if more > 0 else told
+
+
 def transitions_table(result: dict[str, Any]) -> Table:
     """What the gates switched, when and why, drones that do alike in one row; events among them."""
     frame_s = result["frame_s"]
-    alike: dict[tuple[int, str, str], tuple[float, list[str]]] = {}
+    alike: dict[tuple[int, str, str], tuple[float, list[tuple[int, int]]]] = {}
     for t in result["transitions"]:
         key = (int(t["t_s"] / frame_s + 1e-6), f"{t['from']} → {t['to']}", t["reason"])
-        alike.setdefault(key, (t["t_s"], []))[1].append(f"{t['drone']}→{','.join(map(str, t['peers']))}")
-    rows = [(t_s, "  ".join(sorted(who)), what, why) for (_, what, why), (t_s, who) in alike.items()]
+        alike.setdefault(key, (t["t_s"], []))[1].extend((t["drone"], peer) for peer in t["peers"])
+    rows = [(t_s, _links_in_words(links), what, why) for (_, what, why), (t_s, links) in alike.items()]
     rows += [
         (e["t_s"], "fleet" if e["drone"] < 0 else str(e["drone"]), f"[yellow]{e['kind']}[/yellow]", e["text"])
         for e in result["events"]

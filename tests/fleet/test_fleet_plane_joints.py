@@ -245,6 +245,23 @@ def test_a_drone_that_comes_back_begins_its_links_with_nothing(left_s: float) ->
     assert granted_s[0] == pytest.approx(3.32)  # the dwell time of 0.3 s after its first decision
 
 
+def test_a_link_that_a_shown_view_began_rests_once_its_peer_is_heard() -> None:
+    """The policy asks for features in the shown view alone; in the heard view with this peer it names no link."""
+    shown_memory = memory()
+    for drone in (0, 1):
+        shown_memory.hold(descriptor(drone), 0.0)
+    shown = shown_memory.view(0.0)
+    rig = Rig(lambda view: [FEATURES] if view is shown else [], dwell_s=0.0)
+    rig.agent._reads = lambda heard: shown if rig.env.now < 0.1 else heard
+    rig.env.run(until=0.35)
+    rig.hear(1)
+    rig.env.run(until=0.65)
+    sent_s = [t_s for t_s, *_ in rig.sent]
+    assert sent_s
+    assert max(sent_s) < 0.4
+    assert not rig.gate.due(0.7)
+
+
 def test_a_drone_looks_as_often_as_any_of_its_links_asks_also_one_that_carries_nothing() -> None:
     gate = Gate()
     gate.enforce(FEATURES._replace(duty_percent=20))

@@ -115,6 +115,36 @@ def test_decisions_of_one_frame_are_one_row_and_events_stand_among_them() -> Non
     assert table.caption is None
 
 
+def test_of_many_links_that_do_alike_the_first_are_shown_and_the_others_counted() -> None:
+    """In order of the drones' numbers, and each drone once."""
+    changes = [
+        {"t_s": 0.5, "drone": drone, "from": "a", "to": "b", "reason": "r", "peers": peers}
+        for drone, peers in ((10, list(range(20, 40))), (9, [3]), (9, [1, 2]), (100, [0]))
+    ]
+    table = summary.transitions_table(told_outcome() | {"frame_s": 0.1, "transitions": changes, "events": []})
+    ((_, who, _, _),) = cells(table)
+    assert who == "9→1,2,3  10→20,21,22,23,24,25,26,27,28,29,30,31,32,33,34,35,36,37,38,39  100→0"
+    table = summary.transitions_table(
+        told_outcome() | {"frame_s": 0.1, "transitions": [*changes, changes[0] | {"drone": 0}], "events": []}
+    )
+    ((_, who, _, _),) = cells(table)
+    assert who == "0→20,21,22,23,24,25,26,27,28,29,30,31,32,33,34,35,36,37,38,39  9→1,2,3  10→20  and 20 more"
+
+
+def test_of_a_large_fleet_the_lowest_charge_is_shown_and_how_many_are_down() -> None:
+    drone = told_outcome()["drones"]["0"]
+    drones = {str(i): drone | {"soc": 0.5 + i / 100, "airborne": i != 3} for i in range(25)} | {
+        "7": drone | {"soc": 0.2}
+    }
+    shown = dict(cells(summary.outcome_table(told_outcome() | {"drones": drones})))
+    assert shown["charge left"] == "lowest 20.0 % (drone 7), median 62.0 %; 1 of 25 drones down"
+
+
+def test_a_flight_slower_than_real_time_is_shown_as_such() -> None:
+    shown = dict(cells(summary.outcome_table(told_outcome() | {"wall_s": 73.0, "realtime_factor": 0.0274})))
+    assert shown["wall time"] == "73.00 s, 0.027 × real time"
+
+
 @pytest.mark.parametrize("count", [24, 25, 30])
 def test_of_many_decisions_the_first_are_shown_and_the_others_counted(count: int) -> None:
     changes = [{"t_s": k / 2, "drone": 0, "from": "a", "to": "b", "reason": "r", "peers": [1]} for k in range(count)]
