@@ -17,7 +17,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from functools import lru_cache
-from operator import itemgetter
+from operator import is_, itemgetter
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -333,12 +333,8 @@ def nothing(source: int, destination: int, reason: str) -> Directive:
 
 def nothing_to_all(source: int, destinations: tuple[int, ...], reason: str) -> tuple[Directive, ...]:
     """`nothing` for each of several destinations."""
-    if type(destinations) is tuple and {type(source), *map(type, destinations)} == {int} and type(reason) is str:
-        made = _nothing(source, reason)
-        if len(destinations) > 1:
-            found: tuple[Directive, ...] = itemgetter(*destinations)(made)  # in half the time of one after the other
-            return found
-        return tuple([made[destination] for destination in destinations])
+    if type(destinations) is tuple and type(source) is int and type(reason) is str:
+        return _nothing(source, reason).to_all(destinations)
     return tuple([nothing(source, destination, reason) for destination in destinations])
 
 
@@ -347,6 +343,18 @@ class _Nothing(dict[int, Directive]):
 
     def __init__(self, source: int, reason: str) -> None:
         self._source, self._reason = source, reason
+        self._last: tuple[tuple[int, ...], tuple[Directive, ...]] = (), ()
+
+    def to_all(self, destinations: tuple[int, ...]) -> tuple[Directive, ...]:
+        """Those for several destinations; most often they are the same as the last time."""
+        before, answer = self._last
+        if len(destinations) == len(before) and all(map(is_, destinations, before)):
+            return answer
+        if len(destinations) < 2 or set(map(type, destinations)) != {int}:
+            return tuple([nothing(self._source, destination, self._reason) for destination in destinations])
+        made: tuple[Directive, ...] = itemgetter(*destinations)(self)  # in half the time of one after the other
+        self._last = destinations, made
+        return made
 
     def __missing__(self, destination: int) -> Directive:
         made = self[destination] = Directive(self._source, destination, reason=self._reason)
@@ -415,19 +423,20 @@ def boxes_across_networks(policy: AnyPolicy) -> AnyPolicy:
     def decide(view: FleetView, **params: object) -> Sequence[Directive]:
         directives = policy(view, **params)
         foreign = [
-            d[2] is not _NONE  # as most links carry nothing
+            k
+            for k, d in enumerate(directives)
+            if d[2] is not _NONE  # as most links carry nothing
             and (
                 (d[2] == _FEATURES and not view.shares_features_with(d.destination))
                 or (d[2] == _CODES and not view.shares_codes_with(d.destination))
             )
-            for d in directives
         ]
-        if not any(foreign):
+        if not foreign:
             return directives
-        return [
-            d._replace(representation=_DETECTIONS, rho=0.0, reason=OTHER_NETWORK) if other else d
-            for d, other in zip(directives, foreign, strict=True)
-        ]
+        changed = list(directives)
+        for k in foreign:
+            changed[k] = changed[k]._replace(representation=_DETECTIONS, rho=0.0, reason=OTHER_NETWORK)
+        return changed
 
     decide.__signature__ = inspect.signature(policy)  # type: ignore[attr-defined]
     return decide  # type: ignore[return-value]
