@@ -155,8 +155,7 @@ class Air:
         if links is not self._links:
             self._links = links
             begin = np.asarray(links.begin, np.int64)
-            receiver = links.receiver if links.is_square else links.receiver[links.by_sender]
-            self._link_lists = begin, np.ascontiguousarray(receiver, np.int64)
+            self._link_lists = begin, np.ascontiguousarray(links.receiver, np.int64)
         extra = None
         if given is None:
             gain = self.channel.now.gain
@@ -167,9 +166,6 @@ class Air:
             loss[answers & (square_db < self._service.least_snr_db)] = 1.0
             gain = linear(np.where(traced | answers, HEARD_DB, square_db)[sender, receiver])
             extra = loss[sender, receiver]
-        if not links.is_square:
-            gain = gain[links.by_sender]
-            extra = None if extra is None else extra[links.by_sender]
         self.medium.set_links(*self._link_lists, gain, frame=self.channel.frame, extra=extra)
 
     def _retune(self) -> None:

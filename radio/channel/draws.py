@@ -72,17 +72,6 @@ def link_keys(drones: Keys, sender: NDArray[np.int64], receiver: NDArray[np.int6
     return mix(drones)[sender] ^ mix(drones ^ np.uint64(0x5851F42D4C957F2D))[receiver]
 
 
-def numbers(keys: Keys, first_frame: int, frames: int) -> Keys:
-    """[frames, L]: 64 random bits a link and frame."""
-    counters = mix(np.arange(first_frame, first_frame + frames, dtype=np.uint64))
-    return mix(keys[None, :] + counters[:, None])
-
-
-def levels(bits: Keys) -> NDArray[np.uint64]:
-    """0 … 65,535, indices into the tables below: the upper 16 bits."""
-    return np.asarray(bits >> np.uint64(48))
-
-
 @lru_cache(maxsize=1)
 def normal_table() -> NDArray[np.float32]:
     """[65,536]: the standard normal distribution in steps of equal probability, ± 4.3 at most."""

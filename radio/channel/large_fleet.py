@@ -7,16 +7,17 @@ numbers that they have in a small fleet, so that one more drone changes none of 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sortie.radio.channel.antenna import Antennas
-from sortie.radio.channel.draws import StreamShadowing, drone_keys, levels, link_keys, normal_table, numbers
+from sortie.radio.channel.draws import StreamShadowing, drone_keys, link_keys, normal_table
 from sortie.radio.channel.earshot import IntArray, LinkList, both_ways, near_pairs
 from sortie.radio.channel.pathloss import path_loss_db
-from sortie.radio.channel.shadowing import ShadowField, gauss_markov, keep
+from sortie.radio.channel.shadowing import ShadowField, keep
 from sortie.radio.settings import AirSettings
 
 Array = NDArray[np.floating[Any]]
@@ -30,9 +31,9 @@ class BlockStart(NamedTuple):
 
     links: LinkList
     gain_db: Array
-    """[frames, L]: path, antennas and shadowing."""
+    """[frames, P] of pairs: path, antennas and shadowing; a link is the same in both directions."""
     shadow_db: Array
-    """[frames, L]."""
+    """[frames, P]."""
 
 
 class Crowd:
@@ -69,7 +70,6 @@ class Crowd:
         loss_db = path_loss_db(self._settings, distance, p[:, low, 2], p[:, high, 2])
         if not self._antennas.lossless:
             loss_db = loss_db + self._antennas_db(p, low, high, distance, up)
-        links = both_ways(self._n, low, high)
         shadow_db: Array
         if self._field is not None:
             at = (self._field.between(q, (frame + t) * self._frame_s) for t, q in enumerate(positions_m))
@@ -78,8 +78,7 @@ class Crowd:
             shadow_db = self._shadowing(low, high, frame, len(p))
             early = int(np.searchsorted(high, self._n_early))  # pairs are by higher id
             shadow_db[:, :early] = self._early.block(len(p))[:, low[:early], high[:early]]
-        gain_db = shadow_db - loss_db
-        return BlockStart(links, np.concatenate([gain_db, gain_db], axis=1), np.tile(shadow_db, 2))
+        return BlockStart(both_ways(self._n, low, high), shadow_db - loss_db, shadow_db)
 
     def _antennas_db(self, p: Array, low: IntArray, high: IntArray, distance: Array, up: Array | None) -> Array:
         along = (p[:, low] - p[:, high]) / np.maximum(distance, 1e-6)[..., None]
@@ -95,8 +94,11 @@ class Crowd:
             where = np.minimum(np.searchsorted(self._last_pairs, pairs), len(self._last_pairs) - 1)
             known = self._last_pairs[where] == pairs
             begin_db[known] = self._last_db[where[known]]
-        drawn = levels(numbers(link_keys(self._keys, low, high), frame, flown))
-        z = np.take(normal_table(), drawn, mode="clip")
-        shadow_db = gauss_markov(z, self._settings.shadowing_sigma_db, self._keep, begin_db)
+        from sortie.radio.channel import crowd_loops
+
+        sigma_db, kept = self._settings.shadowing_sigma_db, self._keep
+        single = map(np.float32, (sigma_db, sqrt(1.0 - kept**2) * sigma_db, kept))
+        shadow_db = np.empty((flown, len(pairs)), np.float32)
+        crowd_loops.shadowing(link_keys(self._keys, low, high), frame, normal_table(), *single, begin_db, shadow_db)
         self._last_pairs, self._last_db = pairs, shadow_db[-1].copy()
         return shadow_db

@@ -24,8 +24,10 @@ def free_space_loss_db(distance_m: ArrayLike, carrier_ghz: float) -> FloatArray:
 
 def log_distance_loss_db(distance_m: ArrayLike, carrier_ghz: float, exponent: float) -> FloatArray:
     """Free space at 1 m, then 10 · exponent · log10(d), dB; nearer than 1 m counts as 1 m."""
-    d = np.maximum(distance_m, 1.0)
-    return np.asarray(float(free_space_loss_db(1.0, carrier_ghz)) + 10.0 * exponent * np.log10(d))
+    loss_db = np.asarray(np.log10(np.maximum(distance_m, 1.0)))
+    loss_db *= 10.0 * exponent  # in place: a large fleet's are many
+    loss_db += float(free_space_loss_db(1.0, carrier_ghz))
+    return loss_db
 
 
 def two_ray_loss_db(

@@ -70,25 +70,38 @@ def _is_finite(values: FloatArray) -> bool:
 
 def linear(snr_db: AnyFloats) -> FloatArray:
     """A ratio in dB as a factor; NaN is 0."""
-    return np.nan_to_num(10.0 ** (np.asarray(snr_db, float) / 10.0))
+    factor = np.array(snr_db, float)
+    factor /= 10.0  # in place: a large fleet's links are a million
+    np.power(10.0, factor, out=factor)
+    return np.asarray(np.nan_to_num(factor, copy=False))
 
 
 class FrameLinks:
-    """The mean SNR of the links in one frame; all other forms of it are made at their first use."""
+    """The mean SNR of the links in one frame, or of their pairs; all other forms of it are made at their first use."""
 
-    __slots__ = ("_gain", "_rows", "_square", "links", "snr_db")
+    __slots__ = ("_gain", "_of_pairs", "_rows", "_snr_db", "_square", "links")
 
-    def __init__(self, links: LinkList, snr_db: AnyFloats, gain: FloatArray | None = None) -> None:
-        self.links, self.snr_db = links, snr_db
+    def __init__(
+        self, links: LinkList, snr_db: AnyFloats, gain: FloatArray | None = None, *, of_pairs: bool = False
+    ) -> None:
+        self.links, self._snr_db, self._of_pairs = links, snr_db, of_pairs
         self._square: FloatArray | None = None
         self._rows: list[list[float]] | None = None
         self._gain = gain
 
     @property
+    def snr_db(self) -> AnyFloats:
+        """[L]."""
+        if self._of_pairs:
+            self._snr_db, self._of_pairs = self.links.of_pairs(self._snr_db), False
+        return self._snr_db
+
+    @property
     def gain(self) -> FloatArray:
         """[L]: the same as a factor, 0 for NaN."""
         if self._gain is None:
-            self._gain = linear(self.snr_db)
+            gain = linear(self._snr_db)
+            self._gain = self.links.of_pairs(gain) if self._of_pairs else gain
         return self._gain
 
     @property
@@ -176,7 +189,7 @@ class Channel:
         self._block = EPOCH if self._crowd else max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones)))
         self.links = all_links(0 if self._crowd else n_drones)
         self.now = self.before = FrameLinks(self.links, np.empty(0))
-        # the block, [frames, L] each
+        # the block, [frames, L] each; of a large fleet [frames, P]
         self._snr_db: AnyFloats
         self._shadow_db: AnyFloats
         self._gain: FloatArray | None = None  # of a small fleet
@@ -198,26 +211,29 @@ class Channel:
         row = self.frame % self._block
         if row == 0:
             self._refill()
-        links, snr = self.links, self._snr_db[row]
+        links = self.links
         gain = None if self._gain is None else self._gain[row]
+        now = FrameLinks(links, self._snr_db[row], gain, of_pairs=self._crowd is not None)
+        if self._own is not None or extra_loss_db is not None or jammers:
+            now = FrameLinks(links, self._changed(now.snr_db, extra_loss_db, jammers))
+        self.before = self.now if self.frame else now
+        self.now = now
+
+    def _changed(self, snr_db: AnyFloats, extra_loss_db: ArrayLike | None, jammers: Sequence[Jammer]) -> AnyFloats:
+        """[L]: what the scenario's own model, extra losses and jammers make of this frame's links."""
+        links, snr = self.links, snr_db.copy()
         if self._own is not None:
             square_db = links.square(snr, OUT_OF_RANGE_DB)
             at_m, t_s = self._positions_m[self.frame], self.frame * self._frame_s
             snr = changed_snr(self._own, t_s, at_m, square_db)[links.sender, links.receiver]
-            gain = None
-        if extra_loss_db is not None or jammers:
-            snr = snr.copy()
-            if extra_loss_db is not None:
-                extra = np.asarray(extra_loss_db, dtype=float)
-                if extra.shape != (self.n, self.n):
-                    raise ValueError(f"extra_loss_db has shape {extra.shape}, must be {(self.n, self.n)}")
-                snr -= extra[links.sender, links.receiver]
-            if jammers:
-                snr -= self.noise_rise_db(jammers)[links.receiver]
-            gain = None
-        now = FrameLinks(links, snr, gain)
-        self.before = self.now if self.frame else now
-        self.now = now
+        if extra_loss_db is not None:
+            extra = np.asarray(extra_loss_db, dtype=float)
+            if extra.shape != (self.n, self.n):
+                raise ValueError(f"extra_loss_db has shape {extra.shape}, must be {(self.n, self.n)}")
+            snr -= extra[links.sender, links.receiver]
+        if jammers:
+            snr -= self.noise_rise_db(jammers)[links.receiver]
+        return snr
 
     def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
         """From the next frame on the fleet flies another way; what was drawn of shadowing stays.
@@ -247,7 +263,7 @@ class Channel:
     @property
     def shadow_db(self) -> FloatArray:
         """[N, N] of this frame."""
-        return self.links.square(self._shadow_db[self.frame % self._block], np.nan)
+        return self.links.square(self.links.of_pairs(self._shadow_db[self.frame % self._block]), np.nan)
 
     def noise_rise_db(self, jammers: Sequence[Jammer]) -> FloatArray:
         """[N]: how far the jammers lift each receiver's noise."""
