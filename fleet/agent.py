@@ -384,7 +384,7 @@ class Agent:
             peers = [peer for peer in view.age_s if peer != me]
         else:
             due = {*self._overdue(ages, now_s), *[d.destination for d in changed]}
-            if known is not memory.ids:
+            if known is not None and known is not memory.ids:
                 due.update(np.setdiff1d(memory.ids, known, assume_unique=True).tolist())
             peers = sorted(due - {me})
             self._asked_of.update([(d.destination, d) for d in changed])
