@@ -172,12 +172,9 @@ def _column(table: pa.Table, name: str) -> Floats:
 def _lanes(axes: Axes, record: SortieRecord) -> None:
     end_s, n = record.scenario.duration_s, _drones(record)
 
-    def best(carried: dict[tuple[int, int], str], drone: int) -> str:
-        kinds = {level.split(" ")[0] for (sender, _), level in carried.items() if sender == drone}
-        return max(kinds | {"nothing"}, key=["nothing", *list(REPRESENTATION_OF)[1:]].index)
-
+    ladder = ["nothing", *list(REPRESENTATION_OF)[1:]]
     since = dict.fromkeys(range(n), (0.0, "nothing"))
-    carried: dict[tuple[int, int], str] = {}
+    carried: list[dict[int, str]] = [{} for _ in range(n)]  # representation by drone and peer
     down: set[int] = set()
 
     def close(drone: int, t_s: float) -> None:
@@ -194,10 +191,9 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
         if "airborne" in change:
             (down.discard if change["airborne"] else down.add)(drone)
         else:
-            carried |= {(drone, peer): change["to"] for peer in change["peers"]}
-        kind = (
-            "nothing" if drone in down else best(carried, drone)
-        )  # who is down sends nothing, whatever was last decided
+            carried[drone] |= dict.fromkeys(change["peers"], change["to"].split(" ")[0])
+        # who is down sends nothing, whatever was last decided
+        kind = max({"nothing"}.union(() if drone in down else carried[drone].values()), key=ladder.index)
         if kind != since[drone][1]:
             close(drone, t_s)
             since[drone] = (t_s, kind)
