@@ -70,14 +70,15 @@ lint: $(STAMP) ## style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# torch's threads would wait in a busy loop, which takes the cores from the other worker
 scenarios: $(STAMP) ## fly the library's scenarios and test what each expects (minutes each)
-	$(BIN)/python -m pytest -n auto --dist loadfile scenarios/library
+	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest -n auto --dist loadfile scenarios/library
 
 fuzz: $(STAMP) ## try every reader with damaged inputs, ten minutes of processor time each (SECONDS_EACH=n, READER=name)
 	$(BIN)/python tests/fuzz $(READER) --seconds $(SECONDS_EACH)
 
 notebooks: $(STAMP) ## execute the notebooks
-	$(BIN)/python -m pytest -n auto --nbmake --nbmake-timeout=1200 notebooks
+	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest -n auto --nbmake --nbmake-timeout=1200 notebooks
 
 outputs: $(STAMP) ## execute the notebooks and keep their outputs, which the site shows (NOTEBOOK=name for one)
 	$(BIN)/python docs/site/run_notebooks.py $(NOTEBOOK)
