@@ -76,10 +76,8 @@ def differing(
         return None
     renewed = {d.destination for d in gone.values()}
     added = {d.destination for d in new}
-    is_once_each = renewed <= added and linked.keys().isdisjoint(
-        added - renewed
-    )  # no link lost its directive or has two
-    return new if is_once_each else None
+    # no link lost its directive, and none has two
+    return new if renewed <= added and linked.keys().isdisjoint(added - renewed) else None
 
 
 def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
