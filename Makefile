@@ -70,7 +70,7 @@ lint: $(STAMP) ## style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# torch's threads would wait in a busy loop, which takes the cores from the other worker
+# torch's threads would wait in a busy loop, which takes the cores from other workers
 scenarios: $(STAMP) ## fly the library's scenarios and test what each expects (minutes each)
 	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest -n auto --dist loadfile scenarios/library
 

@@ -186,7 +186,7 @@ class Agent:
         self._links: dict[int, _OutgoingLink] = {}
         self._answer: Sequence[Directive] = ()  # what the policy answered last; it was checked
         self._asked_of: dict[int, Directive] = {}  # the same by peer
-        self._ids: NDArray[np.int64] | None = None  # `memory.ids` as it was then, None where that is no answer of now
+        self._ids: NDArray[np.int64] | None = None  # `memory.ids` as it was then; None: check all anew
         table, row = memory.table, memory.row
         self._heard_s = table.heard_s[row]
         self._busy, self._at_rest, self._blamed = table.busy[row], table.at_rest[row], table.blamed[row]

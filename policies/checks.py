@@ -58,7 +58,7 @@ def differing(
     Args:
         before: the answer before, which was checked by a view of the same peers or some of them.
         directives: the answer now.
-        view: that it was given to.
+        view: that the answer now was given to.
         linked: the answer before, by destination.
 
     Returns:

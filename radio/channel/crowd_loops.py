@@ -27,7 +27,7 @@ def _mix(z):
 
 @loop
 def distances(positions_m, low, high, range_m, apart_m, near):
-    """Distances [frames, P] of the pairs `low`, `high` [P]; sets `near` [P] where one is at most `range_m`."""
+    """Distances [frames, P] of the pairs `low`, `high` [P]; sets `near` [P] where it is at most `range_m` in any frame."""
     for t in range(positions_m.shape[0]):
         for k in range(len(low)):
             a, b = low[k], high[k]
