@@ -5,13 +5,14 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
+NOTEBOOKS ?= notebooks
 COMPILED := .venv-compiled
 # compiled files are kept: otherwise each of hundreds of processes compiles what it imports, and each worker all tests
 export PYTHONDONTWRITEBYTECODE :=
 SOURCES := $(shell find -L sortie -type f -not -path "*/__pycache__/*")
 
 
-.PHONY: help sortie screenshot test test-all lint check format bench bench-all figures validate-ns3 ns3 mavproxy mutate clean scenarios notebooks outputs fuzz docs test-lowest compiled test-compiled
+.PHONY: help sortie screenshot test test-all nightly lint check format bench bench-all figures validate-ns3 ns3 mavproxy mutate clean scenarios scenarios-short notebooks outputs fuzz docs test-lowest compiled test-compiled
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -35,8 +36,8 @@ screenshot: $(STAMP) ## fly the paper's replay and take docs/sortie.png from the
 test: $(STAMP) ## run the test suite but for its slow tests, a worker a core
 	$(BIN)/python -m pytest -n auto -m 'not slow'
 
-test-all: $(STAMP) ## run the whole test suite
-	$(BIN)/python -m pytest -n auto
+test-all: $(STAMP) ## run the whole test suite, with other random examples each time
+	$(BIN)/python -m pytest -n auto --hypothesis-profile explore
 
 test-lowest: ## test the lowest versions that pyproject.toml allows, without torch, in .venv-lowest (Python 3.11)
 	$(PYTHON) -m venv --clear .venv-lowest
@@ -74,11 +75,16 @@ lint: $(STAMP) ## style and types
 scenarios: $(STAMP) ## fly the library's scenarios and test what each expects (minutes each)
 	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest -n auto --dist loadfile scenarios/library
 
+# the search is the largest fleet, and its point shows in a quarter of its time
+scenarios-short: $(STAMP) ## the same with the surrogate in place of the detector, seconds each
+	$(BIN)/python -m pytest -n auto --dist loadfile scenarios/library --ignore scenarios/library/search_grid.yaml --sortie-set perception.detector=surrogate
+	$(BIN)/python -m pytest scenarios/library/search_grid.yaml --sortie-set perception.detector=surrogate --sortie-set duration_s=30
+
 fuzz: $(STAMP) ## try every reader with damaged inputs, ten minutes of processor time each (SECONDS_EACH=n, READER=name)
 	$(BIN)/python tests/fuzz $(READER) --seconds $(SECONDS_EACH)
 
-notebooks: $(STAMP) ## execute the notebooks
-	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest -n auto --nbmake --nbmake-timeout=1200 notebooks
+notebooks: $(STAMP) ## execute the notebooks (NOTEBOOKS=notebooks/name.ipynb for one)
+	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest -n auto --nbmake --nbmake-timeout=1200 $(NOTEBOOKS)
 
 outputs: $(STAMP) ## execute the notebooks and keep their outputs, which the site shows (NOTEBOOK=name for one)
 	$(BIN)/python docs/site/run_notebooks.py $(NOTEBOOK)
@@ -88,6 +94,9 @@ docs: $(STAMP) ## build the documentation site into build/site; a broken link or
 	$(BIN)/python -m sphinx -W --keep-going -q -j auto -c docs/site . build/site
 
 check: lint test ## lint, types, tests
+
+nightly: ## run everything that CI leaves out because it is slow and rarely breaks (hours): before an issue is called resolved
+	bash .ci/run nightly
 
 format: $(STAMP) ## format and fix what can be fixed
 	$(BIN)/ruff check --fix .

@@ -9,7 +9,7 @@ import signal
 import pytest
 import typer.main
 import typer.testing
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 # torch's threads wait in a busy loop by themselves, which takes the cores from other workers; read when torch is loaded
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -20,8 +20,10 @@ typer.main.get_command = typer.testing._get_command = functools.cache(typer.main
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # begun in the background: children would ignore Ctrl-C as well
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-settings.register_profile("sortie", deadline=None)  # a deadline is a timed assertion: it fails on a busy machine alone
-settings.load_profile("sortie")
+# A deadline and the check of slow draws are timed assertions: they fail on a busy machine alone.
+settings.register_profile("explore", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True)
+settings.register_profile("same", settings.get_profile("explore"), derandomize=True)
+settings.load_profile("same")  # the same examples in each run; `make nightly` explores others
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
