@@ -6,13 +6,10 @@ STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
 NOTEBOOKS ?= notebooks
-COMPILED := .venv-compiled
 # compiled files are kept: otherwise each of hundreds of processes compiles what it imports, and each worker all tests
 export PYTHONDONTWRITEBYTECODE :=
-SOURCES := $(shell find -L sortie -type f -not -path "*/__pycache__/*")
 
-
-.PHONY: help sortie screenshot test test-all nightly lint check format bench bench-all figures validate-ns3 ns3 mavproxy mutate clean scenarios scenarios-short notebooks outputs fuzz docs test-lowest compiled test-compiled
+.PHONY: help sortie screenshot test test-all nightly lint check format bench bench-all figures validate-ns3 ns3 mavproxy mutate clean scenarios scenarios-short notebooks outputs fuzz docs test-lowest
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -47,24 +44,6 @@ test-lowest: ## test the lowest versions that pyproject.toml allows, without tor
 	.venv-lowest/bin/sortie fly track_target --set perception.detector=surrogate --set duration_s=5 --out .venv-lowest/run
 	@# the one left out counts the operations of the torch network
 	.venv-lowest/bin/python -m pytest -m 'not slow' tests/scenarios tests/policies tests/radio tests/fleet --ignore tests/fleet/test_fleet_computer.py
-
-# A copy of the tree is compiled, so that nothing is left in the tree; the libraries are those of .venv.
-$(COMPILED)/.installed: $(STAMP) setup.py $(SOURCES)
-	$(BIN)/python -m venv --clear $(COMPILED)
-	@mkdir $(COMPILED)/tree
-	@cp -rL sortie setup.py pyproject.toml README.md LICENSE $(COMPILED)/tree
-	SORTIE_COMPILE=1 PIP_CONSTRAINT=$(CURDIR)/constraints.txt $(COMPILED)/bin/python -m pip install --quiet --no-deps $(COMPILED)/tree
-	@rm -r $(COMPILED)/tree
-	@$(BIN)/python -c 'import sys; print(*[p for p in sys.path if p.endswith("site-packages")], sep="\n")' > $$($(COMPILED)/bin/python -c 'import site; print(site.getsitepackages()[0])')/of_venv.pth
-	@touch $@
-
-compiled: $(COMPILED)/.installed ## install Sortie with its radio compiled by mypyc into .venv-compiled (needs a C compiler)
-
-test-compiled: compiled ## test that the compiled radio makes equal records, and run the tests of the radio with it
-	$(BIN)/python -m pytest tests/test_compiled.py
-	@# from a copy of the tests: beside the tree its sources would be imported
-	@rm -rf $(COMPILED)/tests && cp -r tests pyproject.toml $(COMPILED)
-	cd $(COMPILED) && bin/python -m pytest -n auto -m 'not slow' tests/radio tests/sim/engine/test_sim_transport.py
 
 lint: $(STAMP) ## style and types
 	$(BIN)/ruff check .

@@ -7,9 +7,7 @@ import hashlib
 import inspect
 import numbers
 import re
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.metadata import requires, version
 from importlib.resources import files
 from pathlib import Path
@@ -33,7 +31,7 @@ _WITHOUT_TORCH = {"none", "surrogate"}
 def code_version() -> str:
     """The release, a plus sign, and 16 hex digits of a SHA-256 digest.
 
-    The digest covers every file of the installed package (sources, compiled parts, learned parameters, the library of
+    The digest covers every file of the installed package (sources, learned parameters, the library of
     scenarios) and the version of every library that the package requires. Two processes with equal versions run the
     same code, but for optional libraries: what is kept of flights with torch is kept under `flight_code`.
 
@@ -42,22 +40,6 @@ def code_version() -> str:
         True
     """
     return f"{RELEASE}+{digest_of(contents(files('sortie')), _required())[:16]}"
-
-
-def compiled_modules() -> list[str]:
-    """The modules of Sortie in this process that mypyc compiled; none in the usual install.
-
-    Records do not depend on it, only the time that a flight takes.
-    """
-    own = {
-        name: getattr(module, "__file__", None) for name, module in sys.modules.items() if name.startswith("sortie.")
-    }
-    return sorted(name for name, file in own.items() if str(file).endswith(tuple(EXTENSION_SUFFIXES)))
-
-
-def named_version() -> str:
-    """`code_version` for readers: it also says whether the radio is compiled."""
-    return code_version() + (" (radio compiled)" if compiled_modules() else "")
 
 
 def codes_here() -> tuple[str, str]:

@@ -41,7 +41,7 @@ from sortie.sim.cli import (
     worst,
 )
 from sortie.sim.cli.console import err, out
-from sortie.sim.identity import named_version
+from sortie.sim.identity import code_version
 from sortie.sim.process import own_process
 from sortie.sim.user_errors import missing, path_errors
 
@@ -119,5 +119,5 @@ def main() -> None:
 @app.callback(invoke_without_command=True)
 def _version(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     if version:
-        out.print(named_version())
+        out.print(code_version())
         raise typer.Exit

@@ -129,8 +129,6 @@ def page(
         release: `release.json`; empty for none.
         host_s: seconds that this machine takes for a million additions.
     """
-    from sortie.sim.identity import compiled_modules
-
     scale = host_s / release["host_s"] if release else 1.0
     columns = [
         Column("what"), Column("Sortie", ".3f", " s"), Column("times as fast as real time", ".1f"), Column("peer"),
@@ -147,8 +145,6 @@ def page(
         ])  # fmt: skip
     missing = sorted({i.peer for i in items if i.peer and found[i.what][1] is None})
     about = f"Processor seconds, the least of {RUNS} runs; peers ran in the same call."
-    if compiled_modules():
-        about += " The radio is compiled (`make compiled`)."
     if missing:
         about += f" Not installed here: {', '.join(missing)}."
     return Table(columns, rows, about)

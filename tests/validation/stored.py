@@ -18,7 +18,7 @@ from typing import Any
 from sortie.perception.metrics.bootstrap import Difference
 from sortie.scenarios.report_text import MINUS, NONE, interval, replace_section, table
 from sortie.sim.folders import write_text
-from sortie.sim.identity import named_version
+from sortie.sim.identity import code_version
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs/results/tables"
@@ -99,7 +99,7 @@ def save(
 
     Args: `hardware`: where times are measured. `network`: the weights by which a table's accuracy was measured.
     """
-    made = {"sortie": named_version(), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
+    made = {"sortie": code_version(), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
     more = {"network": network, "hardware": hardware}
     store(name, tables, made | {key: value for key, value in more.items() if value}, folder)
 

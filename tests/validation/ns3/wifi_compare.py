@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from stored import Column, Table
 from wifi_air import FADING, QUIET, run_air, shadowing_db
-from wifi_compiled import compiled_cpu_s
 from wifi_ns3 import run_ns3
 from wifi_plan import FRAME_S, Case
 
@@ -186,15 +185,13 @@ def loads_table(cases: Sequence[Case], seeds: Sequence[int], about: str) -> Tabl
     columns = [Column("fleet and payload"), Column("load", ".0f", " %", 100)]
     for c in shown.values():
         columns += [Column(f"{c.name}: ns-3", c.form, c.unit, c.factor), Column("Sortie", c.form, c.unit, c.factor)]
-    columns += [Column("times as fast", ".0f"), Column("compiled", ".0f"), Column("beyond its bound")]
+    columns += [Column("times as fast", ".0f"), Column("beyond its bound")]
     through_air(LOADS[0], seeds[0])  # what is compiled or loaded at its first use is no part of a run's time
     rows: list[list[Any]] = []
-    found = compared(cases, seeds)
-    compiled_s = compiled_cpu_s(cases, seeds) or [math.nan] * len(cases)
-    for (case, ns3, ours), machine_s in zip(found, compiled_s, strict=True):
+    for case, ns3, ours in compared(cases, seeds):
         cells = [None if math.isnan(one.get(name, math.nan)) else one[name] for name in shown for one in (ns3, ours)]
-        speeds = [None if math.isnan(cpu_s) else ns3["cpu_s"] / cpu_s for cpu_s in (ours["cpu_s"], machine_s)]
-        rows.append([case.name, case.load or None, *cells, *speeds, _words(beyond(case, ns3, ours))])
+        speed = ns3["cpu_s"] / ours["cpu_s"]
+        rows.append([case.name, case.load or None, *cells, speed, _words(beyond(case, ns3, ours))])
     return Table(columns, rows, about)
 
 
@@ -203,7 +200,7 @@ def tables(seeds: Sequence[int] = SEEDS) -> dict[str, Table]:
     about = (
         f"Seeds: {len(seeds)}. Every drone sends a descriptor of 208 B and its payloads ten times a second, at MCS 9 in the "
         "cross and MCS 7 elsewhere, unless the row names another. Delays are of delivered payloads; speed compares "
-        "the medians of processor time; *compiled* is by the compiled radio (`make compiled`)."
+        "the medians of processor time."
     )
     flows = [
         [case.name, ns3["saturated_mbps"], ours["saturated_mbps"], ours["saturated_mbps"] / ns3["saturated_mbps"] - 1,

@@ -55,8 +55,7 @@ def table(seed: int, plans: int, seeds: tuple[int, ...] = SEEDS) -> Table:
     """Drawn plans by both simulators."""
     about = (
         f"{plans} plans, drawn from the seed {seed}; {len(seeds)} seeds for each. The load is the offered payload over what "
-        "one sender carries alone. Speed compares the medians of processor time; *compiled* is by the compiled radio "
-        "(`make compiled`)."
+        "one sender carries alone. Speed compares the medians of processor time."
     )
     return loads_table([drawn(seed, k) for k in range(plans)], seeds, about)
 
