@@ -126,7 +126,7 @@ def make_detector(scene: SceneModel, config: Perception, seed: int, replication:
     """The detector that the scenario names; None where only traffic is simulated.
 
     Raises:
-        ValueError: weights or a recording that are missing or do not fit, naming the file.
+        InputError: weights or a recording that are missing or do not fit, naming the file.
     """
     if config.detector not in DETECTORS:
         return _own(scene, config, seed, replication)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.budget import CODEBOOK_BYTES
 from sortie.perception.errors import InputError
+from sortie.scenarios.regular import regular
 
 _MOST_DEFLATED = 1040
 """Deflate makes at most so many bytes of one, and a little more at a stream's begin and end."""
@@ -49,7 +50,7 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         Exception: a damaged archive can raise nearly anything: zlib.error, RuntimeError, NotImplementedError.
     """
-    with path.open("rb") as stream:
+    with regular(path).open("rb") as stream:
         with zipfile.ZipFile(stream) as archive:
             for info in archive.infolist():
                 if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -74,6 +75,6 @@ def codebook_digest(path: Path) -> str:
         InputError: the file cannot be read.
     """
     try:
-        return hashlib.blake2b(path.read_bytes(), digest_size=CODEBOOK_BYTES - 1).hexdigest()
+        return hashlib.blake2b(regular(path).read_bytes(), digest_size=CODEBOOK_BYTES - 1).hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot be read as a codebook ({error.strerror})") from None

@@ -36,6 +36,7 @@ from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import DroneJoins, Scenario
 from sortie.scenarios.whole import whole
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version
 from sortie.sim.results.accuracy import matched
 from sortie.sim.results.record import SortieRecord
@@ -81,11 +82,11 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         """Args: `scenario` with at least two drones; its policy and its `limits.run_s` are not used.
 
         Raises:
-            ValueError: a lone drone, which has nothing to decide.
+            RunError: a lone drone, which has nothing to decide.
         """
         n = scenario.fleet.drones
         if n < 2:
-            raise ValueError(f"fleet.drones is {n}, must be at least 2 to share")
+            raise RunError(f"fleet.drones is {n}, must be at least 2 to share")
         scored = scenario.perception.model_copy(
             update={"egos": max(n, scenario.perception.egos)}
         )  # each drone is rewarded for its own boxes
@@ -137,7 +138,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         """Fly one step under these actions; one that is missing stays as it was.
 
         Raises:
-            ValueError: no such agent, or an action outside its space; nothing has been flown, the step may be tried again.
+            RunError: no such agent, or an action outside its space; nothing has been flown, the step may be tried again.
         """
         flight = self._resumed() if self.agents else None
         if flight is None:
@@ -184,7 +185,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     def _checked(self, agent: str, action: Any) -> np.ndarray[Any, Any]:
         """The action by link [N - 1, choices], a copy: the sortie's thread would wrap a −1 around and cut a 0.5 off."""
         if agent not in self._spaces:
-            raise ValueError(f"actions: {agent!r}, must be of {self.possible_agents[0]} … {self.possible_agents[-1]}")
+            raise RunError(f"actions: {agent!r}, must be of {self.possible_agents[0]} … {self.possible_agents[-1]}")
         space = self.action_space(agent)
         try:
             given = np.array(action)
@@ -193,7 +194,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
         if not space.contains(given):
             said = f"{given.tolist() if given.shape else action!r}"
             most = ", ".join(str(n - 1) for n in CHOICES)
-            raise ValueError(
+            raise RunError(
                 f"{agent}: action {said}, must be {space.shape[0]} whole numbers: "
                 f"for each other drone {len(CHOICES)} of at least 0 and at most {most}"
             )
@@ -369,12 +370,12 @@ class TeamEnv(gymnasium.Env[Obs, np.ndarray[Any, Any]]):
         """Fly one step under these actions.
 
         Raises:
-            ValueError: an action outside its space; nothing has been flown, the step may be tried again.
+            RunError: an action outside its space; nothing has been flown, the step may be tried again.
         """
         n, each = len(self.drones.possible_agents), self.drones.action_space("drone_0").shape[0]
         if np.size(action) != n * each:
             must = f"must be {n * each} whole numbers: those of each drone, one after the other"
-            raise ValueError(f"action: {np.asarray(action).tolist()}, {must}")
+            raise RunError(f"action: {np.asarray(action).tolist()}, {must}")
         rows = np.reshape(action, (n, each))
         given = {a: rows[int(a.removeprefix("drone_"))] for a in self.drones.agents}
         observations, rewards, _, over, infos = self.drones.step(given)

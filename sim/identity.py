@@ -18,6 +18,7 @@ from sortie.scenarios.code_digest import contents, digest_of, installed
 from sortie.scenarios.plugins.reference import file_of, is_file, package_of
 from sortie.scenarios.plugins.user_code import imported_files, imported_packages
 from sortie.scenarios.reading.files import ensure_files, named_files, named_models
+from sortie.scenarios.regular import regular
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.shipped import located
 
@@ -254,7 +255,7 @@ def file_digest(path: Path) -> str:
     Raises:
         OSError: the file cannot be read.
     """
-    now = path.stat()
+    now = regular(path).stat()
     return _digest_as_it_stands(path, now.st_size, now.st_mtime_ns)
 
 

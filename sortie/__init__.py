@@ -11,10 +11,10 @@ Everything here is loaded when it is first used. What is not in `__all__` is pri
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # typing's own takes a while to import
 if TYPE_CHECKING:
+    from typing import Any
+
     from sortie._api import (
         CampaignResult,
         Comparison,
@@ -86,7 +86,9 @@ def __getattr__(name: str) -> Any:
 
         value: Any = version("sortie-sim")
     elif name in _HOME_OF:
-        value = getattr(importlib.import_module(_HOME_OF[name]), name)
+        from importlib import import_module
+
+        value = getattr(import_module(_HOME_OF[name]), name)
     else:
         raise AttributeError(f"module 'sortie' has no attribute {name!r}")
     globals()[name] = value

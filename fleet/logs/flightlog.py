@@ -20,6 +20,7 @@ from sortie.fleet.logs.fields import Found, from_dataflash, from_tlog, from_ulog
 from sortie.fleet.logs.geodesy import metres_per_radian
 from sortie.fleet.logs.ulog import is_ulog, read_ulog
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.regular import regular
 
 Array = npt.NDArray[np.float64]
 
@@ -108,7 +109,7 @@ def read_logs(path: str | Path) -> tuple[FlightLog, ...]:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if regular(path).stat().st_size > MAX_BYTES:
             raise LogError(f"{path}: {path.stat().st_size} bytes, must be at most {MAX_BYTES}")
         data = path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name

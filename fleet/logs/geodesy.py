@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from sortie.scenarios.errors import SortieError
+
 _FARTHEST_UP_M = 100_000.0
 """Of an origin; MAVLink's altitudes are 32-bit millimetres."""
 
@@ -25,12 +27,12 @@ class Origin:
 
     def __post_init__(self) -> None:
         if not (abs(self.latitude_deg) <= 85 and abs(self.longitude_deg) <= 180):
-            raise ValueError(
+            raise SortieError(
                 f"origin is ({self.latitude_deg}, {self.longitude_deg}), must lie within ±85° and ±180°: a local "
                 "east and north mean nothing at a pole"
             )
         if not abs(self.altitude_m) <= _FARTHEST_UP_M:
-            raise ValueError(f"its altitude is {self.altitude_m} m, must be within ±{_FARTHEST_UP_M:g} m")
+            raise SortieError(f"its altitude is {self.altitude_m} m, must be within ±{_FARTHEST_UP_M:g} m")
 
 
 def geodetic(position_m: tuple[float, float, float], origin: Origin) -> tuple[float, float, float]:

@@ -11,6 +11,7 @@ from sortie.perception.benchmark.dataset import Benchmark
 from sortie.perception.benchmark.difficulty import Split
 from sortie.perception.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
 from sortie.perception.benchmark.visibility import SEEN, inside, visible
+from sortie.perception.errors import InputError
 from sortie.perception.files import replacing
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import CAMERAS, Renderer
@@ -28,13 +29,13 @@ def draw(bench: Benchmark, split: Split, index: int, frame: int = 0) -> Figure:
 
     Raises:
         ImportError: matplotlib is missing.
-        ValueError: no such scene or frame.
+        InputError: no such scene or frame.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon
 
     if index < 0 or frame < 0:
-        raise ValueError(f"scene {index}, frame {frame}: must be 0 or above")
+        raise InputError(f"scene {index}, frame {frame}: must be 0 or above")
     config = draw_scene(bench.seed, split, index, bench.difficulty)
     scene = model_of(config)
     captures = draw_captures(bench.seed, split, index, frame, bench.difficulty, bench.geometry.cameras)

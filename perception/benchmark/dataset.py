@@ -21,6 +21,7 @@ from sortie.perception.benchmark import manifest
 from sortie.perception.benchmark.difficulty import Difficulty, Layout, Split
 from sortie.perception.benchmark.manifest import COLUMNS, BenchmarkError
 from sortie.perception.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
+from sortie.perception.errors import InputError
 from sortie.perception.files import replacing
 from sortie.perception.geometry import FULL, Geometry
 from sortie.perception.network.bev import lift
@@ -83,7 +84,7 @@ class Benchmark:
             stored = data["benchmark"]
             known = {f.name for f in fields(Difficulty)}
             if set(stored["difficulty"]) != known:
-                raise ValueError(f"difficulty has {sorted(set(stored['difficulty']) ^ known)} too many or too few")
+                raise InputError(f"difficulty has {sorted(set(stored['difficulty']) ^ known)} too many or too few")
             bench = cls(stored["seed"], _difficulty(stored["difficulty"]), Geometry(**stored["geometry"]))
         except (KeyError, TypeError, ValueError) as error:
             raise BenchmarkError(f"{path}: cannot be understood: {error}") from error
@@ -169,13 +170,13 @@ def make_split(
         progress: called with scenes done and scenes to make.
 
     Raises:
-        ValueError: scenes that the split does not have, or none.
+        InputError: scenes that the split does not have, or none.
         BenchmarkError: a file on disk is broken, or a worker was killed.
     """
     count, frames = SIZES[split]
     which = scenes if isinstance(scenes, range) else range(count if scenes is None else scenes)
     if not which or which[0] < 0 or which[-1] >= MOST[split]:
-        raise ValueError(f"scenes is {scenes}, must be 1 to the {MOST[split]} of the {split} split")
+        raise InputError(f"scenes is {scenes}, must be 1 to the {MOST[split]} of the {split} split")
     folder = bench.folder(root)
     paths = {k: folder / split / f"scene_{scene_id(bench.seed, split, k)}_{frames}.npz" for k in which}
     known = manifest.listed(folder, split)
@@ -204,11 +205,11 @@ def load_frames(paths: Sequence[Path]) -> Frames:
     """All frames of the files, in order, in memory (1.3 MB a fleet-frame, 5.2 MB of sharp images; twice that while they are put together).
 
     Raises:
-        ValueError: no files.
+        InputError: no files.
         BenchmarkError: a file cannot be read.
     """
     if not paths:
-        raise ValueError("load_frames needs at least one file")
+        raise InputError("load_frames needs at least one file")
     parts = [manifest.read_arrays(path) for path in paths]
     most = max(p["cars"].shape[1] for p in parts)
     for p in parts:

@@ -10,6 +10,8 @@ import re
 from dataclasses import dataclass, fields, replace
 from typing import Literal, NamedTuple, get_args
 
+from sortie.perception.errors import InputError
+
 Allocation = Literal["uniform", "overlap"]
 CellsBy = Literal["confidence", "norm"]
 Unsent = Literal["zero", "masked"]
@@ -40,7 +42,7 @@ class Sharing:
     """What every ego of every frame receives.
 
     Raises:
-        ValueError: naming the field, its value and what it must be.
+        InputError: naming the field, its value and what it must be.
     """
 
     received_budget: float
@@ -60,16 +62,16 @@ class Sharing:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.received_budget <= 1.0:
-            raise ValueError(f"received_budget is {self.received_budget}, must be 0 to 1")
+            raise InputError(f"received_budget is {self.received_budget}, must be 0 to 1")
         if not _PEERS.fullmatch(self.peers):
-            raise ValueError(
+            raise InputError(
                 f"peers is {self.peers!r}, must be none, or all-k, best-k, worst-k or random-k with k 1 to 99"
             )
         for name, allowed in _ALLOWED.items():
             if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} is {getattr(self, name)!r}, must be {' or '.join(allowed)}")
+                raise InputError(f"{name} is {getattr(self, name)!r}, must be {' or '.join(allowed)}")
         if self.peers == "none" and self.received_budget != 0.0:
-            raise ValueError(f"received_budget is {self.received_budget} with no peers, must be 0")
+            raise InputError(f"received_budget is {self.received_budget} with no peers, must be 0")
 
     @property
     def rule(self) -> str:
@@ -103,7 +105,7 @@ class Sharing:
         """The condition that a label names.
 
         Raises:
-            ValueError: a label that no condition has.
+            InputError: a label that no condition has.
         """
         if label == "single":
             return SINGLE
@@ -112,11 +114,11 @@ class Sharing:
         known = {value: name for name, values in _ALLOWED.items() for value in values}
         try:
             if not at:
-                raise ValueError("no @ in it")
+                raise InputError("no @ in it")
             knobs: dict[str, str] = {known[m]: m for m in marks if m != "roi"}
             return cls(float(budget), peers, roi="roi" in marks, **knobs)  # type: ignore[arg-type]
         except (ValueError, KeyError) as error:
-            raise ValueError(f"condition is {label!r}, must be like best-2@0.02,masked ({error})") from None
+            raise InputError(f"condition is {label!r}, must be like best-2@0.02,masked ({error})") from None
 
     def plain(self, drones: int = 5) -> Sharing:
         """The simplest condition that gives the same boxes in a fleet of this size; what is equal is computed once.

@@ -109,7 +109,7 @@ def measure(
     About 45 CPU seconds a scene.
 
     Raises:
-        ValueError: weights that are missing or do not fit.
+        InputError: weights that are missing or do not fit.
     """
     rows = moves() if rows is None else rows
     setup = {"code": boxes_digest(), "format": FORMAT, "seed": SEED, "moves": [asdict(m) for m in rows]}

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.budget import cells_in
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation import selection
 from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, FrameView, Instrument
@@ -75,16 +76,16 @@ def evaluate(
         progress: called with frames done and frames in all.
 
     Raises:
-        ValueError: an unknown region or convention, more egos than drones, or a condition that does not fit the fleet.
+        InputError: an unknown region or convention, more egos than drones, or a condition that does not fit the fleet.
     """
     drones = frames.est_pose.shape[1]
     if not 1 <= egos <= drones:
-        raise ValueError(f"egos is {egos}, must be 1 to the {drones} drones of a frame")
+        raise InputError(f"egos is {egos}, must be 1 to the {drones} drones of a frame")
     for region in regions:
         if region not in get_args(Region):
-            raise ValueError(f"region is {region!r}, must be {' or '.join(get_args(Region))}")
+            raise InputError(f"region is {region!r}, must be {' or '.join(get_args(Region))}")
     if convention not in CONVENTIONS:
-        raise ValueError(f"convention is {convention!r}, must be {' or '.join(CONVENTIONS)}")
+        raise InputError(f"convention is {convention!r}, must be {' or '.join(CONVENTIONS)}")
     conditions = tuple(dict.fromkeys(conditions))
     settings = Settings(egos, floor, convention, seed)
     plain = {c: c.plain(drones) for c in conditions}

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import CellsBy
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
 from sortie.perception.geometry import Geometry
@@ -51,7 +52,7 @@ class CarNetInstrument:
 
     @classmethod
     def load(cls, weights: Path, device: torch.device = CPU, fusion_params: Params | None = None) -> CarNetInstrument:
-        """From a weights file; ValueError where it is missing or does not fit."""
+        """From a weights file; InputError where it is missing or does not fit."""
         return cls(load_weights(weights), device, fusion_params)
 
     def start_worker(self) -> None:
@@ -130,11 +131,11 @@ class CarNetView:
         Args: `fusion` in place of the network's, such as a tuned copy.
 
         Raises:
-            ValueError: the network's fusion is not DiscoNet.
+            InputError: the network's fusion is not DiscoNet.
         """
         fusion = fusion or self.net.fusion
         if not isinstance(fusion, DiscoNet):
-            raise ValueError(f"fusion is {fusion.name}, must be disconet")
+            raise InputError(f"fusion is {fusion.name}, must be disconet")
         peers = tuple(i for i in range(len(self.features)) if i != ego)
         own = self.own(ego)[torch.from_numpy(cells).to(self._table.device)]
         inside = self.support(ego, peers).inside.flatten(1)[:, cells]

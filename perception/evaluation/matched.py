@@ -16,10 +16,12 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from sortie.perception.code_digest import boxes_digest
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.files import replacing
 from sortie.perception.joining import NMS_IOU
 from sortie.perception.metrics.ap import CONVENTIONS, Matched, average_precision
+from sortie.scenarios.regular import regular
 
 Region = Literal["full", "mission", "ego"]
 Floats = NDArray[np.float64]
@@ -78,10 +80,10 @@ class Evaluation:
         """The same with every box below `tau` gone.
 
         Raises:
-            ValueError: below the floor, where boxes were not kept.
+            InputError: below the floor, where boxes were not kept.
         """
         if not tau >= self.settings.floor:  # NaN is neither
-            raise ValueError(f"tau is {tau}, must be at least the floor {self.settings.floor}")
+            raise InputError(f"tau is {tau}, must be at least the floor {self.settings.floor}")
         cut = {key: [m.at(tau) for m in several] for key, several in self.units.items()}
         return replace(self, units=cut, settings=replace(self.settings, floor=tau))
 
@@ -117,7 +119,7 @@ class Evaluation:
         """What `save` wrote.
 
         Raises:
-            ValueError: no such file, or not one of these; the message names it.
+            InputError: no such file, or not one of these; the message names it.
         """
         try:
             results, facts = read_frames(path)
@@ -125,7 +127,7 @@ class Evaluation:
             conditions = [Sharing.parse(label) for label in facts["conditions"]]
             return assemble(frames, conditions, facts["regions"], Settings(**facts["settings"]), facts["scene"])
         except (OSError, pa.ArrowInvalid, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: not an evaluation of this project ({error!r})") from None
+            raise InputError(f"{path}: not an evaluation of this project ({error!r})") from None
 
     def _frame(self, f: int) -> FrameResult:
         these = slice(f * self.settings.egos, (f + 1) * self.settings.egos)
@@ -173,7 +175,7 @@ class MatchedStore:
             try:
                 found, _ = read_frames(part)
             except (OSError, pa.ArrowInvalid, KeyError, ValueError) as error:
-                raise ValueError(f"{part}: not part of an evaluation ({error!r}); remove it to go on") from None
+                raise InputError(f"{part}: not part of an evaluation ({error!r}); remove it to go on") from None
             for key, result in found.items():
                 self._done[key] = _joined(self._done.get(key), result)
         self._new: dict[str, FrameResult] = {}
@@ -262,5 +264,5 @@ def read_frames(path: Path) -> tuple[dict[str, FrameResult], dict[str, Any]]:
     Raises:
         Exception: OSError, pyarrow.ArrowInvalid, KeyError or ValueError where it is not such a file.
     """
-    table = pq.read_table(path)
+    table = pq.read_table(regular(path))
     return _from_table(table), json.loads(table.schema.metadata[b"sortie"])

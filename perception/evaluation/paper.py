@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames, load_frames, make_split
 from sortie.perception.benchmark.scenes import draw_captures, draw_scene, model_of, scene_id
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.claims import conditions
 from sortie.perception.evaluation.contract import FleetFrames, Instrument
 from sortie.perception.evaluation.evaluate import Region, evaluate
@@ -55,11 +56,11 @@ def bench_frames(
     missing.
 
     Raises:
-        ValueError: more frames than the split has.
+        InputError: more frames than the split has.
     """
     scenes, per_scene = SIZES["test"]
     if count is not None and not 1 <= count <= scenes * per_scene:
-        raise ValueError(f"frames is {count}, must be 1 to the test split's {scenes * per_scene}")
+        raise InputError(f"frames is {count}, must be 1 to the test split's {scenes * per_scene}")
     return load_frames(make_split(Benchmark(seed, geometry=geometry), "test", root, scenes=count, progress=progress))
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import FULL_SHARING, PAPER_WAYS, CellsBy, Sharing, Ways
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, Instrument
 from sortie.perception.evaluation.evaluate import REGION_M, Settings, exchanges, frame_keys, mission_target, truth
@@ -60,13 +61,13 @@ def picture(
     """Frame `f` from one ego, under zero fill; `cells_by` and `ways` as for `measures.under`.
 
     Raises:
-        ValueError: no such frame or drone.
+        InputError: no such frame or drone.
     """
     n, drones = frames.est_pose.shape[:2]
     if not 0 <= f < n:
-        raise ValueError(f"frame is {f}, must be 0 to {n - 1}")
+        raise InputError(f"frame is {f}, must be 0 to {n - 1}")
     if not 0 <= ego < drones:
-        raise ValueError(f"ego is {ego}, must be 0 to {drones - 1}")
+        raise InputError(f"ego is {ego}, must be 0 to {drones - 1}")
     settings = Settings(egos=drones)
     key = frame_keys(frames)[f]
     target = mission_target(frames, f, key)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import PAPER_WAYS, CellsBy, Unsent, Ways
 from sortie.perception.evaluation.matched import FLOOR, Evaluation
 from sortie.perception.evaluation.scores import Bootstrap, By
@@ -21,7 +22,7 @@ class TableSettings:
     """How the table is measured. The defaults are the paper's instrument, with masked fusion beside it.
 
     Raises:
-        ValueError: naming the field, its value and the bound.
+        InputError: naming the field, its value and the bound.
     """
 
     unsent: tuple[Unsent, ...] = ("zero", "masked")
@@ -35,11 +36,11 @@ class TableSettings:
 
     def __post_init__(self) -> None:
         if not self.unsent:
-            raise ValueError("unsent names no instrument, must name zero, masked or both")
+            raise InputError("unsent names no instrument, must name zero, masked or both")
         if not FLOOR <= self.tau < 1.0:
-            raise ValueError(f"tau is {self.tau:g}, must be at least {FLOOR:g} and below 1")
+            raise InputError(f"tau is {self.tau:g}, must be at least {FLOOR:g} and below 1")
         if self.draws < 1:
-            raise ValueError(f"draws is {self.draws}, must be at least 1")
+            raise InputError(f"draws is {self.draws}, must be at least 1")
 
 
 @dataclass(frozen=True, slots=True)

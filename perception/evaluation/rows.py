@@ -14,12 +14,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.special import ndtri
 
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.claims import CLAIMS, SECTIONS, Claim, Kind, conditions
 from sortie.perception.evaluation.condition import Unsent
 from sortie.perception.evaluation.measures import ApOf, Elsewhere, Region, Scores
 from sortie.perception.evaluation.verdict import ClaimVerdict, MeasuredValue
 from sortie.scenarios.intervals import benjamini_hochberg
 from sortie.scenarios.plain_sum import plain_sum
+from sortie.scenarios.regular import regular
 
 INSTRUMENTS: dict[Unsent, str] = {"zero": "the paper's instrument", "masked": "masked fusion"}
 """How cells that were not sent count, and the heading of that column."""
@@ -172,11 +174,11 @@ def from_table(table: pa.Table) -> tuple[list[ClaimRow], dict[str, Any]]:
     """Rows and facts back.
 
     Raises:
-        ValueError: a column that is missing.
+        InputError: a column that is missing.
     """
     missing = sorted(set(SCHEMA.names) - set(table.column_names))
     if missing:
-        raise ValueError(f"column {missing[0]} is missing")
+        raise InputError(f"column {missing[0]} is missing")
     facts: dict[str, Any] = json.loads((table.schema.metadata or {}).get(b"sortie", b"{}"))
     return [ClaimRow(**r) for r in table.select(SCHEMA.names).to_pylist()], facts
 
@@ -185,9 +187,9 @@ def read(path: Path) -> tuple[list[ClaimRow], dict[str, Any]]:
     """The table of a report.
 
     Raises:
-        ValueError: no such file, or not one of these; the message names it.
+        InputError: no such file, or not one of these; the message names it.
     """
     try:
-        return from_table(pq.read_table(path))
+        return from_table(pq.read_table(regular(path)))
     except (OSError, pa.ArrowInvalid, ValueError) as error:
-        raise ValueError(f"{path}: not the table of a report ({error})") from None
+        raise InputError(f"{path}: not the table of a report ({error})") from None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.perception.budget import CELLS, Bools, index_bytes, payload_bytes, ranking, roi_mask
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import Allocation, Sharing
 from sortie.perception.geometry import FULL, Geometry
 from sortie.scenarios.disc import Disc, disc_overlap, rank_by_overlap
@@ -38,11 +39,11 @@ def choose(condition: Sharing, ego: int, overlap: Floats, key: tuple[int, ...] =
         seed: of the random peers.
 
     Raises:
-        ValueError: more peers than there are, or all-k where the fleet has another number.
+        InputError: more peers than there are, or all-k where the fleet has another number.
     """
     others = [i for i in range(len(overlap)) if i != ego]
     if condition.k > len(others) or (condition.rule == "all" and condition.k != len(others)):
-        raise ValueError(f"peers is {condition.peers!r}, must fit a fleet with {len(others)} peers")
+        raise InputError(f"peers is {condition.peers!r}, must fit a fleet with {len(others)} peers")
     if condition.rule == "all":
         return tuple(others)
     ranked = rank_by_overlap(ego, {i: float(overlap[i]) for i in others})

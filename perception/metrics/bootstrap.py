@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sortie.perception.errors import InputError
 from sortie.perception.metrics.ap import Matched, area, average_precision
 from sortie.scenarios.intervals import DRAWS, Floats, p_value, percentile_interval, resamples
 
@@ -111,10 +112,10 @@ def compare(
         draws, seed: number of resamples and the key of their stream.
 
     Raises:
-        ValueError: a and b have unequally many frames.
+        InputError: a and b have unequally many frames.
     """
     if len(a) != len(b):
-        raise ValueError(f"a has {len(a)} frames and b has {len(b)}, must be the same")
+        raise InputError(f"a has {len(a)} frames and b has {len(b)}, must be the same")
     ranked = [rank(units, groups) for units in (a, b)]
     ap_a, ap_b = average_precision(a), average_precision(b)
     if len(ranked[0].truths) < 2:

@@ -106,7 +106,7 @@ class TorchDetector:
         weights: a safetensors file; None takes the one shipped for `perception.fusion`.
 
     Raises:
-        ValueError: weights that are missing or do not fit, naming file and tensor, or that learned another fusion.
+        InputError: weights that are missing or do not fit, naming file and tensor, or that learned another fusion.
 
     One capture's rendering and encoding, and one ego's fusion, are tasks of one thread each; as many run side by
     side as torch has threads when the detector is made (`torch.set_num_threads`). Tasks begin in the order in which they

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import torch
 
+from sortie.perception.errors import InputError
+
 
 def device_named(name: str | None) -> torch.device:
     """The device of a name: "cpu", "cuda", or one of several GPUs as in "cuda:1". With "auto" or None, a GPU where there is one.
 
     Raises:
-        ValueError: there is none of that name here.
+        InputError: there is none of that name here.
     """
     there = ["auto", "cpu"]
     if torch.cuda.is_available():
         there += ["cuda", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))]
     if name is not None and name not in there:
-        raise ValueError(f"device is {name!r}, must be one of {', '.join(there)} here")
+        raise InputError(f"device is {name!r}, must be one of {', '.join(there)} here")
     return torch.device(("cuda" if "cuda" in there else "cpu") if name in (None, "auto") else name)
 
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sortie.perception.errors import InputError
 from sortie.perception.geometry import CELLS, CHANNELS, HEAD_PX, IMAGE_PX, Geometry
 from sortie.perception.network.bev import ground_points
 from sortie.perception.network.fusion.base import Fusion
@@ -245,15 +246,15 @@ class CarNet(nn.Module):
         fusion: a fusion in place of the built-in one that `config` names.
 
     Raises:
-        ValueError: a fusion that is not there, naming those that are.
+        InputError: a fusion that is not there, naming those that are.
     """
 
     def __init__(self, config: ModelConfig = ModelConfig(), fusion: Fusion | None = None) -> None:
         super().__init__()
         if fusion is None and config.fusion not in FUSIONS:
-            raise ValueError(f"fusion is {config.fusion!r}, must be one of {', '.join(FUSIONS)}")
+            raise InputError(f"fusion is {config.fusion!r}, must be one of {', '.join(FUSIONS)}")
         if config.grid == "fine" and fusion is None and config.fusion not in FINE_FUSIONS:
-            raise ValueError(f"fusion is {config.fusion!r} of a fine network, must be one of {', '.join(FINE_FUSIONS)}")
+            raise InputError(f"fusion is {config.fusion!r} of a fine network, must be one of {', '.join(FINE_FUSIONS)}")
         self.config = config
         self.encoder = Encoder(config)
         self.fusion = _fusion(config) if fusion is None else fusion

@@ -29,6 +29,7 @@ from sortie.perception.geometry import FULL
 from sortie.perception.recordings.recording import Floats
 from sortie.perception.recordings.unpickle import UnpickleError, load_data
 from sortie.perception.recordings.writing import write_recording
+from sortie.scenarios.regular import regular
 
 UAVS = 5
 SIDES = ("FRONT", "BACK", "LEFT", "RIGHT", "BOTTOM")
@@ -240,7 +241,7 @@ def read_image(root: Path | str, camera: Camera) -> NDArray[np.uint8]:
 
     path = Path(root) / camera.file
     try:
-        with Image.open(path) as image:
+        with Image.open(regular(path)) as image:
             return np.asarray(image.convert("RGB"), np.uint8)
     except OSError as error:
         raise Uav3dError(f"{path}: cannot be read as an image ({error.strerror or error})") from None
@@ -299,7 +300,7 @@ class _Record:
 def _table(path: Path) -> dict[str, _Record]:
     """A JSON table by token."""
     try:
-        rows = json.loads(path.read_bytes())
+        rows = json.loads(regular(path).read_bytes())
     except OSError as error:
         raise Uav3dError(f"{path}: {error.strerror or error}") from None
     except ValueError as error:

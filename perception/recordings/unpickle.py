@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.regular import regular
 
 _NOW = {
     "numpy._core.multiarray": "numpy.core.multiarray",  # numpy 2
@@ -52,7 +53,7 @@ def load_data(path: Path | str) -> Any:
             much memory or time.
     """
     try:
-        data = Path(path).read_bytes()
+        data = regular(Path(path)).read_bytes()
         _ensure_within_limits(data)
         return loads_data(data)
     except (UnpickleError, OSError) as error:

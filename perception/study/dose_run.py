@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.benchmark.dataset import SIZES, Benchmark, Frames, load_frames, make_split
 from sortie.perception.code_digest import boxes_digest
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import SINGLE, Sharing
 from sortie.perception.evaluation.evaluate import exchanges, frame_hash, frame_keys, in_order, match_all, truth
 from sortie.perception.evaluation.instrument import CPU, CarNetInstrument
@@ -59,7 +60,7 @@ def measure(
         progress: called with (stage, done, of).
 
     Raises:
-        ValueError: frames beyond the test split, or weights that are not there.
+        InputError: frames beyond the test split, or weights that are not there.
     """
     tell = progress or (lambda stage, done, of: None)
     data = frames_of(plan.frames if frames is None else frames, root, tell)
@@ -195,7 +196,7 @@ def frames_of(ranges: Sequence[FrameRange], root: Path, tell: Progress) -> Frame
     files: list[Path] = []
     for r in ranges:
         if not 0 <= r.first <= r.last < scenes:
-            raise ValueError(f"frames {r.first} to {r.last} of benchmark {r.bench_seed}: must lie in 0 to {scenes - 1}")
+            raise InputError(f"frames {r.first} to {r.last} of benchmark {r.bench_seed}: must lie in 0 to {scenes - 1}")
         render, which = partial(tell, f"rendering benchmark {r.bench_seed}"), range(r.first, r.last + 1)
         files += make_split(Benchmark(seed=r.bench_seed), "test", root, scenes=which, progress=render)
     return load_frames(files)

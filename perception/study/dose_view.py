@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import Unsent
 from sortie.perception.evaluation.contract import Exchange, Floats
 from sortie.perception.evaluation.instrument import BATCH, CarNetView
@@ -52,10 +53,10 @@ def tuned(fusion: Fusion, tuning: Tuning) -> DiscoNet:
     """A copy of a network's fusion, tuned to a dose; it shares the weights.
 
     Raises:
-        ValueError: the network's fusion is not DiscoNet.
+        InputError: the network's fusion is not DiscoNet.
     """
     if not isinstance(fusion, DiscoNet):
-        raise ValueError(f"fusion is {fusion.name}, must be disconet")
+        raise InputError(f"fusion is {fusion.name}, must be disconet")
     out = copy.copy(fusion)
     out.tune(tuning.temperature, tuning.silent_weight)
     return out

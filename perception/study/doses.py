@@ -17,8 +17,10 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 from scipy.stats import spearmanr
 
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import SINGLE, Absent, Sharing, Unsent, Ways
 from sortie.perception.evaluation.measures import Contrast, Scores
+from sortie.scenarios.regular import regular
 from sortie.scenarios.schema.base import Params
 
 PLAN = Path(__file__).parent / "doses.toml"
@@ -71,7 +73,7 @@ class FrameRange:
         """As the command line writes it.
 
         Raises:
-            ValueError: not of this form.
+            InputError: not of this form.
 
         Example:
             >>> FrameRange.parse("1:0-239")
@@ -79,7 +81,7 @@ class FrameRange:
         """
         found = re.fullmatch(r"(\d{1,9}):(\d{1,9})-(\d{1,9})", text)
         if found is None:
-            raise ValueError(f"frames is {text!r}, must be a benchmark's seed and frames, such as 7:0-239")
+            raise InputError(f"frames is {text!r}, must be a benchmark's seed and frames, such as 7:0-239")
         return cls(*map(int, found.groups()))
 
 
@@ -114,15 +116,15 @@ def read_plan(path: Path = PLAN) -> DosePlan:
     """The plan in a TOML file.
 
     Raises:
-        ValueError: naming the file, the place and what must be there.
+        InputError: naming the file, the place and what must be there.
     """
     try:
-        return TypeAdapter(DosePlan).validate_python(tomllib.loads(path.read_text("utf-8")))
+        return TypeAdapter(DosePlan).validate_python(tomllib.loads(regular(path).read_text("utf-8")))
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: not TOML ({error})") from None
+        raise InputError(f"{path}: not TOML ({error})") from None
     except ValidationError as error:
         first = error.errors()[0]
-        raise ValueError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise InputError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +177,7 @@ def verdicts(rows: Sequence[DoseRow]) -> dict[str, tuple[bool, ...]]:
     """By network: which of the plan's hypotheses hold, in the plan's order.
 
     Raises:
-        ValueError: a network without zero fill at two doses, or without a masked control.
+        InputError: a network without zero fill at two doses, or without a masked control.
     """
     return {name: _hold([r for r in rows if r.network == name]) for name in dict.fromkeys(r.network for r in rows)}
 
@@ -186,7 +188,7 @@ def _hold(rows: Sequence[DoseRow]) -> tuple[bool, ...]:
     )
     masked = [r for r in rows if r.dose.unsent == "masked"]
     if len(filled) < 2 or not masked:
-        raise ValueError("the plan needs zero fill at two doses or more, and a masked control")
+        raise InputError("the plan needs zero fill at two doses or more, and a masked control")
     least, most = filled[0], filled[-1]
     rises = spearmanr([r.weight_on_zeros for r in filled], [r.contrasts[0].value for r in filled]).statistic
     return (

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 from sortie.perception.benchmark.difficulty import Density
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import CellsBy, Sharing, Unsent
 from sortie.perception.training.recipe import Recipe
+from sortie.scenarios.regular import regular
 
 PLAN = Path(__file__).parent / "variants.toml"
 Tau = float | str
@@ -81,16 +83,16 @@ def read_plan(path: Path = PLAN) -> StudyPlan:
     """The plan in a TOML file.
 
     Raises:
-        ValueError: naming the file, the place and what must be there.
+        InputError: naming the file, the place and what must be there.
     """
     try:
-        raw = tomllib.loads(path.read_text("utf-8"))
+        raw = tomllib.loads(regular(path).read_text("utf-8"))
         given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in raw["evaluation"].items()}
         measured = MeasuredGrid(**given)
         variants = tuple(_variant(v) for v in raw["variant"])
         plan = StudyPlan(raw["question"]["paper"].strip(), raw["question"]["hypothesis"].strip(), measured, variants)
     except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not a plan of a study ({error})") from None
+        raise InputError(f"{path}: not a plan of a study ({error})") from None
     for name, values, allowed in (
         ("unsent", measured.unsent, get_args(Unsent)),
         ("cells_by", measured.cells_by, get_args(CellsBy)),
@@ -98,19 +100,19 @@ def read_plan(path: Path = PLAN) -> StudyPlan:
     ):
         for value in values:
             if value not in allowed:
-                raise ValueError(f"{path}: evaluation.{name} has {value!r}, must be {' or '.join(allowed)}")
+                raise InputError(f"{path}: evaluation.{name} has {value!r}, must be {' or '.join(allowed)}")
     for tau in measured.taus:
         if tau not in ("model", "f1") and not (isinstance(tau, float) and 0 < tau < 1):
-            raise ValueError(f"{path}: evaluation.taus has {tau!r}, must be model, f1 or above 0 and below 1")
+            raise InputError(f"{path}: evaluation.taus has {tau!r}, must be model, f1 or above 0 and below 1")
     list(measured.conditions())  # raises with its own message
     known: dict[str, Variant] = {}
     for v in variants:
         if v.name in known:
-            raise ValueError(f"{path}: variant {v.name} is named twice")
+            raise InputError(f"{path}: variant {v.name} is named twice")
         if v.begins_from and v.begins_from not in known:
-            raise ValueError(f"{path}: variant {v.name} is from {v.begins_from!r}, must be a variant before it")
+            raise InputError(f"{path}: variant {v.name} is from {v.begins_from!r}, must be a variant before it")
         if v.begins_from and not set(v.seeds) <= set(known[v.begins_from].seeds):
-            raise ValueError(f"{path}: variant {v.name} has seeds that {v.begins_from} has not")
+            raise InputError(f"{path}: variant {v.name} has seeds that {v.begins_from} has not")
         for seed in v.seeds:
             v.recipe_for(seed)
         known[v.name] = v

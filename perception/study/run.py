@@ -13,6 +13,7 @@ import torch
 
 from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
 from sortie.perception.benchmark.difficulty import Density, Difficulty
+from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.instrument import CPU, CarNetInstrument
@@ -49,11 +50,11 @@ def train_job(
     """Train one network of the plan into `folder`, from its checkpoint if it has one; None if its weights are there.
 
     Raises:
-        ValueError: a job that is not in the plan, or one that begins from weights that are not there.
+        InputError: a job that is not in the plan, or one that begins from weights that are not there.
     """
     found = next(((v, s) for v, s in plan.jobs() if v.job(s) == job), None)
     if found is None:
-        raise ValueError(f"{job} is not in the plan, must be one of {', '.join(v.job(s) for v, s in plan.jobs())}")
+        raise InputError(f"{job} is not in the plan, must be one of {', '.join(v.job(s) for v, s in plan.jobs())}")
     folders = [folder] if shipped is None else [folder, shipped]
     if weights_of(job, *folders) is not None:
         return None
@@ -61,7 +62,7 @@ def train_job(
     begins = variant.begins(seed)
     warm_start = weights_of(begins, *folders) if begins else None
     if begins and warm_start is None:
-        raise ValueError(f"{job} begins from {begins}, which has no weights in {folder}")
+        raise InputError(f"{job} begins from {begins}, which has no weights in {folder}")
     log.info("training %s: %s", job, variant.reason)
     return train(
         folder / f"{job}.safetensors",

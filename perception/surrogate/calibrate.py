@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.errors import InputError
 from sortie.perception.files import replacing
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import average_precision, match
@@ -50,12 +51,12 @@ def calibrate(
         weights: the detector's; None takes the shipped ones.
 
     Raises:
-        ValueError: weights that do not fit, too few scenes, or an `out` that ends as its card does.
+        InputError: weights that do not fit, too few scenes, or an `out` that ends as its card does.
     """
     if out.suffix == ".md":
-        raise ValueError(f"out is {out}, must not end in .md, as its card does")
+        raise InputError(f"out is {out}, must not end in .md, as its card does")
     if scenes < 2 or held_out < 2:
-        raise ValueError(f"{scenes} scenes and {held_out} held out, must be at least 2 each")
+        raise InputError(f"{scenes} scenes and {held_out} held out, must be at least 2 each")
     report = progress or (lambda stage, done, of: None)
     path = named_weights(weights)
     config = read_config(path)

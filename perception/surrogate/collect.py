@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.code_digest import boxes_digest
+from sortie.perception.errors import InputError
 from sortie.perception.files import replacing
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene.scene_model import SceneModel
@@ -111,7 +112,7 @@ def read(path: Path, split: Split) -> DetectorRuns:
     jobs = moment(seed, split, scene, index)
     captures = captures_of(jobs)
     if len(jobs) != len(count) or len(captures) != len(ranks):
-        raise ValueError(f"{path}: holds {len(count)} results, the plan has {len(jobs)} jobs; remove it")
+        raise InputError(f"{path}: holds {len(count)} results, the plan has {len(jobs)} jobs; remove it")
     parts = np.split(table, np.cumsum(count)[:-1])
     boxes = [Boxes(p[:, :2], p[:, 2:4], p[:, 4], p[:, 5]) for p in parts]
     return DetectorRuns(split, scene, jobs, boxes, dict(zip(captures, ranks, strict=True)))

@@ -14,6 +14,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import expit, logit, ndtr, ndtri
 from torch import Tensor
 
+from sortie.perception.errors import InputError
 from sortie.perception.metrics.overlap import iou_pairs
 from sortie.perception.surrogate.exchange import ALARM_COVARIATES
 from sortie.perception.surrogate.features import axes, on_axes
@@ -296,7 +297,7 @@ def _alarms(rows: FitRows, floor: float, rng: np.random.Generator) -> tuple[Arra
     """Bands of scores, how many of each job's alarms lie in each, and alarms to draw from."""
     score = rows.alarm[:, 5]
     if len(score) < 50:
-        raise ValueError(f"{len(score)} false alarms above {floor:g}, at least 50 are needed; calibrate on more scenes")
+        raise InputError(f"{len(score)} false alarms above {floor:g}, at least 50 are needed; calibrate on more scenes")
     edges = np.append(np.quantile(score, BANDS), 1.0)
     edges[0] = floor
     edges = np.maximum.accumulate(edges + 1e-6 * np.arange(len(edges)))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from sortie.perception.errors import InputError
 from sortie.perception.joining import NMS_IOU
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.types import Boxes
@@ -81,11 +82,11 @@ def fit(moments: Sequence[Moment]) -> BoxErrors:
     """The most likely standard deviations, if errors are normal about zero, and the part that drones have in common.
 
     Raises:
-        ValueError: fewer than a hundred errors.
+        InputError: fewer than a hundred errors.
     """
     score, distance, off = _together(moments)
     if len(score) < FEWEST:
-        raise ValueError(f"{len(score)} boxes lie on a car, must be at least {FEWEST}")
+        raise InputError(f"{len(score)} boxes lie on a car, must be at least {FEWEST}")
     x = terms(score, distance)
     along, across = (tuple(_most_likely(x, axis * axis).tolist()) for axis in off.T)
     alone = BoxErrors(along, across)

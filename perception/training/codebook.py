@@ -16,6 +16,7 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_split
 from sortie.perception.budget import payload_bytes
+from sortie.perception.errors import InputError
 from sortie.perception.files import replacing
 from sortie.perception.geometry import CHANNELS
 from sortie.perception.network.codebook import ENTRIES, Codebook, encoder_digest, save_codebook
@@ -62,10 +63,10 @@ def fit(cells: Floats, recipe: CodebookRecipe, progress: Callable[[str, int, int
     """The stages [stages, 256, 80] of a codebook: k-means of what the stages before leave of cells [n, 80].
 
     Raises:
-        ValueError: fewer cells than a stage has entries.
+        InputError: fewer cells than a stage has entries.
     """
     if len(cells) < ENTRIES:
-        raise ValueError(f"{len(cells)} cells, must be at least {ENTRIES}")
+        raise InputError(f"{len(cells)} cells, must be at least {ENTRIES}")
     left = np.array(cells, np.float32)
     stages = np.empty((recipe.stages, ENTRIES, left.shape[1]), np.float32)
     for k in range(recipe.stages):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from sortie.perception.benchmark.dataset import MOST, SIZES, Benchmark
+from sortie.perception.errors import InputError
 
 PEAK_LR = 2.5e-3
 Precision = Literal["float32", "bfloat16"]
@@ -18,7 +19,7 @@ class Recipe:
     """One run. Everything that its weights follow from, beside the machine.
 
     Raises:
-        ValueError: naming the field, its value and its bounds.
+        InputError: naming the field, its value and its bounds.
     """
 
     steps: int = 500
@@ -51,19 +52,19 @@ class Recipe:
         ):
             value = getattr(self, name)
             if not low <= value <= high:
-                raise ValueError(f"{name} is {value}, must be {low} to {high}")
+                raise InputError(f"{name} is {value}, must be {low} to {high}")
         if self.batch % 2:
-            raise ValueError(f"batch is {self.batch}, must be even")
+            raise InputError(f"batch is {self.batch}, must be even")
         if not 0 < self.peak_lr <= 1:
-            raise ValueError(f"peak_lr is {self.peak_lr}, must be above 0 and at most 1")
+            raise InputError(f"peak_lr is {self.peak_lr}, must be above 0 and at most 1")
         if not 0 <= self.cell_dropout <= 1:
-            raise ValueError(f"cell_dropout is {self.cell_dropout}, must be 0 to 1")
+            raise InputError(f"cell_dropout is {self.cell_dropout}, must be 0 to 1")
         if not 0 <= self.varied <= 1:
-            raise ValueError(f"varied is {self.varied}, must be 0 to 1")
+            raise InputError(f"varied is {self.varied}, must be 0 to 1")
         if self.precision not in get_args(Precision):
-            raise ValueError(f"precision is {self.precision!r}, must be float32 or bfloat16")
+            raise InputError(f"precision is {self.precision!r}, must be float32 or bfloat16")
         if self.unsent not in ("masked", "zero"):
-            raise ValueError(f"unsent is {self.unsent!r}, must be masked or zero")
+            raise InputError(f"unsent is {self.unsent!r}, must be masked or zero")
 
 
 def command(recipe: dict[str, Any], model: dict[str, Any], bench_seed: int, out: str) -> str:

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_split
 from sortie.perception.benchmark.difficulty import VARIED
+from sortie.perception.errors import InputError
 from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference
 from sortie.perception.network.checkpoint import load_weights, read_config
@@ -112,7 +113,7 @@ def train(
             A resumed run first calls it with the rows that `loss.csv` already has.
 
     Raises:
-        ValueError: weights that cannot be read, a benchmark, weights or a checkpoint of another range or image than the
+        InputError: weights that cannot be read, a benchmark, weights or a checkpoint of another range or image than the
             network's, or no such device.
     """
     begun = time.monotonic()
@@ -120,11 +121,11 @@ def train(
     show = scalars or (lambda step, values: None)
     bench = Benchmark(geometry=config.geometry) if bench is None else bench
     if bench.geometry.half_extent_m != config.half_extent_m:
-        raise ValueError(
+        raise InputError(
             f"the benchmark reaches ±{bench.geometry.half_extent_m:g} m, must be the network's ±{config.half_extent_m:g} m"
         )
     if bench.geometry != config.geometry:
-        raise ValueError(
+        raise InputError(
             f"the benchmark's image_px is {bench.geometry.image_px}, must be the network's {config.image_px}"
         )
     where = device_named(device)
@@ -246,7 +247,7 @@ def _begin_from(net: CarNet, path: Path, log: logging.Logger) -> None:
     given = load_weights(path, copy.deepcopy(net.fusion) if own else None)
     found = read_config(path)
     if found.half_extent_m != net.config.half_extent_m:
-        raise ValueError(f"{path}: made for another range than ±{net.config.half_extent_m:g} m")
+        raise InputError(f"{path}: made for another range than ±{net.config.half_extent_m:g} m")
     _refuse_other_image(path, found.image_px, net.config)
     mine, theirs = net.state_dict(), given.state_dict()
     fit = {k: v for k, v in theirs.items() if k in mine and mine[k].shape == v.shape}
@@ -258,7 +259,7 @@ def _begin_from(net: CarNet, path: Path, log: logging.Logger) -> None:
 
 def _refuse_other_image(path: Path, image_px: int, config: ModelConfig, advice: str = "") -> None:
     if image_px != config.image_px:
-        raise ValueError(f"{path}: image_px is {image_px}, must be {config.image_px} as in the run{advice}")
+        raise InputError(f"{path}: image_px is {image_px}, must be {config.image_px} as in the run{advice}")
 
 
 def _resume_curve(path: Path, done: int) -> list[tuple[int, dict[str, float]]]:
@@ -300,7 +301,7 @@ def _restore(
     """Load a checkpoint of the same run; no progress when there is none or it belongs to another.
 
     Raises:
-        ValueError: it belongs to a network of another image.
+        InputError: it belongs to a network of another image.
     """
     from safetensors import safe_open
 

@@ -11,6 +11,7 @@ import functools
 import hashlib
 import inspect
 import re
+import sys
 import traceback
 from collections.abc import Callable, Mapping
 from importlib.metadata import Distribution, EntryPoint, entry_points
@@ -154,25 +155,54 @@ def _from_package(kind: str, entry: EntryPoint, error: type[SortieError]) -> Cal
         function = entry.load()
     except Exception as failure:
         where = f"{entry.name!r} of {entry.dist.name if entry.dist else entry.value}"
-        raise error(f"{kind} {where} does not load: {type(failure).__name__}: {failure}") from failure
+        raise error(f"{kind} {where} does not load: {describe_error(failure)}") from failure
     if not callable(function):
         raise error(f"{kind} {entry.name!r}: {entry.value} is no function or class")
     return guarded(function)
 
 
-def describe_error(error: BaseException) -> str:
-    """An exception that a user's code raised, and the last line of the user's own files that it passed through."""
-    frames = traceback.walk_tb(error.__traceback__)
-    lines = [(f.f_code.co_filename, n) for f, n in frames if is_users(f.f_globals.get("__name__"))]
-    place = f" ({Path(lines[-1][0]).name}, line {lines[-1][1]})" if lines else ""
-    text = f"{type(error).__name__}: {error}{place}"
+def describe_error(error: BaseException, called: Any = None) -> str:
+    """An exception that a user's code raised, with the file and the last line of that code that it passed through.
+
+    Where it passed through none, as with a wrong number of arguments, they are those where `called` is defined.
+    """
+    lines = _lines_outside(error) or _defined(called)
+    own = next((top for top, _, _ in lines if is_users(top)), lines[0][0] if lines else "")
+    place = next((f" ({Path(file).name}, line {n})" for top, file, n in reversed(lines) if top == own), "")
+    text = f"{error if isinstance(error, SortieError) else f'{type(error).__name__}: {error}'}{place}"
     return text.encode(errors="backslashreplace").decode()  # a table and a terminal take no half of a surrogate pair
+
+
+def passes_through_users(error: BaseException) -> bool:
+    """Whether an exception was raised in a file that `load` ran, or in what that file called."""
+    return any(is_users(top) for top, _, _ in _lines_outside(error))
+
+
+def _lines_outside(error: BaseException) -> list[tuple[str, str, int]]:
+    """The lines of a traceback that are neither Sortie's nor Python's: package, file and number."""
+    lines = []
+    for frame, number in traceback.walk_tb(error.__traceback__):
+        top = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if top != "sortie" and top not in sys.stdlib_module_names:
+            lines.append((top, frame.f_code.co_filename, number))
+    return lines
+
+
+def _defined(called: Any) -> list[tuple[str, str, int]]:
+    """As `_lines_outside`: where a function or class of the user is defined."""
+    inner = _inner(called)
+    code = getattr(inner.__init__ if inspect.isclass(inner) else inner, "__code__", None)
+    return [] if code is None else [("", code.co_filename, code.co_firstlineno)]
+
+
+def _inner(model: Any) -> Any:
+    inner = inspect.unwrap(model)
+    return inspect.unwrap(getattr(inner, "func", inner))
 
 
 def name_of(model: Any) -> str:
     """A model's name for errors: that of the function or class."""
-    inner = inspect.unwrap(model)
-    inner = inspect.unwrap(getattr(inner, "func", inner))
+    inner = _inner(model)
     owner = getattr(inner, "__self__", None)
     if owner is not None:
         return f"{type(owner).__name__}.{inner.__name__}"
@@ -183,10 +213,10 @@ def checked_call(kind: str, function: Callable[..., Any], *args: Any, **kwargs: 
     """Call a user's model; what it raises becomes a `PluginError` of one line that names the model and the place."""
     try:
         return function(*args, **kwargs)
-    except SortieError:
+    except PluginError:  # of a model that this one calls
         raise
     except (Exception, SystemExit) as failure:
-        raise PluginError(f"{kind} {name_of(function)}: {describe_error(failure)}") from failure
+        raise PluginError(f"{kind} {name_of(function)}: {describe_error(failure, function)}") from failure
 
 
 def checked_array(

@@ -1,6 +1,6 @@
 """A process that ends its parent when the parent's threads stand still for too long. It imports nothing of Sortie.
 
-`user_calls.py` starts it, with the file of the shared memory, its format, the time of a tick, and the exit code.
+`user_calls.py` starts it, with the file of the shared memory, its format, and the time of a tick.
 """
 
 import mmap

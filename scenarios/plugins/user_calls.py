@@ -23,6 +23,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sortie.scenarios.exit_codes import FAILED, STUCK
+
 DECISION_S = 10.0
 """The longest time for a decision where no scenario says otherwise."""
 LOAD_S = 60.0
@@ -30,8 +32,6 @@ LOAD_S = 60.0
 GRACE_S = 5.0
 """A call that is interrupted must end within this time. It is interrupted again when half of it is over."""
 TICK_S = 0.1
-STUCK = 70
-"""Exit code of a process that was ended because a call could not be interrupted."""
 BEAT = "=Qd480s"
 """What `stuck.py` reads: a counter of ticks, how long it may stand still (0: for ever), and the error to print."""
 
@@ -215,7 +215,7 @@ class _Watch:
     def end(self) -> bool:
         """Whether the call was late. A process that the call forked ends here: it must not go on with what the first one does."""
         if os.getpid() != self._process:
-            _exit(STUCK)
+            _exit(FAILED)
         with self._lock:
             self.calling = False
         return self._ticks * TICK_S > self._limit_s
@@ -254,7 +254,7 @@ class _Beat:
             file.truncate(struct.calcsize(BEAT))
             self._memory = mmap.mmap(file.fileno(), struct.calcsize(BEAT))
             script = Path(__file__).with_name("stuck.py")
-            command = [sys.executable, "-I", "-S", str(script), str(file.fileno()), BEAT, str(TICK_S), str(STUCK)]
+            command = [sys.executable, "-I", "-S", str(script), str(file.fileno()), BEAT, str(TICK_S)]
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=[file.fileno()])  # noqa: S603 - our own script
         self._ticks = 0
         atexit.register(self._close)

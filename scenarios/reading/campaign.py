@@ -24,6 +24,7 @@ from sortie.scenarios.reading.load import (
 )
 from sortie.scenarios.reading.nodes import MAX_DEPTH, Node, ScenarioError, as_node, assign, child, dotted, plain
 from sortie.scenarios.reading.strict_yaml import read_scalar
+from sortie.scenarios.regular import regular
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.campaign import (
     Campaign,
@@ -187,7 +188,7 @@ def _column(spread: Column, here: Path, node: Node) -> tuple[Any, ...]:
     path = here / spread.file
     at = f"{node.where}: {path}"
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with regular(path).open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
             if spread.column not in (rows.fieldnames or ()):
                 has = ", ".join(rows.fieldnames or ()) or "nothing"

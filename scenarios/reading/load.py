@@ -30,6 +30,7 @@ from sortie.scenarios.reading.nodes import (
     problems,
 )
 from sortie.scenarios.reading.strict_yaml import read_yaml, write_yaml
+from sortie.scenarios.regular import regular
 from sortie.scenarios.schema import Airframe, DescriptorForm, Scenario
 from sortie.scenarios.schema.base import PresetSection
 from sortie.scenarios.schema.conditions import ConditionSet
@@ -141,7 +142,7 @@ def read(path_or_name: str | Path, wanted: Mapping[str, Path] | None = None) -> 
     """
     path = {**library(), **campaigns(), **condition_sets()}.get(str(path_or_name), Path(path_or_name))
     try:
-        with path.open("rb") as file:
+        with regular(path, or_pipe=True).open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
         raise ScenarioError(f"{path}: no such file, {_nearby(path, wanted)}") from None

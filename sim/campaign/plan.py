@@ -306,7 +306,7 @@ def _check_metrics(study: Study, policies: Sequence[Mapping[str, Any]]) -> None:
     for i, name in enumerate(study.campaign.metrics):
         try:
             check_number(name, keys)
-        except ValueError as error:
+        except RunError as error:
             raise RunError(f"{study.where('metrics', i)}: {error}") from None
 
 

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 
-from sortie.scenarios.plugins.user_calls import STUCK
+from sortie.scenarios.exit_codes import FAILED, STUCK
 from sortie.sim.campaign.signals import undisturbed
 from sortie.sim.campaign.work import RunResult, Task, flies_user_code, fly_in_worker, killed, stuck
 
@@ -210,4 +210,4 @@ def _end_with(driver: int) -> None:
     """End this process when the driver is gone, also in the middle of a run."""
     while os.getppid() == driver:
         time.sleep(0.5)
-    os._exit(1)
+    os._exit(FAILED)

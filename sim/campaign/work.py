@@ -22,6 +22,7 @@ from sortie.perception.network.memory import keep_freed
 from sortie.policies.contract import Policy
 from sortie.scenarios.code_digest import installed
 from sortie.scenarios.plugins.reference import package
+from sortie.scenarios.reading.nodes import ScenarioError
 from sortie.scenarios.schema import Scenario
 from sortie.sim.campaign.memory import limited
 from sortie.sim.check.expectations import metric
@@ -32,6 +33,7 @@ from sortie.sim.process import own_process
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.outcome_fields import lacking
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.user_errors import in_line
 
 Task = tuple[int, str]
 """A run's number and its task."""
@@ -90,7 +92,7 @@ def fly_task(task: str) -> SortieRecord:
     """One run's record.
 
     Raises:
-        ValidationError, PolicyError, ...: whatever a sortie raises.
+        ScenarioError, PolicyError, ...: whatever a sortie raises.
     """
     scenario, seed, replication = unpack(task)
     return run_sortie(scenario, None, seed, replication=replication)
@@ -100,10 +102,14 @@ def unpack(task: str) -> tuple[Scenario, int, int]:
     """A task's scenario, seed and replication.
 
     Raises:
-        ValidationError: a drawn value that the schema does not allow.
+        ScenarioError: a drawn value that the schema does not allow.
     """
     fields = json.loads(task)
-    scenario = Scenario.model_validate_json(json.dumps(fields["scenario"]), strict=True)
+    try:
+        scenario = Scenario.model_validate_json(json.dumps(fields["scenario"]), strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ScenarioError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     return scenario, fields["seed"], fields["replication"]
 
 
@@ -129,7 +135,7 @@ def _result(
         result = outcome(record)
         values = tuple(number(result, name) for name in metrics)
     except Exception as error:  # whatever it is, the other runs go on
-        what = _in_one_line(error)
+        what = in_line(error, MAX_ERROR)
         if memory_b is not None and isinstance(error, MemoryError):
             what = f"MemoryError: more than {memory_b / 1e9:.3g} GB (--worker-memory)"
         return RunResult(run, key, "failed", what, "", (None,) * len(metrics))
@@ -166,15 +172,6 @@ def number(result: dict[str, Any], name: str) -> float | None:
     except KeyError:
         return lacking(name, len(result.get("battery", ())))
     return float(value) if value is not None and math.isfinite(value) else None
-
-
-def _in_one_line(error: Exception) -> str:
-    if isinstance(error, ValidationError):
-        first = error.errors(include_url=False)[0]
-        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    else:
-        text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}"[:MAX_ERROR]
 
 
 def _check_file(path: str, digest: str) -> None:

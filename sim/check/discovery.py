@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sortie.scenarios.reading.top_keys import top_keys
+from sortie.scenarios.regular import regular
 from sortie.sim.check.golden import golden_path
 from sortie.sim.folders import RunError
 
@@ -36,7 +37,7 @@ def is_scenario(path: Path) -> bool:
     if path.with_name("record.json").is_file() and path.with_name("outcome.json").is_file():
         return False
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             data = file.read(MAX_BYTES)
     except OSError:
         return False

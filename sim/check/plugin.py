@@ -100,13 +100,16 @@ class ScenarioFile(pytest.File):
 
     def collect(self) -> Iterator[ScenarioItem]:
         """One test an expectation, and one for the golden outcome."""
-        from sortie.scenarios.reading.load import ScenarioError, load
+        from sortie.scenarios.errors import SortieError
+        from sortie.scenarios.reading.load import load
         from sortie.sim.check.expectations import in_words
         from sortie.sim.check.golden import golden_path
+        from sortie.sim.user_errors import user_errors
 
         try:
-            scenario = load(self.path, self.config.getoption("sortie_set"))
-        except ScenarioError as error:
+            with user_errors():
+                scenario = load(self.path, self.config.getoption("sortie_set"))
+        except SortieError as error:
             raise self.CollectError(str(error)) from None
         names = [in_words(e) for e in scenario.expect]
         names += [f"decision {i}" for i in range(len(scenario.expect_decisions))]
@@ -129,12 +132,13 @@ class ScenarioFile(pytest.File):
     def _fly(self) -> Flown:
         from sortie.sim.check.checking import check_scenario
         from sortie.sim.check.once import Flown
+        from sortie.sim.user_errors import as_text
 
         update, overrides = (self.config.getoption(f"sortie_{n}") for n in ("update", "set"))
         try:
             checked = check_scenario(str(self.path), overrides, update=update)
-        except ValueError as error:  # scenarios, policies and files tell what is wrong in one line
-            return Flown(error=f"{type(error).__name__}: {error}")
+        except Exception as error:
+            return Flown(error=as_text(error))
         return Flown(checked.verdicts, tuple(map(checked.replay, checked.verdicts)), checked.written)
 
 
@@ -160,7 +164,7 @@ class ScenarioItem(pytest.Item):
             raise ExpectationFailed(verdict, flown.replays[self.number])
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """A failed expectation in words; an error that the user can correct in one line."""
+        """A failed expectation in words; an error of a flight as `user_errors.as_text` has it."""
         if isinstance(excinfo.value, ExpectationFailed):
             return excinfo.value.in_words()
         if isinstance(excinfo.value, FlightFailed):
@@ -173,7 +177,7 @@ class ScenarioItem(pytest.Item):
 
 
 class FlightFailed(Exception):
-    """A flight without verdicts: an error that the user can correct."""
+    """A flight without verdicts. The text has the user's error in one line, or a traceback where it is a defect of Sortie."""
 
 
 class ExpectationFailed(AssertionError):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
@@ -13,8 +13,10 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
+from sortie._signals import as_usual
 from sortie._supervised import report as report_code
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.exit_codes import DEFECT, INTERRUPTED, USER
 from sortie.sim.cli import (
     bench,
     calibrate,
@@ -40,24 +42,23 @@ from sortie.sim.cli import (
     view,
     worst,
 )
-from sortie.sim.cli.console import err, out
+from sortie.sim.cli.console import err, out, own_streams
 from sortie.sim.identity import code_version
 from sortie.sim.process import own_process
-from sortie.sim.user_errors import missing, path_errors
+from sortie.sim.user_errors import defect, user_errors
 
 
 class _Commands(TyperGroup):
-    """Prints that a command was interrupted, which typer alone ends silently, or which extra it lacks."""
+    """Prints that a command was interrupted, which typer alone ends silently; the user's errors become `SortieError`."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            with _notes_once():
+            as_usual()
+            with user_errors(), _notes_once():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
             err.print("interrupted; what was not finished was not written")
-            raise typer.Exit(130) from None
-        except ImportError as error:
-            raise missing(error) from error
+            raise typer.Exit(INTERRUPTED) from None
 
 
 @contextmanager
@@ -102,18 +103,24 @@ for name, command in COMMANDS.items():
 def main() -> None:
     """The `sortie` command, once it is imported (sortie.__main__)."""
     own_process()
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # what a terminal cannot show stops no command
+    own_streams()
+    code: object = 0
     try:
         try:
-            with path_errors():
-                app(prog_name="sortie")  # also in the child process of `_supervised`
-        except SortieError as error:
-            err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
-            sys.exit(2)
-    except SystemExit as ended:
-        report_code(ended.code)
-        raise
+            app(prog_name="sortie")  # also in the child process of `_supervised`
+        except SystemExit as ended:
+            code = ended.code
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except SortieError as error:
+        err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
+        code = USER
+    except Exception as error:
+        traceback.print_exception(error)
+        err.print(defect(), soft_wrap=True, markup=False)
+        code = DEFECT
+    report_code(code)
+    sys.exit(code)
 
 
 @app.callback(invoke_without_command=True)

@@ -13,10 +13,11 @@ from rich.table import Table
 from sortie.perception.benchmark.difficulty import Difficulty
 from sortie.perception.benchmark.manifest import problems, read
 from sortie.perception.geometry import Geometry
+from sortie.scenarios.exit_codes import FAILED
 from sortie.scenarios.report_text import points
 from sortie.sim.cli.console import err, out, stages
 from sortie.sim.cli.options import ImagePx, ImagePxOption
-from sortie.sim.user_errors import user_errors
+from sortie.sim.folders import RunError
 
 app = typer.Typer(no_args_is_help=True, help="The benchmark: seeded splits of procedural scenes.")
 
@@ -63,7 +64,7 @@ def make(
     from sortie.perception.benchmark.dataset import MOST, SIZES, Benchmark, make_split
 
     bench = Benchmark(seed, Difficulty(density=density.value), Geometry(float(range_.value), int(image_px.value)))
-    with user_errors(), stages() as report:
+    with stages() as report:
         for name in dict.fromkeys(s.value for s in split) if split else SIZES:
             count = min(scenes or SIZES[name][0], MOST[name])
             make_split(bench, name, out_dir, scenes=count, workers=workers, progress=partial(report, f"{name} scenes"))
@@ -84,25 +85,24 @@ def show(
     out_file: Annotated[Path | None, typer.Option("--out", help="The PNG file; default: beside the splits.")] = None,
 ) -> None:
     """Draw a frame: five drones' views, their bird's-eye images, and who sees which car. Needs the extra `report`."""
-    with user_errors():
-        from sortie.perception.benchmark.contact_sheet import draw, save
-        from sortie.perception.benchmark.dataset import MOST, SIZES, Benchmark
+    from sortie.perception.benchmark.contact_sheet import draw, save
+    from sortie.perception.benchmark.dataset import MOST, SIZES, Benchmark
 
-        bench = Benchmark.at(folder)
-        count, (_, frames) = MOST[split.value], SIZES[split.value]
-        if index >= count:
-            raise ValueError(f"scene is {index}, must be 0 to {count - 1} in the {split.value} split")
-        if frame >= frames:
-            raise ValueError(f"frame is {frame}, must be 0 to {frames - 1} in the {split.value} split")
-        path = out_file or folder / "sheets" / f"{split.value}_{index}_{frame}.png"
-        save(draw(bench, split.value, index, frame), path)
+    bench = Benchmark.at(folder)
+    count, (_, frames) = MOST[split.value], SIZES[split.value]
+    if index >= count:
+        raise RunError(f"scene is {index}, must be 0 to {count - 1} in the {split.value} split")
+    if frame >= frames:
+        raise RunError(f"frame is {frame}, must be 0 to {frames - 1} in the {split.value} split")
+    path = out_file or folder / "sheets" / f"{split.value}_{index}_{frame}.png"
+    save(draw(bench, split.value, index, frame), path)
     out.print(f"drawn in [bold]{path}[/bold]", soft_wrap=True)
 
 
 @app.command()
 def verify(folder: FolderArgument) -> None:
     """Compare every file with the manifest. Exit code 1 if one is missing or differs."""
-    with user_errors(), stages() as report:
+    with stages() as report:
         from sortie.perception.benchmark.dataset import Benchmark
 
         Benchmark.at(folder)
@@ -110,7 +110,7 @@ def verify(folder: FolderArgument) -> None:
     for line in found:
         err.print(f"[red]{line}[/red]", soft_wrap=True)
     if found:
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
     count = sum(len(files) for files in read(folder)["splits"].values())
     out.print(f"{count} files, all as the manifest says")
 
@@ -152,7 +152,7 @@ def difficulty(
     workers: Annotated[int | None, typer.Option(help="Number of processes; default: one per core.", min=1)] = None,
 ) -> None:
     """Measure how each parameter of the difficulty changes AP. An interrupted run continues."""
-    with user_errors(), stages() as report:
+    with stages() as report:
         from sortie.perception.evaluation.difficulty_effects import measure
         from sortie.perception.network.detector import named_weights
 

@@ -17,7 +17,6 @@ from sortie.sim.cli.console import out, stages
 from sortie.sim.cli.options import refuse
 from sortie.sim.folders import ensure_files
 from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means
-from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
     from sortie.perception.surrogate.judge import CalibrationVerdict
@@ -60,21 +59,20 @@ def calibrate(
     from sortie.perception.surrogate.calibrate import calibrate as make  # here: torch takes a second to import
 
     chosen = [p.strip() for p in policies.split(",")]
-    with user_errors():
-        for p in chosen if fly is not None else ():
-            resolve(p)
-        if fly is not None and load_conditions(fly) is None:
-            load(fly)
-        if made is None:
-            ensure_files(out_file)
+    for p in chosen if fly is not None else ():
+        resolve(p)
+    if fly is not None and load_conditions(fly) is None:
+        load(fly)
     if made is None:
-        with user_errors(), stages() as progress:
+        ensure_files(out_file)
+    if made is None:
+        with stages() as progress:
             _, verdict = make(
                 out_file, work=work, weights=weights, scenes=scenes, held_out=held_out, seed=seed, progress=progress
             )
         _tell(verdict, out_file)
     if fly is not None:
-        with user_errors(), stages() as progress:
+        with stages() as progress:
             flown = list(flights(fly, made or out_file, weights, rate_hz, chosen, progress, towns))
         in_towns = f", {towns} towns each" if towns > 1 else ""
         for table in _in_flight(flown, f"AP in points, {fly} at {rate_hz:g} Hz{in_towns}"):

@@ -14,9 +14,9 @@ from rich.progress import Progress as Bar
 from typer.core import TyperGroup
 
 import sortie
+from sortie.scenarios.exit_codes import ENDED, FAILED, INTERRUPTED
 from sortie.sim.campaign.signals import EndedError, ended_by_sigterm
 from sortie.sim.cli.console import err, out
-from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
     from sortie.scenarios.schema import Scenario
@@ -112,7 +112,7 @@ def run(
                 )  # fmt: skip
     except KeyboardInterrupt as end:
         where = "" if folder is None else f" in {folder}"
-        what, code = ("ended by SIGTERM", 143) if isinstance(end, EndedError) else ("interrupted", 130)
+        what, code = ("ended by SIGTERM", ENDED) if isinstance(end, EndedError) else ("interrupted", INTERRUPTED)
         err.print(f"{what}; what is finished is kept{where}, the same command goes on", soft_wrap=True)
         raise typer.Exit(code) from None
     out.print(_in_words(done), soft_wrap=True)
@@ -121,17 +121,16 @@ def run(
     else:
         out.print(f"kept in [bold]{folder}[/bold]")
     if done.failed:
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
 
 
 @app.command("report")
 def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")]) -> None:
     """Write report.md and its figures from the finished runs."""
-    with user_errors():
-        from sortie.sim.campaign.report import write_report
-        from sortie.sim.campaign.table import TABLE
+    from sortie.sim.campaign.report import write_report
+    from sortie.sim.campaign.table import TABLE
 
-        path = write_report(folder, _notice)
+    path = write_report(folder, _notice)
     out.print(f"report written to [bold]{path}[/bold], rows in [bold]{folder / TABLE}[/bold]")
 
 
@@ -159,8 +158,7 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
         err.print(f"the campaign has not flown run {run} yet: there is no record to compare with")
     elif row["status"] == "failed":
         err.print(f"in the campaign run {run} failed: {row['error']}", soft_wrap=True, markup=False)
-    with user_errors():
-        scenario, seed, replication = unpack(plan.task(run))
+    scenario, seed, replication = unpack(plan.task(run))
     return scenario, seed, replication, (row or {}).get("fingerprint") or None
 
 

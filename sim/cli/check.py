@@ -10,6 +10,7 @@ import typer
 
 import sortie
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.exit_codes import FAILED
 from sortie.scenarios.reading.campaign import read_any
 from sortie.scenarios.reading.load import ScenarioError, campaigns, condition_sets, library
 from sortie.sim.check.junit import Suite, junit
@@ -71,7 +72,7 @@ def check(
     _write_junit(junit_file, suites)
     if failed:
         err.print(f"[red]{failed} expectation{'s' if failed > 1 else ''} failed[/red]")
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
 
 
 def _write_junit(file: Path | None, suites: Sequence[Suite]) -> None:
@@ -95,5 +96,5 @@ def _check_syntax(files: list[str], overrides: list[str] | None) -> None:
         out.print(issue, soft_wrap=True, markup=False, highlight=False)
     if issues:
         err.print(f"[red]{len(issues)} thing{'s are' if len(issues) > 1 else ' is'} wrong[/red]")
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
     out.print(f"{len(files)} file{'s' if len(files) > 1 else ''} read, nothing is wrong")

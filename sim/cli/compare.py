@@ -16,7 +16,7 @@ from sortie.sim.cli.conditions import compare_conditions
 from sortie.sim.cli.console import bars, out, stages
 from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded, refuse, split_policies
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
-from sortie.sim.studies.compare import Flown, chosen_seeds, in_town_of
+from sortie.sim.studies.compare import MOST_SEEDS, Flown, chosen_seeds, in_town_of
 from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
 
 PRECISE = ("metric", "pilot", "most_seeds", "kept")
@@ -39,6 +39,7 @@ def compare(
             help="Fly this many seeds, beginning with --seed or the scenario's, each in its own town. Default: 8 with "
             "the surrogate and no --seed, else 1.",
             min=1,
+            max=MOST_SEEDS,
         ),
     ] = None,
     set_: SetOption = None,
@@ -80,7 +81,9 @@ def compare(
     ] = None,
     most_seeds: Annotated[
         int | None,
-        typer.Option(help="With --half-width: seeds flown by the torch detector at most. Default: 200.", min=4),
+        typer.Option(
+            help="With --half-width: seeds flown by the torch detector at most. Default: 200.", min=4, max=MOST_SEEDS
+        ),
     ] = None,
     kept: Annotated[
         Path | None,

@@ -2,14 +2,60 @@
 
 from __future__ import annotations
 
+import io
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sortie.sim.folders import RunError
+
 out = Console(emoji=False)  # `mine.py:link:` is a file's name
 err = Console(stderr=True, highlight=False, emoji=False)
+
+
+class _Stream(io.RawIOBase):
+    """A standard stream of this process. What cannot be written is an error of the user, once."""
+
+    def __init__(self, stream: io.TextIOWrapper | None, name: str) -> None:
+        self._stream, self._name, self._works = stream, name, True
+
+    def writable(self) -> bool:
+        return True
+
+    def isatty(self) -> bool:
+        return self._stream is not None and self._stream.isatty()
+
+    def fileno(self) -> int:
+        if self._stream is None:
+            raise OSError("it was closed")
+        return self._stream.fileno()
+
+    def write(self, data: Any) -> int:
+        """Raises RunError at the first failure; after it, and on the error output, nothing can be told any more."""
+        try:
+            if self._works:
+                return os.write(self.fileno(), data)
+        except OSError as error:
+            self._works = False
+            if self._name:
+                raise RunError(f"{self._name}: {error.strerror or error}; not everything was printed") from None
+        return len(data)
+
+
+def own_streams() -> None:
+    """Have output that is full or closed end the command with one line. Only for a process of Sortie's own."""
+    for name, words in (("stdout", "standard output"), ("stderr", "")):
+        stream = getattr(sys, name)
+        if stream is None or type(stream) is io.TextIOWrapper:  # not what a test puts there
+            encoding, by_line = (None, False) if stream is None else (stream.encoding, stream.line_buffering)
+            text = io.BufferedWriter(_Stream(stream, words))
+            # what a terminal cannot show stops no command
+            setattr(sys, name, io.TextIOWrapper(text, encoding, "backslashreplace", line_buffering=by_line))
 
 
 def line_printer(name: str) -> Callable[[str], None]:

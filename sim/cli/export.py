@@ -14,7 +14,6 @@ from sortie.sim.export.endpoint import read_key
 from sortie.sim.export.origin import parse_origin
 from sortie.sim.folders import RunError, ensure_files, ensure_folder
 from sortie.sim.results import run_folder
-from sortie.sim.user_errors import missing
 
 BAG, TLOG, PCAP = "bag", "sortie.tlog", "sortie.pcap"
 BEGIN = "2026-01-01T00:00:00"
@@ -94,8 +93,6 @@ def export(
         from sortie.sim.export.bag import write_bag
 
         counts = write_bag(record, path, began_us * 1000, where)
-    except ImportError as error:
-        raise missing(error) from error
     except TraceError as error:
         raise RunError(f"{error}; the bag's origin is in it, or --origin names one") from error
     out.print(f"{sum(counts.values())} messages on {len(counts)} topics, in [bold]{path}[/bold]", soft_wrap=True)

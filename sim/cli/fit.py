@@ -13,7 +13,6 @@ from rich.table import Table
 from sortie.sim.cli.console import out, stages
 from sortie.sim.cli.options import refuse
 from sortie.sim.folders import ensure_files, write_text
-from sortie.sim.user_errors import user_errors
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -52,14 +51,13 @@ def fit_codebook(
     path = named_weights(weights)
     target = out_file or beside(path, CODEBOOK)
     recipe = CodebookRecipe(stages_, scenes, iterations, seed)
-    with user_errors():
-        net = load_weights(path)
-        ensure_files(target)
-        with stages() as progress:
-            facts = make_codebook(
-                net, target, Benchmark(bench_seed, geometry=net.config.geometry), recipe,
-                weights=path.name, root=bench_dir, progress=progress,
-            )  # fmt: skip
+    net = load_weights(path)
+    ensure_files(target)
+    with stages() as progress:
+        facts = make_codebook(
+            net, target, Benchmark(bench_seed, geometry=net.config.geometry), recipe,
+            weights=path.name, root=bench_dir, progress=progress,
+        )  # fmt: skip
     table = Table("bytes of a cell", "variance that is lost", title=f"{facts['cells']} cells")
     for length, lost in facts["unexplained"].items():
         table.add_row(str(length), f"{100 * lost:.1f} %")
@@ -93,41 +91,40 @@ def fit_errors(
     from sortie.perception.uncertainty import errors_text
     from sortie.scenarios.shipped import ERRORS, beside
 
-    with user_errors():
-        if boxes is Boxes.surrogate:
-            from sortie.perception.surrogate.model import SHIPPED
-            from sortie.scenarios.shipped import calibration_of
+    if boxes is Boxes.surrogate:
+        from sortie.perception.surrogate.model import SHIPPED
+        from sortie.scenarios.shipped import calibration_of
 
-            path = SHIPPED if weights is None else calibration_of(weights)
-        else:
-            from sortie.perception.network.detector import named_weights
+        path = SHIPPED if weights is None else calibration_of(weights)
+    else:
+        from sortie.perception.network.detector import named_weights
 
-            path = named_weights(weights)
-        target = out_file or beside(path, ERRORS)
-        ensure_files(target)
-        if boxes is Boxes.surrogate:
-            from sortie.perception.surrogate.errors import moments
+        path = named_weights(weights)
+    target = out_file or beside(path, ERRORS)
+    ensure_files(target)
+    if boxes is Boxes.surrogate:
+        from sortie.perception.surrogate.errors import moments
 
-            found = moments(path, "fit", towns)
-            drawn = {"towns": towns}
-        else:
-            from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
-            from sortie.perception.network.checkpoint import load_weights
-            from sortie.perception.training.boxes_alone import boxes_alone, moments_of
-            from sortie.scenarios.schema import Perception
+        found = moments(path, "fit", towns)
+        drawn = {"towns": towns}
+    else:
+        from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_split
+        from sortie.perception.network.checkpoint import load_weights
+        from sortie.perception.training.boxes_alone import boxes_alone, moments_of
+        from sortie.scenarios.schema import Perception
 
-            net = load_weights(path)
-            split = make_split(Benchmark(bench_seed, geometry=net.config.geometry), "validation", bench_dir)
-            frames = load_frames(split)
-            found = moments_of(frames, boxes_alone(net, frames, Perception().score_threshold))
-            drawn = {"bench-seed": bench_seed}
-        model = box_errors.fit(found)
-        fitted = box_errors.calibration(model, found)
-        given = {"weights": weights, "out": out_file} | drawn
-        flags = [part for k, v in given.items() if v is not None for part in (f"--{k}", str(v))]
-        command = shlex.join(["sortie", "fit", "errors", boxes.value, *flags])
-        made = {"command": command, "boxes_of": path.name, "boxes": fitted.boxes}
-        write_text(target, errors_text(model, made))
+        net = load_weights(path)
+        split = make_split(Benchmark(bench_seed, geometry=net.config.geometry), "validation", bench_dir)
+        frames = load_frames(split)
+        found = moments_of(frames, boxes_alone(net, frames, Perception().score_threshold))
+        drawn = {"bench-seed": bench_seed}
+    model = box_errors.fit(found)
+    fitted = box_errors.calibration(model, found)
+    given = {"weights": weights, "out": out_file} | drawn
+    flags = [part for k, v in given.items() if v is not None for part in (f"--{k}", str(v))]
+    command = shlex.join(["sortie", "fit", "errors", boxes.value, *flags])
+    made = {"command": command, "boxes_of": path.name, "boxes": fitted.boxes}
+    write_text(target, errors_text(model, made))
     out.print(
         f"{fitted.boxes} boxes: {100 * fitted.within[0]:.1f} % of the errors within one standard deviation, "
         f"{100 * fitted.within[1]:.1f} % within two; {100 * model.common:.0f} % of a variance is common to several drones"

@@ -57,7 +57,9 @@ def fly(
     ] = None,
     pace: Annotated[
         float,
-        typer.Option(help="With --mavlink: simulated seconds per wall-clock second; 0: as fast as possible.", min=0),
+        typer.Option(
+            help="With --mavlink: simulated seconds per wall-clock second, 0.001 to 1000; 0: as fast as possible."
+        ),
     ] = 1.0,
     mavlink_key: Annotated[
         Path | None,

@@ -20,7 +20,6 @@ from sortie.scenarios.schema import Battery
 from sortie.sim.cli.console import out
 from sortie.sim.export.origin import parse_origin
 from sortie.sim.folders import RunError, ensure_folder, replacing, write_text
-from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
     from sortie.fleet.logs.flightlog import FlightLog
@@ -88,11 +87,10 @@ def import_log(
     ensure_folder(folder, SCENARIO, "flight", {TRACE, SCENARIO})
     if (folder / SCENARIO).is_file() and MADE not in (folder / SCENARIO).read_text("utf-8", "replace"):
         raise RunError(f"{folder}: its {SCENARIO} is none that sortie import wrote; choose another folder or move it")
-    with user_errors():
-        flights, columns, text = flown_log(
-            logs, folder, rate, from_s, until_s, lift, system or (), together=together, ground=ground or ()
-        )
-    with replacing(folder) as new, user_errors():
+    flights, columns, text = flown_log(
+        logs, folder, rate, from_s, until_s, lift, system or (), together=together, ground=ground or ()
+    )
+    with replacing(folder) as new:
         write_trace(new / TRACE, columns)
         write_text(new / SCENARIO, text)
     rows, first = len(columns["t_s"]), flights[0]

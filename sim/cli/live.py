@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from sortie.scenarios.exit_codes import INTERRUPTED
 from sortie.sim.cli.console import err, out, stages
 from sortie.sim.cli.options import PolicyOption, SetOption, loaded, refuse
 from sortie.sim.folders import RunError, ensure_files, write_text
-from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
     from sortie.sim.live.result import LiveResult
@@ -97,11 +97,10 @@ def live(
         None if text is None else _drone_at(option, text) for option, text in (("--kill", kill), ("--start", start))
     )
     flown = loaded(scenario, set_, policy)
-    with user_errors():
-        from sortie.sim.export.origin import given_origin, parse_origin
-        from sortie.sim.live.seals import find_key, read_own_key
-        from sortie.sim.live.session import fly_live
-        from sortie.sim.live.watchdog import parse_fallback
+    from sortie.sim.export.origin import given_origin, parse_origin
+    from sortie.sim.live.seals import find_key, read_own_key
+    from sortie.sim.live.session import fly_live
+    from sortie.sim.live.watchdog import parse_fallback
 
     ensure_files(out_file)
     with stages() as report:
@@ -128,7 +127,7 @@ def live(
         out.print(f"kept in [bold]{out_file}[/bold]", soft_wrap=True)
     if result.interrupted:
         err.print(f"interrupted after {result.flown_s:.1f} s")
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)
 
 
 def _drone_at(option: str, text: str) -> tuple[int, float]:

@@ -103,35 +103,32 @@ def paper(
     given = {"temperature": temperature, "silent_weight": silent_weight}
     fusion_params = {name: value for name, value in given.items() if value != {"temperature": 1.0}.get(name, 0.0)}
     ensure_between(readme, report.BEGIN, report.END)
-    try:
-        ways = Ways(absent, serve)  # type: ignore[arg-type]
-        asked = TableSettings(chosen, cells_by, tau, "scene" if scenes else "frame", ways=ways)  # type: ignore[arg-type]
-        cores = workers or os.cpu_count() or 1
-        job = making.PaperSettings(
-            named_weights(weights),
-            asked,
-            frames,
-            seed,
-            cores,
-            _command(context),
-            live,
-            fusion_params,
-            device,
+    ways = Ways(absent, serve)  # type: ignore[arg-type]
+    asked = TableSettings(chosen, cells_by, tau, "scene" if scenes else "frame", ways=ways)  # type: ignore[arg-type]
+    cores = workers or os.cpu_count() or 1
+    job = making.PaperSettings(
+        named_weights(weights),
+        asked,
+        frames,
+        seed,
+        cores,
+        _command(context),
+        live,
+        fusion_params,
+        device,
+    )
+    if frame is not None:
+        _open_frame(
+            making.frame_picture(job, work, frame, ego),
+            work / "frames" / f"seed{seed}_frame{frame}_ego{ego}.rrd",
+            out,
+            show=show,
         )
-        if frame is not None:
-            _open_frame(
-                making.frame_picture(job, work, frame, ego),
-                work / "frames" / f"seed{seed}_frame{frame}_ego{ego}.rrd",
-                out,
-                show=show,
-            )
-            return
-        making.ensure_writable(out_dir)
-        other = [] if against is None else rows.read(against / making.TABLE)[0]
-        with stages() as progress:
-            result = making.make(job, work, progress)
-    except ValueError as error:
-        raise RunError(str(error)) from error
+        return
+    making.ensure_writable(out_dir)
+    other = [] if against is None else rows.read(against / making.TABLE)[0]
+    with stages() as progress:
+        result = making.make(job, work, progress)
     making.write(result, out_dir)
     wide = out if out.is_terminal else Console(width=PIPED_WIDTH)
     wide.print(verdicts_table(result.rows, masked=wide.width >= NARROW))

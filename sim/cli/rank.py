@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import sortie
+from sortie.scenarios.exit_codes import FAILED
 from sortie.sim.cli.console import err, out, stages
 from sortie.sim.cli.options import split_policies
 from sortie.sim.ranking.rank import SUITE
@@ -69,4 +70,4 @@ def rank(
     if ranking.faults:
         for line in ranking.faults:
             err.print(f"[red]{line}[/red]", soft_wrap=True)
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)

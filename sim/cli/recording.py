@@ -47,17 +47,14 @@ def evaluate(
     from sortie.perception.recordings.instrument import evaluate_recording
 
     ensure_files(save)
-    try:
-        if not FLOOR <= tau <= 1.0:  # before the evaluation, which may take hours
-            raise ValueError(f"tau is {tau:g}, must be {FLOOR:g} to 1")
-        asked = None if conditions is None else [Sharing.parse(label) for label in conditions.split()]
-        with bars() as bar:
-            found = evaluate_recording(
-                path, asked, fusion=fusion, progress=lambda done, of: bar("frames", of)(done) if done == of else None
-            )
-        shown = found.at(tau)
-    except ValueError as error:
-        raise RunError(str(error)) from error
+    if not FLOOR <= tau <= 1.0:  # before the evaluation, which may take hours
+        raise RunError(f"tau is {tau:g}, must be {FLOOR:g} to 1")
+    asked = None if conditions is None else [Sharing.parse(label) for label in conditions.split()]
+    with bars() as bar:
+        found = evaluate_recording(
+            path, asked, fusion=fusion, progress=lambda done, of: bar("frames", of)(done) if done == of else None
+        )
+    shown = found.at(tau)
     table = Table(title=f"{path.name}, AP@0.5 at τ = {tau:g}")
     for name in ("condition", "full scene", "mission", "payload B an ego", "index B an ego"):
         table.add_column(name, justify="left" if name == "condition" else "right")

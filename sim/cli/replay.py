@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import sortie
+from sortie.scenarios.exit_codes import FAILED
 from sortie.sim.cli.console import err, out
 from sortie.sim.cli.options import PolicyOption
 from sortie.sim.folders import ensure_files
@@ -37,4 +38,4 @@ def replay(
         out.print(f"kept in [bold]{out_file}[/bold]", soft_wrap=True)
     if expect_same and not replayed.same:
         err.print(f"[red]{len(replayed.differences)} differences[/red]")
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)

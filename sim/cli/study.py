@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from sortie.scenarios.regular import regular
 from sortie.sim.cli.console import out, stages
 from sortie.sim.cli.options import DeviceOption, WorkersOption
 from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing, writing_durably
-from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
     from sortie.perception.study.measure import StudyRow
@@ -37,15 +37,14 @@ def study_train(
     from sortie.perception.study.run import SHIPPED, train_job
 
     plan = read_plan()
-    with user_errors():
-        for job in jobs or [v.job(s) for v, s in plan.jobs()]:
-            with stages(f"{job}: ") as progress:
-                result = train_job(plan, job, work, bench_dir, shipped=SHIPPED, progress=progress)
-            if result is None:
-                out.print(f"[bold]{job}[/bold] has its weights")
-            else:
-                gain = result.validation
-                out.print(f"[bold]{job}[/bold] AP@0.5 alone {gain.ap_a:.3f}, all five {gain.ap_b:.3f}")
+    for job in jobs or [v.job(s) for v, s in plan.jobs()]:
+        with stages(f"{job}: ") as progress:
+            result = train_job(plan, job, work, bench_dir, shipped=SHIPPED, progress=progress)
+        if result is None:
+            out.print(f"[bold]{job}[/bold] has its weights")
+        else:
+            gain = result.validation
+            out.print(f"[bold]{job}[/bold] AP@0.5 alone {gain.ap_a:.3f}, all five {gain.ap_b:.3f}")
 
 
 @study.command("run")
@@ -63,7 +62,7 @@ def study_run(
     from sortie.perception.study.run import SHIPPED, measure
 
     plan, rows = read_plan(), list[StudyRow]()
-    with user_errors(), stages() as progress:
+    with stages() as progress:
         where = measuring_device(device)
         cores = workers or os.cpu_count() or 1
         for job, some in measure(
@@ -96,20 +95,19 @@ def study_report(
 
     plan = read_plan()
     drawn: list[tuple[str, str]] = []
-    with user_errors():
-        ensure_folder(out_dir, TABLE, "report", {REPORT, TABLE, *figures.CAPTIONS})
-        ensure_between(readme, report.BEGIN, report.END)
-        rows = _read_rows(table)
-        with replacing(out_dir) as folder:
-            _write_table(to_table(rows), folder / TABLE)
-            if common.available():
-                drawn = figures.draw_all(plan, rows, folder)
-            (folder / REPORT).write_text(report.report(plan, rows, drawn), encoding="utf-8")
-        if readme is not None:
-            link = Path(os.path.relpath(out_dir.resolve() / REPORT, readme.resolve().parent)).as_posix()
-            section = report.short(plan, rows, link)
-            put_between(readme, section, report.BEGIN, report.END)
-            out.print(f"the study's sentences in [bold]{readme}[/bold] written")
+    ensure_folder(out_dir, TABLE, "report", {REPORT, TABLE, *figures.CAPTIONS})
+    ensure_between(readme, report.BEGIN, report.END)
+    rows = _read_rows(table)
+    with replacing(out_dir) as folder:
+        _write_table(to_table(rows), folder / TABLE)
+        if common.available():
+            drawn = figures.draw_all(plan, rows, folder)
+        (folder / REPORT).write_text(report.report(plan, rows, drawn), encoding="utf-8")
+    if readme is not None:
+        link = Path(os.path.relpath(out_dir.resolve() / REPORT, readme.resolve().parent)).as_posix()
+        section = report.short(plan, rows, link)
+        put_between(readme, section, report.BEGIN, report.END)
+        out.print(f"the study's sentences in [bold]{readme}[/bold] written")
     for line in report.answers(plan, report.StudyRows(rows)):
         out.print(line)
     if not drawn:
@@ -140,13 +138,12 @@ def study_doses(
     plan, rows = doses.read_plan(), list[doses.DoseRow]()
     budgets = [f"two − four, {budget:g}" for budget in (0.0, *plan.budgets)]
     heads = ("network", "dose", "weight on zeros", f"starved, {plan.starved:g}", *budgets)
-    with user_errors():
-        where = measuring_device(device)
-        ranges = None if frames is None else [doses.FrameRange.parse(text) for text in frames]
-        with stages() as progress:
-            cores = workers or os.cpu_count() or 1
-            for row in measure(plan, work, bench_dir, frames=ranges, workers=cores, device=where, progress=progress):
-                rows.append(row)
+    where = measuring_device(device)
+    ranges = None if frames is None else [doses.FrameRange.parse(text) for text in frames]
+    with stages() as progress:
+        cores = workers or os.cpu_count() or 1
+        for row in measure(plan, work, bench_dir, frames=ranges, workers=cores, device=where, progress=progress):
+            rows.append(row)
     table = Table(*heads, title=f"{rows[0].frames} frames; AP points with 95 % intervals over frames")
     for row in rows:
         effects = [interval(e.value, e.low, e.high, signed) for e in (row.starved, row.silent, *row.contrasts)]
@@ -169,7 +166,7 @@ def _read_rows(path: Path) -> list[StudyRow]:
     from sortie.perception.study.measure import from_table
 
     try:
-        return from_table(pq.read_table(path))
+        return from_table(pq.read_table(regular(path)))
     except (OSError, pa.ArrowInvalid, TypeError) as error:
         raise RunError(f"{path}: not the rows of a study ({error})") from None
 

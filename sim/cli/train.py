@@ -12,8 +12,7 @@ import typer
 
 from sortie.sim.cli.console import out, stages
 from sortie.sim.cli.options import DeviceOption, ImagePx, ImagePxOption
-from sortie.sim.folders import ensure_files
-from sortie.sim.user_errors import user_errors
+from sortie.sim.folders import RunError, ensure_files
 
 
 class ExchangeForm(StrEnum):
@@ -114,29 +113,29 @@ def train(
     from sortie.sim.cli import tables
 
     half_extent_m = float(range_.value)
-    with user_errors():  # before scenes are rendered, which takes minutes
-        if warm_start is not None:
-            warm_start = shipped(str(warm_start)) if str(warm_start) in FUSIONS else named_weights(warm_start)
-        recipe = Recipe(
-            steps=steps,
-            batch=batch,
-            seed=seed,
-            scenes=scenes,
-            peak_lr=peak_lr,
-            cell_dropout=cell_dropout,
-            unsent=unsent.value,
-            varied=varied,
-            precision=precision.value,
-            warm_start=warm_start.name if warm_start else "",
-        )
-        if fusion not in FUSIONS:
-            resolve("fusion", fusion, None, FUSIONS)
-        device_named(device)
-        if warm_start is not None and not warm_start.is_file():
-            raise ValueError(f"{warm_start}: no such weights")
-        ensure_files(out_file)
+    # before scenes are rendered, which takes minutes
+    if warm_start is not None:
+        warm_start = shipped(str(warm_start)) if str(warm_start) in FUSIONS else named_weights(warm_start)
+    recipe = Recipe(
+        steps=steps,
+        batch=batch,
+        seed=seed,
+        scenes=scenes,
+        peak_lr=peak_lr,
+        cell_dropout=cell_dropout,
+        unsent=unsent.value,
+        varied=varied,
+        precision=precision.value,
+        warm_start=warm_start.name if warm_start else "",
+    )
+    if fusion not in FUSIONS:
+        resolve("fusion", fusion, None, FUSIONS)
+    device_named(device)
+    if warm_start is not None and not warm_start.is_file():
+        raise RunError(f"{warm_start}: no such weights")
+    ensure_files(out_file)
     config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value, grid.value, int(image_px.value))
-    with stages() as progress, user_errors(), _curves(out_file) as scalars:
+    with stages() as progress, _curves(out_file) as scalars:
         result = train_detector(
             out_file,
             recipe,

@@ -27,9 +27,11 @@ from sortie.policies.verification.shield import check_shieldable
 from sortie.policies.verification.single_view import PLANE
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
 from sortie.policies.verification.views import LARGEST, to_json
+from sortie.scenarios.exit_codes import FAILED
 from sortie.scenarios.plugins.reference import Params
 from sortie.scenarios.plugins.user_calls import DECISION_S, LOAD_S, watched
 from sortie.scenarios.reading.load import build, dump, loads
+from sortie.scenarios.regular import regular
 from sortie.scenarios.schema import PolicySection, Scenario
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
 from sortie.sim.check.kits import KITS
@@ -98,7 +100,7 @@ def verify(
     The options are for policies. A policy is tested on random views, and the command tries to prove its properties
     (*invariants*). Each verdict says what it covers: *proved* for all views of fleets up to a size, *proved over the
     reals* (as if nothing were rounded), *searched* (some of all views), or *drawn* (random views alone). The exit code is
-    also 1 if a property is refuted, and 70 or 152 if the policy's code does not return and cannot be interrupted.
+    also 1 if a property is refuted, and 152 if the policy's code does not return and cannot be interrupted.
 
     Invariants about time (`within 0.5 s: …`, `climbs_in(dwell) <= 1`) are tested on sequences of views. What counts is
     what the gates enforce, after staleness rules and damping.
@@ -136,7 +138,7 @@ def verify(
         _keep(out_dir / slug(policy), kept)
     if broken:
         err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
 
 
 def _verify_model(kind: str, reference: str) -> None:
@@ -151,7 +153,7 @@ def _verify_model(kind: str, reference: str) -> None:
     broken = len(failing(checks))
     if broken:
         err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
 
 
 def overhead(
@@ -253,7 +255,7 @@ def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant
     if file is None and type(own) is not str:  # a text of another class may read otherwise
         raise RunError(f"{source} is of type {type(own).__name__}, must be text")
     try:
-        return parse(str(own) if file is None else file.read_text("utf-8-sig"))
+        return parse(str(own) if file is None else regular(file).read_text("utf-8-sig"))
     except OSError as error:
         raise RunError(f"{file}: {error.strerror}") from error
     except UnicodeDecodeError as error:

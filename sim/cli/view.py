@@ -16,7 +16,11 @@ from sortie.sim.folders import RunError
 def view(
     run: Annotated[Path, typer.Argument(help="A run's folder.")],
     picture: Annotated[
-        Path | None, typer.Option(help="Save a picture of the viewer here instead of opening it; needs no screen.")
+        Path | None,
+        typer.Option(
+            help="Save a picture of the viewer here instead of opening it. It needs no screen, but a Vulkan driver for the "
+            "CPU (Debian, Ubuntu: apt install mesa-vulkan-drivers)."
+        ),
     ] = None,
     at_s: Annotated[
         float, typer.Option("--at", help="With --picture: the simulated time that it shows, s.", min=0)

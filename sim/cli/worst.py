@@ -10,7 +10,6 @@ from rich.table import Table
 
 from sortie.sim.cli.console import out
 from sortie.sim.cli.fly import fly as fly_again
-from sortie.sim.user_errors import user_errors
 
 
 def worst(
@@ -28,10 +27,9 @@ def worst(
     ] = 0,
 ) -> None:
     """Show the worst runs by a metric, and the commands that fly them again."""
-    with user_errors():
-        from sortie.sim.campaign.worst import worst as find
+    from sortie.sim.campaign.worst import worst as find
 
-        found = find(folder, metric, max(count, fly), policy, more_is_worse=most)
+    found = find(folder, metric, max(count, fly), policy, more_is_worse=most)
     table = Table(
         "run", "policy", *found.varied, metric, title="the most first" if found.more_is_worse else "the least first"
     )

@@ -42,6 +42,7 @@ from sortie.policies.verification.past import Past
 from sortie.policies.verification.shield import check_shieldable, enforce
 from sortie.policies.verification.shield_together import MARK, Ceilings
 from sortie.policies.verification.views import ViewError, from_json
+from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.scenarios.schema import PolicyChange, PolicySection, Scenario
 from sortie.sim.engine.audit import Audit
@@ -154,11 +155,13 @@ def ask(policy: NamedPolicy, view: FleetView) -> Sequence[Directive]:
     """
     try:
         answer = policy.decide(view)
-    except PolicyError:
-        raise
     except Exception as error:
-        what = f"raises {describe_error(error)}"
-        raise PolicyError(f"policy {policy.name!r} on drone {view.ego} {what}") from error
+        if not is_guarded(policy.decide):  # a built-in one
+            raise
+        what = ":" if isinstance(error, SortieError) else " raises"
+        raise PolicyError(
+            f"policy {policy.name!r} on drone {view.ego}{what} {describe_error(error, policy.decide)}"
+        ) from error
     if type(answer) is not list and (isinstance(answer, Directive) or not isinstance(answer, Sequence)):
         what = f"returns {type(answer).__name__}, must be a sequence of directives"
         raise PolicyError(f"policy {policy.name!r} on drone {view.ego} {what}")
@@ -174,6 +177,8 @@ def ask_viewpoint(policy: NamedPolicy, viewpoint: Viewpoint, view: FleetView) ->
     try:
         asked = viewpoint(view)
     except Exception as error:
+        if not is_guarded(policy.decide):
+            raise
         what = f"its viewpoint raises {describe_error(error)}"
         raise PolicyError(f"policy {policy.name!r} on drone {view.ego}: {what}") from error
     check_reposition(asked, view)

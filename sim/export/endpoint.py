@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sortie.fleet.logs.telemetry import KEY_BYTES
+from sortie.scenarios.regular import regular
 from sortie.sim.folders import RunError
 
 
@@ -25,7 +26,7 @@ def read_key(path: Path) -> bytes:
         RunError: the file cannot be read or holds neither.
     """
     try:
-        content = path.read_bytes()
+        content = regular(path).read_bytes()
     except OSError as error:
         raise RunError(f"{path}: {error.strerror}") from error
     if len(content) == KEY_BYTES:

@@ -145,18 +145,20 @@ class MavlinkEndpoint:
     Args:
         address: `udpout:HOST:PORT` sends there; `udpin:HOST:PORT` waits for a ground station's first message, and
             sends to the ground station that spoke last.
-        pace: 1 is real time, 2 twice as fast; None sends as fast as the sortie is worked out.
+        pace: 1 is real time, 2 twice as fast, 0.001 to 1000; None sends as fast as the sortie is worked out.
         origin: where on the globe ENU (0, 0, 0) lies; None: by `origin_of`.
         key: 32 B with which frames are signed; messages to the endpoint that are not signed with it are ignored.
 
     Raises:
-        RunError: an address that is none, or one that is taken.
+        RunError: an address that is none, or one that is taken; a pace out of its bounds.
     """
 
     def __init__(
         self, address: str, pace: float | None = 1.0, origin: Origin | None = None, key: bytes | None = None,
         *, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
+        if pace is not None and not 1e-3 <= pace <= 1e3:
+            raise RunError(f"pace is {pace:g}, must be 0.001 to 1000, or 0 for as fast as possible")
         self._waits, host, port = parse_address(address)
         self._pace, self._origin, self._key, self._clock = pace, origin, key, clock
         self._stream: Stream | None = None

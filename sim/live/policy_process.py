@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from sortie.policies.contract import Directive, Disc, FleetView, PolicyError, Representation
 from sortie.policies.registry import describe_error
+from sortie.scenarios.exit_codes import FAILED
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.pilot import Pilot, plan_for, schedule_policies
@@ -135,4 +136,4 @@ def _end_with_parent() -> None:
     parent = parent_process()
     if parent is not None:
         wait([parent.sentinel])
-        os._exit(1)
+        os._exit(FAILED)

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sortie.fleet.messages.auth import Dropped, DropReason, Opened, Sealer, open_datagram, unseal
+from sortie.scenarios.regular import regular
 from sortie.sim.export.endpoint import read_key
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import RunError
@@ -102,7 +103,7 @@ def read_secrets(path: Path) -> Secrets:
     """
     _check_mode(path)
     try:
-        both = bytes.fromhex(path.read_text("ascii"))
+        both = bytes.fromhex(regular(path).read_text("ascii"))
     except OSError as error:
         raise RunError(f"{path}: {error.strerror}") from error
     except ValueError:

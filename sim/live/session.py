@@ -30,7 +30,6 @@ from sortie.sim.live.result import LiveResult, Lost, summarise
 from sortie.sim.live.scope import left_out
 from sortie.sim.live.seals import secrets_of
 from sortie.sim.live.watchdog import DETECTIONS, Fallback
-from sortie.sim.user_errors import user_errors
 
 MAX_DRONES = 20
 """The most processes that this starts on one host."""
@@ -209,8 +208,8 @@ def _check(
     for address in mavlink:
         parse_address(address)
     if mavlink:
-        with user_errors():  # here, before a process of a drone finds pymavlink missing
-            import_module("sortie.fleet.logs.mavlink")
+        # here, before a process of a drone finds pymavlink missing
+        import_module("sortie.fleet.logs.mavlink")
     if not 0 <= loss <= 1:
         raise RunError(f"loss is {loss:g}, must be in [0, 1]")
     if kill is not None and not (0 <= kill[0] < drones and begin_s < kill[1] < end_s):

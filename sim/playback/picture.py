@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
 
 SIZE = (1920, 1080)
+_DRIVER = "it needs a Vulkan driver that renders on the CPU (Debian, Ubuntu: apt install mesa-vulkan-drivers)"
 PATIENCE_S = 120.0
 """How long the viewer may take to load the recording and to paint it."""
 
@@ -52,7 +53,7 @@ def take_picture(recording: Path, picture: Path, at_s: float, *, size: tuple[int
         viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True)  # noqa: S603
         try:
             if not listens(port, viewer):
-                raise RuntimeError("it does not come up")
+                raise RuntimeError(f"it does not come up; {_DRIVER}")
             return _ask(port, picture, at_s)
         except (RuntimeError, TimeoutError, ConnectionError) as error:
             said.seek(0)
@@ -82,7 +83,7 @@ def _ask(port: int, picture: Path, at_s: float) -> list[str]:
                 viewer.save_screenshot(str(attempt))
                 before, now = now, attempt.read_bytes()
     if not now:
-        raise RuntimeError("it does not paint")
+        raise RuntimeError(f"it does not paint; {_DRIVER}")
     picture.write_bytes(now)
     return [f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports]
 
@@ -102,5 +103,5 @@ def _why(said: bytes) -> str:
         re.search(r"no (suitable|compatible)? ?(graphics|gpu|adapter)|adapter", text, re.IGNORECASE)
         and "llvmpipe" not in text
     ):
-        return "no Vulkan driver to render with (Debian: apt install mesa-vulkan-drivers)"
+        return f"no Vulkan driver; {_DRIVER}"
     return ""

@@ -23,6 +23,7 @@ from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, 
 from sortie.policies.damping import is_switch
 from sortie.policies.registry import describe_error
 from sortie.scenarios.plain_sum import plain_sum
+from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.sim.results.arrow_types import columns_of, from_table, to_table
 from sortie.sim.results.views import Decision
 
@@ -154,6 +155,8 @@ def _answer(policy: Policy, source: int, view: FleetView) -> Answer:
     except PolicyError:
         raise
     except Exception as error:
+        if not is_guarded(policy):  # a built-in one
+            raise
         raise PolicyError(f"as drone {source}, by the view of drone {view.ego}: {describe_error(error)}") from error
 
 

@@ -16,6 +16,7 @@ from sortie.fleet.messages.auth import DropReason
 from sortie.radio.transmission import Status
 from sortie.scenarios.intervals import AMOUNT, ANY, FLAG, SHARE, Range
 from sortie.scenarios.reading.nodes import nearest
+from sortie.sim.folders import RunError
 
 
 class Percentiles(TypedDict):
@@ -421,22 +422,20 @@ def check_number(name: str, keys: Mapping[str, Collection[str]]) -> None:
         keys: as `open_keys` gives them; a list that is not among them may be of any length.
 
     Raises:
-        ValueError: it never has one: no such field, wall clock, or no number; with what could have been meant.
+        RunError: it never has one: no such field, wall clock, or no number; with what could have been meant.
     """
     kind: Any = Outcome
     parts = name.split(".")
     if parts[0] in WALL:
-        raise ValueError(f"{name}: is wall clock, a metric must follow from the run alone")
+        raise RunError(f"{name}: is wall clock, a metric must follow from the run alone")
     for depth, part in enumerate(parts):
         above = ".".join(parts[:depth])
         below = _below(kind, part, keys.get(above))
         if below is None:
-            raise ValueError(
-                f"{name}: {above or 'the outcome'} has no {part!r}, {_instead(kind, part, keys.get(above))}"
-            )
+            raise RunError(f"{name}: {above or 'the outcome'} has no {part!r}, {_instead(kind, part, keys.get(above))}")
         kind = below
     if what := _no_number(kind):
-        raise ValueError(f"{name}: is {what}, a metric must be a number")
+        raise RunError(f"{name}: is {what}, a metric must be a number")
 
 
 def possible(name: str) -> Range:

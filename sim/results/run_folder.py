@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sortie.scenarios.reading.load import ScenarioError, dump, loads
+from sortie.scenarios.regular import regular
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import models_of_the_past
 from sortie.sim.folders import RunError, ensure_folder, replacing, settled
@@ -104,7 +105,7 @@ def ensure_same(path: Path, scenario: Scenario, seed: int, replication: int, fil
         if not (path / OUTCOME).is_file():
             return
         try:
-            about = json.loads((path / RECORD).read_text("utf-8"))
+            about = json.loads(regular(path / RECORD).read_text("utf-8"))
             old = {name: about[name] for name in new}
             there = _scenario_of(path).model_dump(mode="json")
         except (OSError, ValueError, TypeError, LookupError) as error:
@@ -218,7 +219,7 @@ def _is_of_the_run(page: Path) -> bool:
 
 def _scenario_of(path: Path) -> Scenario:
     """The scenario of a run. Packages that offered its models need not be installed."""
-    text = (path / SCENARIO).read_text("utf-8")
+    text = regular(path / SCENARIO).read_text("utf-8")
     with models_of_the_past():
         scenario = loads(text, source=str(path / SCENARIO))
     if scenario.takes_turns and not re.search("^  egos:", text, re.MULTILINE):  # of a version in which all were scored
@@ -236,7 +237,7 @@ def load(path: Path) -> SortieRecord:
     if not (path / OUTCOME).is_file():
         raise RunError(f"{path}: no run there ({OUTCOME} is missing)")
     try:
-        about = json.loads((path / RECORD).read_text("utf-8"))
+        about = json.loads(regular(path / RECORD).read_text("utf-8"))
         scenario = _scenario_of(path)
         expected = dict(TABLES)
         if scenario.record.views:
@@ -247,7 +248,7 @@ def load(path: Path) -> SortieRecord:
             expected[rosters.TABLE] = rosters.COLUMNS
         if scenario.record.beliefs:
             expected[beliefs.TABLE] = beliefs.COLUMNS
-        tables = {name: pq.read_table(path / f"{name}.parquet") for name in expected}
+        tables = {name: pq.read_table(regular(path / f"{name}.parquet")) for name in expected}
         for name, columns in expected.items():
             if lacking := [c for c in columns if c not in tables[name].column_names]:
                 raise ValueError(f"{name}.parquet has no column {lacking[0]}; another version's, perhaps: fly it again")

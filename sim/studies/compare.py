@@ -14,12 +14,14 @@ from sortie.policies.registry import own_fusion, resolve
 from sortie.scenarios.intervals import SHARE, Estimate, mean_interval
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.folders import RunError
 from sortie.sim.results.accuracy import matched
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
 SEEDS = 8
 """Sorties a policy where nothing else is asked and the detector is quick."""
+MOST_SEEDS = 10_000
 TOWNS = 2**63
 BLOCK_S = 5.0
 """Instants of a sortie that are resampled together. Neighbouring instants see the same cars over the same links. On
@@ -109,9 +111,14 @@ def chosen_seeds(scenario: Scenario, first: int | None = None, count: int | None
         first: None is the scenario's own seed.
         count: None is eight for the surrogate's sorties, which take seconds, where no first seed is named either. It is
             one for all others.
+
+    Raises:
+        RunError: too many.
     """
     surrogate = scenario.perception.detector == "surrogate" and first is None
     count = (SEEDS if surrogate else 1) if count is None else count
+    if not 1 <= count <= MOST_SEEDS:
+        raise RunError(f"seeds is {count}, must be 1 to {MOST_SEEDS}")
     begin = scenario.seed if first is None else first
     return range(begin, begin + count)
 

@@ -25,7 +25,7 @@ from sortie.sim.engine.sortie import DetectorMaker, run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.results.accuracy import Both, both_matched
 from sortie.sim.results.outcome import outcome
-from sortie.sim.studies.compare import AREAS, BY_BOTH, Compared, Contender, Gain, gain_between, in_town_of
+from sortie.sim.studies.compare import AREAS, BY_BOTH, MOST_SEEDS, Compared, Contender, Gain, gain_between, in_town_of
 from sortie.sim.studies.surrogate_draws import fly_with_draws
 
 METRICS = tuple(f"ap50.{area}" for area in AREAS)
@@ -95,6 +95,8 @@ class Settings:
             raise RunError(f"metric: {self.metric}, must be one of {', '.join(METRICS)}")
         if not 4 <= self.pilot <= self.most:
             raise RunError(f"pilot: {self.pilot}, must be 4 or more and at most the seeds to fly ({self.most})")
+        if self.most > MOST_SEEDS:
+            raise RunError(f"most_seeds: {self.most}, must be at most {MOST_SEEDS}")
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,10 @@ from sortie.perception.evaluation.verdict import MeasuredValue
 from sortie.policies.contract import Directive, FleetView, Policy
 from sortie.policies.registry import resolve
 from sortie.scenarios.reading.load import load
+from sortie.scenarios.regular import regular
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.folders import RunError
 from sortie.sim.results.record import SortieRecord
 
 SCENARIO = "paper_replay"
@@ -143,19 +145,19 @@ def measured_live(path: Path) -> dict[str, MeasuredValue]:
     """What a live flight measured of the claims that take real processes on a real bus; the file is `sortie live --out`'s.
 
     Raises:
-        ValueError: the file cannot be read, or is none of these.
+        RunError: the file cannot be read, or is none of these.
     """
     try:
-        facts = json.loads(path.read_text("utf-8"))
+        facts = json.loads(regular(path).read_text("utf-8"))
         note = f"{facts['drones']} processes on Cyclone DDS, {facts['policy']}, {facts['flown_s']:.0f} s, {facts['machine']}"
         core = MeasuredValue(
             float(facts["drones_cpu_percent"]), note=f"{note}; the bench took {facts['bench_cpu_percent']:.0f} %"
         )
         data = MeasuredValue(float(facts["data_bytes_per_s"]) / 1e6, note=f"{note}; goodput as in the simulated flight")
     except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}") from error
+        raise RunError(f"{path}: {error.strerror}") from error
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not what sortie live --out writes") from error
+        raise RunError(f"{path}: not what sortie live --out writes") from error
     return {"ros2_core_percent": core, **({"x86_container_mb_per_s": data} if _on_x86() else {})}
 
 

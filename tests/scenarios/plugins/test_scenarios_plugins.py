@@ -123,7 +123,9 @@ def test_a_scenario_says_what_a_field_may_name(section: dict[str, object], messa
 
 def test_errors_of_a_model_are_of_one_line_and_name_it() -> None:
     model = Guard("link", Fails(), ("snr_db",))
-    with pytest.raises(PluginError, match=r"^link Fails.snr_db: KeyError: 'no such drone'$"):
+    with pytest.raises(
+        PluginError, match=r"^link Fails.snr_db: KeyError: 'no such drone' \(test_scenarios_plugins.py, line \d+\)$"
+    ):
         model.snr_db()  # type: ignore[attr-defined]
     with pytest.raises(PluginError, match=r"^link Fails.stop: ProgramExitError: exit code 0, must return$"):
         model.stop()  # type: ignore[attr-defined]

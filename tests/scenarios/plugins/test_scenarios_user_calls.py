@@ -20,6 +20,7 @@ import pytest
 from sortie.policies.contract import FleetView, PolicyError
 from sortie.policies.registry import parameters, resolve, viewpoint_of
 from sortie.policies.verification.conformance import conform, full_view
+from sortie.scenarios.exit_codes import STUCK
 from sortie.scenarios.plugins import user_calls
 from sortie.scenarios.plugins.user_calls import (
     Guarded,
@@ -266,7 +267,7 @@ def test_calls_of_other_threads_go_on() -> None:
     assert done == [False]
 
 
-@pytest.mark.parametrize(("name", "ended"), [("sleeps", user_calls.STUCK), ("compiled", -signal.SIGXCPU)])
+@pytest.mark.parametrize(("name", "ended"), [("sleeps", STUCK), ("compiled", -signal.SIGXCPU)])
 def test_a_call_that_cannot_be_interrupted_ends_the_process(file: Path, name: str, ended: int) -> None:
     done = subprocess.run(
         [sys.executable, "-c", ENDS.format(path=file, name=name)], capture_output=True, text=True, check=False

@@ -35,6 +35,12 @@ def lingers(view, seen=[]):
         seen[0].start()
     return []
 
+def lasts(view, seen=[]):
+    # as the end of a process takes long on a busy machine
+    if not seen:
+        seen.append(atexit.register(threading.Event().wait))
+    return []
+
 def slow(view):
     print("decides", flush=True)
     while True:
@@ -59,11 +65,12 @@ def command(folder: Path, policy: str) -> list[str]:
 @pytest.mark.parametrize(
     ("policy", "code", "line"),
     [
-        ("compiled", 1, "error: the process ended before the command did"),
-        ("thread", 1, "error: the process ended before the command did"),
+        ("compiled", 2, "error: the process ended before the command did"),
+        ("thread", 2, "error: the process ended before the command did"),
         ("late", 2, "returns int, must be a sequence of directives"),
         ("fine", 0, ""),
-        ("lingers", 1, "error: the process did not end after the command"),
+        ("lingers", 0, ""),
+        ("lasts", 0, ""),
     ],
 )
 def test_the_exit_code_is_the_commands(tmp_path: Path, policy: str, code: int, line: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import struct
 import subprocess
 import time
@@ -91,7 +90,7 @@ def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         return False
 
     monkeypatch.setattr(picture, "listens", never)
-    with pytest.raises(RunError, match=r"it does not come up$"):
+    with pytest.raises(RunError, match=r"it does not come up; .* mesa-vulkan-drivers\)$"):
         take_picture(tmp_path / "there.rrd", tmp_path / "p.png", 0.0)
     until_s = time.monotonic() + 30.0  # killed at once, but somebody has to collect it
     while alive(int(pid.read_text())):
@@ -117,6 +116,6 @@ def test_what_cannot_be_pictured_is_named(tmp_path: Path, monkeypatch: pytest.Mo
     fake.write_text("#!/bin/sh\necho 'wgpu: no suitable graphics adapter' >&2\nexit 3\n")
     fake.chmod(0o755)
     monkeypatch.setattr(picture, "viewer_binary", lambda: str(fake))
-    with pytest.raises(RunError, match=re.escape("there.rrd: no Vulkan driver to render with (Debian: apt install")):
+    with pytest.raises(RunError, match=r"there\.rrd: no Vulkan driver; .*apt install mesa-vulkan-drivers\)$"):
         take_picture(tmp_path / "there.rrd", tmp_path / "p.png", 0.0)
     assert not (tmp_path / "p.png").exists()
