@@ -14,6 +14,7 @@ import numpy as np
 
 from sortie.policies.contract import (
     DIRECTIVE_BOUNDS,
+    MAX_REASON,
     MAX_REPOSITION_M,
     Directive,
     Disc,
@@ -109,6 +110,7 @@ def _is_plainly_valid(directives: Sequence[Directive], view: FleetView) -> bool:
                 and duty_percent.__class__ is int
                 and 0 <= duty_percent <= _MAX_DUTY
                 and reason.__class__ is str
+                and len(reason) <= MAX_REASON
                 and (reason.isascii() or _reason_fault(reason) is None)
             ):
                 return False
@@ -270,7 +272,9 @@ def _reason_fault(reason: object) -> str | None:
     if not isinstance(reason, str) or not _is_honest(reason):
         return f"reason is {text_of(reason)}, must be text"
     if _HALF_PAIR.search(reason):
-        return f"reason is {reason!r}, must be text that UTF-8 can write"
+        return f"reason is {reason!r:.200}, must be text that UTF-8 can write"
+    if len(reason) > MAX_REASON:
+        return f"reason has {len(reason)} characters, must have at most {MAX_REASON}"
     return None
 
 

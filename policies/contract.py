@@ -309,7 +309,7 @@ class Directive(NamedTuple):
     duty_percent: int = 100
     """Share of frames in which the source runs perception at all, 0 … 100."""
     reason: str = ""
-    """Why, as text for the record. It is not on the wire and no part of equality."""
+    """Why, as text for the record, at most `MAX_REASON` characters. It is not on the wire and no part of equality."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Directive) and self[:-1] == other[:-1]
@@ -383,7 +383,7 @@ class Reposition(NamedTuple):
     """The place over ground where the drone would be now, ENU; it moves on with the formation."""
     y_m: float
     reason: str = ""
-    """Why, as text for the record."""
+    """Why, as text for the record, at most `MAX_REASON` characters."""
 
 
 class Viewpoint(Protocol):
@@ -468,5 +468,7 @@ DIRECTIVE_BOUNDS: dict[str, DirectiveBound] = {
     "duty_percent": DirectiveBound(100, "a whole number"),
 }
 """The bounds of a directive's numbers: for policies, for the shield and for what comes in over the wire."""
+MAX_REASON = 1000
+"""A reason has at most so many characters: a fleet writes tens of thousands of them into a record."""
 MAX_REPOSITION_M = 200.0
 """A drone may not ask for a place farther away than this."""

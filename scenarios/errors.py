@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from sortie.scenarios.report_text import visible
+
 MOST_CHARACTERS = 2000
 """A longer message is cut: names and values in it may be those of a damaged file."""
 
@@ -18,5 +20,5 @@ class SortieError(ValueError):
 
 def one_line(text: object) -> str:
     """Text with its control characters and odd spaces escaped, and cut where it is very long."""
-    escaped = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+    escaped = visible(str(text)).replace("\n", "\\n")
     return escaped if len(escaped) <= MOST_CHARACTERS else escaped[: MOST_CHARACTERS - 1] + "…"

@@ -9,6 +9,20 @@ from typing import Any
 MINUS, NONE, ALL_EQUAL = "−", "–", "(all equal)"
 
 
+def visible(text: str) -> str:
+    """Text with everything escaped that a terminal or a page does not show: control characters, odd spaces, marks of direction.
+
+    Ends of lines stay.
+
+    Example:
+        >>> visible("a \\x1b[31mred\\u202e")
+        'a \\\\x1b[31mred\\\\u202e'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+
+
 def number(value: Any, form: str = ".3f", unit: str = "") -> str:
     """A number with its unit; a dash where there is none."""
     return NONE if value is None or value != value else f"{value:{form}}{unit and ' ' + unit}"

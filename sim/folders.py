@@ -26,7 +26,7 @@ class RunError(SortieError):
     """A file or folder that cannot be used as the user asked; the message names the path."""
 
 
-def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = ()) -> None:
+def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = (), *, replace: bool = True) -> None:
     """Refuse a path that `replacing` could not use, before anything is flown or measured.
 
     Args:
@@ -35,9 +35,10 @@ def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = 
         what: the kind's name, as in "run".
         written: all that one of the kind may hold, by its path in it, so that nothing of a user's goes when it is
             replaced; left out, anything.
+        replace: whether an older one may be replaced.
 
     Raises:
-        RunError: it holds something else, or cannot be made.
+        RunError: it holds something else, or one that may not be replaced; or it cannot be made.
     """
     if not path.resolve().name:
         raise RunError(f"{path}: is the root of the file system, a {what} needs a folder below it")
@@ -50,13 +51,19 @@ def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = 
         if written and path.is_dir() and (others := _others(path, written)):
             more = f" and {len(others) - 1} more" if len(others) > 1 else ""
             raise RunError(f"{path}: holds {others[0]}{more}, which no {what} wrote; choose another folder or move it")
+        if not replace and path.is_dir() and any(path.iterdir()):
+            raise RunError(f"{path}: holds a {what} already; choose another folder, or replace it with --replace")
 
 
-def ensure_files(*paths: Path | None) -> None:
+def ensure_files(*paths: Path | None, replace: bool = True) -> None:
     """Refuse paths of files that could not be written, before anything is flown or measured; None is no file.
 
+    Args:
+        paths: the files to be.
+        replace: whether files that exist may be replaced, whoever wrote them.
+
     Raises:
-        RunError: one is a folder, a part of a run, named twice, or cannot be made.
+        RunError: one is a folder, a part of a run, named twice, cannot be made, or exists and may not be replaced.
     """
     places: set[Path] = set()
     for path in filter(None, paths):
@@ -69,6 +76,8 @@ def ensure_files(*paths: Path | None) -> None:
         if path.resolve() in places:
             raise RunError(f"{path}: two outputs have this name, and one would replace the other; name two files")
         places.add(path.resolve())
+        if not replace and os.path.lexists(path):
+            raise RunError(f"{path}: exists already; choose another file, or replace it with --replace")
 
 
 def _ensure_spared(path: Path) -> None:

@@ -166,6 +166,12 @@ def runs_user_code(scenario: Scenario) -> bool:
     return any(is_file(name) for _, name in named_models(scenario.model_dump(mode="json")))
 
 
+def policy_files(scenario: Scenario) -> list[str]:
+    """The policies of a scenario that are in files, as it names them."""
+    named = named_models(scenario.model_dump(mode="json"))
+    return [name for kind, name in named if kind == "policy" and is_file(name)]
+
+
 def own_files(
     scenario: Scenario, policy: str | Callable[..., object] | None = None, detector: object = None
 ) -> dict[str, str]:

@@ -311,12 +311,14 @@ def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = F
     Args:
         run: a run that was flown with `record.views`.
         policy: the policy that decides; None uses the policies that decided in flight, each where it did. Their
-            decisions must then be the same, unless they depend on more than the view.
+            decisions must then be the same, unless they depend on more than the view. A run that was opened names files,
+            and does not run them: name a policy that is a file.
         disagreement: also measure how often two drones' views lead to different choices about one link. The time for
             this grows with the third power of the number of drones.
 
     Raises:
-        RunError: the run kept no views, or a function that the scenario does not name decided in flight.
+        RunError: the run kept no views, or a function that the scenario does not name decided in flight; or a file did,
+            and the run was opened from a folder.
         PolicyError: the policy is unknown, fails on a view or breaks its contract.
 
     Example:
@@ -327,11 +329,13 @@ def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = F
         ['t_s', 'drone', 'decision', 'peer', 'fields']
     """
     from sortie.sim.engine.pilot import NamedPolicy, PolicyPlan, plan_for
-    from sortie.sim.identity import name_of
+    from sortie.sim.identity import name_of, policy_files
     from sortie.sim.studies.replay import replay as decide_again
 
     if not isinstance(run, Run):
         raise RunError(f"run: {run!r}, must be a Run, as sortie.open_run gives it")
+    if policy is None and run.path is not None and (files := policy_files(run.scenario)):
+        raise RunError(f"{run.path}: {files[0]} decided in flight; name it as the policy to run that file again")
     chosen, function = _with_policy(run.scenario, policy)
     plan = plan_for(chosen) if function is None else PolicyPlan(NamedPolicy(name_of(function), function))
     return decide_again(run.record, plan, as_flown=policy is None, disagreement=disagreement)

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from typer.core import TyperGroup
 
 from sortie._signals import as_usual
@@ -42,7 +41,7 @@ from sortie.sim.cli import (
     view,
     worst,
 )
-from sortie.sim.cli.console import err, out, own_streams
+from sortie.sim.cli.console import err, out, own_streams, print_error
 from sortie.sim.identity import code_version
 from sortie.sim.process import own_process
 from sortie.sim.user_errors import defect, user_errors
@@ -113,11 +112,11 @@ def main() -> None:
         if sys.stdout is not None:
             sys.stdout.flush()
     except SortieError as error:
-        err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True)
+        print_error(error)
         code = USER
     except Exception as error:
         traceback.print_exception(error)
-        err.print(defect(), soft_wrap=True, markup=False)
+        err.print(defect(), soft_wrap=True)
         code = DEFECT
     report_code(code)
     sys.exit(code)

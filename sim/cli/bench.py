@@ -15,7 +15,7 @@ from sortie.perception.benchmark.manifest import problems, read
 from sortie.perception.geometry import Geometry
 from sortie.scenarios.exit_codes import FAILED
 from sortie.scenarios.report_text import points
-from sortie.sim.cli.console import err, out, stages
+from sortie.sim.cli.console import out, print_failure, print_written, stages
 from sortie.sim.cli.options import ImagePx, ImagePxOption
 from sortie.sim.folders import RunError
 
@@ -73,7 +73,7 @@ def make(
     for name, files in read(folder)["splits"].items():
         table.add_row(name, f"{len(files)}", f"{sum(f['frames'] for f in files.values())}")
     out.print(table)
-    out.print(f"kept in [bold]{folder}[/bold], see a frame with: sortie bench show {folder} test 0", soft_wrap=True)
+    print_written("kept in", folder, f", see a frame with: sortie bench show {folder} test 0")
 
 
 @app.command()
@@ -96,7 +96,7 @@ def show(
         raise RunError(f"frame is {frame}, must be 0 to {frames - 1} in the {split.value} split")
     path = out_file or folder / "sheets" / f"{split.value}_{index}_{frame}.png"
     save(draw(bench, split.value, index, frame), path)
-    out.print(f"drawn in [bold]{path}[/bold]", soft_wrap=True)
+    print_written("drawn in", path)
 
 
 @app.command()
@@ -108,7 +108,7 @@ def verify(folder: FolderArgument) -> None:
         Benchmark.at(folder)
         found = problems(folder, partial(report, "files"))
     for line in found:
-        err.print(f"[red]{line}[/red]", soft_wrap=True)
+        print_failure(line)
     if found:
         raise typer.Exit(FAILED)
     count = sum(len(files) for files in read(folder)["splits"].values())

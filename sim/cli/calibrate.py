@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.box import SIMPLE
 from rich.table import Table
+from rich.text import Text
 
 from sortie.policies.registry import resolve
 from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.report_text import points
-from sortie.sim.cli.console import out, stages
+from sortie.sim.cli.console import out, print_written, stages
 from sortie.sim.cli.options import refuse
 from sortie.sim.folders import ensure_files
 from sortie.sim.studies.in_flight import REGIONS, ConditionAp, flights, means
@@ -86,14 +87,14 @@ def _tell(verdict: CalibrationVerdict, out_file: Path) -> None:
     table = Table("condition", "torch", "surrogate", "error", title="AP@0.5 on held-out scenes")
     for v in verdict.levels:
         colour = "green" if abs(v.error) <= WITHIN else "red"
-        table.add_row(v.condition, f"{v.torch:.3f}", f"{v.surrogate:.3f}", f"[{colour}]{v.error:+.3f}[/{colour}]")
+        table.add_row(v.condition, f"{v.torch:.3f}", f"{v.surrogate:.3f}", Text(f"{v.error:+.3f}", colour))
     out.print(table)
     for o in verdict.orders:
-        said = "not significant" if not o.significant else "kept" if o.kept else "[red]lost[/red]"
+        said = "not significant" if not o.significant else "kept" if o.kept else "lost"
         out.print(
-            f"{o.b} − {o.a}: torch {o.torch:+.3f} \\[{o.low:+.3f}, {o.high:+.3f}], surrogate {o.surrogate:+.3f}, {said}"
+            f"{o.b} − {o.a}: torch {o.torch:+.3f} [{o.low:+.3f}, {o.high:+.3f}], surrogate {o.surrogate:+.3f}, {said}"
         )
-    out.print(f"kept in [bold]{out_file}[/bold], its card in [bold]{out_file.with_suffix('.md')}[/bold]")
+    print_written("kept in", out_file, f", its card in {out_file.with_suffix('.md')}")
 
 
 def _in_flight(levels: Sequence[ConditionAp], title: str) -> Iterator[Table]:

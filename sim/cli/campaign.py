@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 import sortie
 from sortie.scenarios.exit_codes import ENDED, FAILED, INTERRUPTED
 from sortie.sim.campaign.signals import EndedError, ended_by_sigterm
-from sortie.sim.cli.console import err, out
+from sortie.sim.cli.console import err, out, print_written
 
 if TYPE_CHECKING:
     from sortie.scenarios.schema import Scenario
@@ -119,7 +119,7 @@ def run(
     if report_:
         report(folder)
     else:
-        out.print(f"kept in [bold]{folder}[/bold]")
+        print_written("kept in", folder)
     if done.failed:
         raise typer.Exit(FAILED)
 
@@ -131,7 +131,7 @@ def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")])
     from sortie.sim.campaign.table import TABLE
 
     path = write_report(folder, _notice)
-    out.print(f"report written to [bold]{path}[/bold], rows in [bold]{folder / TABLE}[/bold]")
+    print_written("report written to", path, f", rows in {folder / TABLE}")
 
 
 def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> tuple[Scenario, int, int, str | None]:
@@ -151,23 +151,21 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
         raise RunError("--from-campaign: the run has its own scenario, policy, seed and settings; name nothing else")
     plan, row = find_row(folder, run)
     if plan.code not in (here := codes_here()):
-        err.print(
-            f"[yellow]this is Sortie {here[' torch ' in plan.code]}, the campaign was flown with {plan.code}[/yellow]"
-        )
+        _notice(f"this is Sortie {here[' torch ' in plan.code]}, the campaign was flown with {plan.code}")
     if row is None:
         err.print(f"the campaign has not flown run {run} yet: there is no record to compare with")
     elif row["status"] == "failed":
-        err.print(f"in the campaign run {run} failed: {row['error']}", soft_wrap=True, markup=False)
+        err.print(f"in the campaign run {run} failed: {row['error']}", soft_wrap=True)
     scenario, seed, replication = unpack(plan.task(run))
     return scenario, seed, replication, (row or {}).get("fingerprint") or None
 
 
 def _notice(line: str) -> None:
-    err.print(line, style="yellow", soft_wrap=True, markup=False)
+    err.print(line, style="yellow", soft_wrap=True)
 
 
 def _in_words(done: sortie.CampaignResult) -> str:
-    failed = f", [red]{done.failed} failed[/red]" if done.failed else ""
+    failed = f", {done.failed} failed" if done.failed else ""
     speed = (
         f"; {done.flown} of them now, {60 * done.flown / done.seconds:.1f} a minute"
         if done.flown
@@ -179,7 +177,7 @@ def _in_words(done: sortie.CampaignResult) -> str:
 @contextmanager
 def _bar(name: str) -> Iterator[Callable[[Progress], None]]:
     """A progress bar with throughput and time left. It prints nothing without a terminal."""
-    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
+    columns = (TextColumn(name, markup=False), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}", markup=False))
     with Bar(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("starting", total=None)
 

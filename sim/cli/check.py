@@ -15,7 +15,7 @@ from sortie.scenarios.reading.campaign import read_any
 from sortie.scenarios.reading.load import ScenarioError, campaigns, condition_sets, library
 from sortie.sim.check.junit import Suite, junit
 from sortie.sim.cli import tables
-from sortie.sim.cli.console import bars, err, line_printer, out
+from sortie.sim.cli.console import bars, line_printer, out, print_failure
 from sortie.sim.cli.options import SetOption, refuse
 from sortie.sim.folders import ensure_files, write_text
 
@@ -66,12 +66,12 @@ def check(
         failed += len(checked.failed)
         out.print(tables.verdict_table(flown.name, checked.verdicts))
         if checked.written:
-            out.print(checked.written, soft_wrap=True, markup=False)
+            out.print(checked.written, soft_wrap=True)
         for command in dict.fromkeys(map(checked.replay, checked.failed)):
-            out.print(f"see it with: {command}", soft_wrap=True, markup=False)
+            out.print(f"see it with: {command}", soft_wrap=True)
     _write_junit(junit_file, suites)
     if failed:
-        err.print(f"[red]{failed} expectation{'s' if failed > 1 else ''} failed[/red]")
+        print_failure(f"{failed} expectation{'s' if failed > 1 else ''} failed")
         raise typer.Exit(FAILED)
 
 
@@ -93,8 +93,8 @@ def _check_syntax(files: list[str], overrides: list[str] | None) -> None:
         else:
             issues += [f"{file}: {issue}" for issue in (() if scenario is None else not_there(scenario))]
     for issue in issues:
-        out.print(issue, soft_wrap=True, markup=False, highlight=False)
+        out.print(issue, soft_wrap=True, highlight=False)
     if issues:
-        err.print(f"[red]{len(issues)} thing{'s are' if len(issues) > 1 else ' is'} wrong[/red]")
+        print_failure(f"{len(issues)} thing{'s are' if len(issues) > 1 else ' is'} wrong")
         raise typer.Exit(FAILED)
     out.print(f"{len(files)} file{'s' if len(files) > 1 else ''} read, nothing is wrong")

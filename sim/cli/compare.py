@@ -13,8 +13,16 @@ import sortie
 from sortie.policies.registry import POLICIES
 from sortie.scenarios.reading.load import load_conditions
 from sortie.sim.cli.conditions import compare_conditions
-from sortie.sim.cli.console import bars, out, stages
-from sortie.sim.cli.options import ScenarioArgument, SeedOption, SetOption, loaded, refuse, split_policies
+from sortie.sim.cli.console import bars, out, print_written, stages
+from sortie.sim.cli.options import (
+    ReplaceOption,
+    ScenarioArgument,
+    SeedOption,
+    SetOption,
+    loaded,
+    refuse,
+    split_policies,
+)
 from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
 from sortie.sim.studies.compare import MOST_SEEDS, Flown, chosen_seeds, in_town_of
 from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
@@ -94,19 +102,24 @@ def compare(
     by_torch: Annotated[
         bool, typer.Option("--by-torch", help="With conditions: fly with the surrogate, score with the torch detector.")
     ] = False,
+    replace: ReplaceOption = False,
 ) -> None:
-    """Fly a scenario or a set of conditions under several policies with equal seeds and draws, and print the comparison."""
+    """Fly a scenario or a set of conditions under several policies with equal seeds and draws, and print the comparison.
+
+    A file of --out, --report or --recording that exists needs --replace.
+    """
     conditions = load_conditions(scenario)
     if conditions is not None:
         one = ("seeds", "own_fusion", "recording", "report", "readme", "half_width", *PRECISE)
         refuse(context, ("seed",), "a scenario, not with a set of conditions: its file has its seeds")
         refuse(context, one, "a scenario, not with a set of conditions")
         named = list(POLICIES) if policies == "all" else split_policies(policies)
-        return compare_conditions(conditions, named, set_ or [], out_file, by_torch=by_torch)
+        return compare_conditions(conditions, named, set_ or [], out_file, by_torch=by_torch, replace=replace)
     if by_torch:
         raise RunError(f"--by-torch goes with a set of conditions; for {scenario}: --set perception.detector=torch")
     labels = split_policies(policies)
     base = [loaded(scenario, set_, label) for label in labels][0]  # noqa: RUF015  every policy's notes are printed
+    ensure_files(out_file, recording, report, replace=replace)
     ensure_files(out_file, recording, report, kept)
     ensure_between(readme, BEGIN, END)
     if half_width is not None:
@@ -133,10 +146,10 @@ def compare(
     out.print(compared.summary())
     if out_file is not None:
         write_text(out_file, json.dumps(_plain(compared), indent=2, allow_nan=False) + "\n")
-        out.print(f"kept in [bold]{out_file}[/bold]")
+        print_written("kept in", out_file)
     if report is not None:
         compared.report(report)
-        out.print(f"kept in [bold]{report}[/bold]", soft_wrap=True)
+        print_written("kept in", report)
     if readme is not None:
         command = compare_command(
             scenario, policies, seed, seeds, set_ or [], own_fusion=own_fusion, half_width=half_width, metric=metric, pilot=pilot,
@@ -144,10 +157,10 @@ def compare(
         )  # fmt: skip
         section = comparison_markdown(Flown(compared.sorties, compared.gains), command, compared.precision)
         put_between(readme, section, BEGIN, END)
-        out.print(f"the comparison in [bold]{readme}[/bold] written")
+        print_written("the comparison in", readme, " written")
     if recording is not None:
         compared.save_recording(recording)
-        out.print(f"kept in [bold]{recording}[/bold], see it with: rerun {recording}", soft_wrap=True)
+        print_written("kept in", recording, f", see it with: rerun {recording}")
 
 
 def _plain(compared: sortie.Comparison) -> dict[str, Any]:

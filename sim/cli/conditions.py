@@ -12,12 +12,13 @@ from typing import Annotated
 import typer
 from rich.box import SIMPLE
 from rich.table import Table
+from rich.text import Text
 
 from sortie.perception.detectors import make_detector
 from sortie.policies.catalogue.adaptive import ARMS
 from sortie.scenarios.report_text import number, percent, points, size
 from sortie.scenarios.schema.conditions import ConditionSet
-from sortie.sim.cli.console import bars, out
+from sortie.sim.cli.console import bars, out, print_written
 from sortie.sim.cli.options import SetOption
 from sortie.sim.folders import ensure_files, write_text
 from sortie.sim.studies.conditions import FIXED, Cell, best_fixed, fly_all, summarise
@@ -31,9 +32,10 @@ def compare_conditions(
     out_file: Path | None,
     *,
     by_torch: bool = False,
+    replace: bool = False,
 ) -> None:
     """Fly every policy in every condition, print AP by condition and the sums, keep both as JSON."""
-    ensure_files(out_file)
+    ensure_files(out_file, replace=replace)
     conditions = conditions.model_copy(update={"set": (*conditions.set, *sets)})
     with bars() as bar:
         each = {p: bar(p, len(conditions.conditions)) for p in policies}
@@ -72,8 +74,9 @@ def compare_conditions(
         else f"of {fixed}: share of its AP"
     )
     out.print(
-        f"[dim]over {fixed}: AP points over {fixed}{best}, and the interval of their mean over conditions; {share}; data and "
-        "energy of a sortie; missed: payloads past their deadline[/dim]"
+        f"over {fixed}: AP points over {fixed}{best}, and the interval of their mean over conditions; {share}; data and "
+        "energy of a sortie; missed: payloads past their deadline",
+        style="dim",
     )
     if out_file is not None:
         found = {
@@ -81,7 +84,7 @@ def compare_conditions(
             "cells": [{**asdict(c), "ap": _known(c.ap)} for c in cells],
         }
         write_text(out_file, json.dumps(found, indent=1) + "\n")
-        out.print(f"kept in [bold]{out_file}[/bold]")
+        print_written("kept in", out_file)
 
 
 def _known(figure: float) -> float | None:
@@ -104,7 +107,7 @@ def _by_condition(
         for c in conditions.conditions:
             best = max(at[p, c.name] for p in policies)
             figures = ((number(at[p, c.name]), at[p, c.name] == best) for p in few)
-            table.add_row(c.name, f"{c.budget:g}", *(f"[bold]{a}[/bold]" if is_ else a for a, is_ in figures))
+            table.add_row(c.name, f"{c.budget:g}", *(Text(a, "bold" if is_ else "") for a, is_ in figures))
         yield table
 
 
@@ -159,4 +162,4 @@ def learn(
     out.print(table)
     enough = ", ".join(f"{name} {budget:.3f}" for name, budget in thresholds(lessons).items())
     out.print(f"maps find more than boxes from a budget of: {enough}")
-    out.print(f"kept in [bold]{out_file}[/bold]")
+    print_written("kept in", out_file)

@@ -9,13 +9,29 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from sortie.sim.folders import RunError
+from sortie.sim.terminal import Terminal
 
-out = Console(emoji=False)  # `mine.py:link:` is a file's name
-err = Console(stderr=True, highlight=False, emoji=False)
+out = Terminal()
+err = Terminal(stderr=True, highlight=False)
+
+
+def print_written(before: str, path: object, after: str = "") -> None:
+    """Print where something was written, or what was made: the path or name in bold, between two texts."""
+    out.print(Text.assemble(f"{before} ", (str(path), "bold"), after), soft_wrap=True)
+
+
+def print_failure(text: str) -> None:
+    """Print a line that says what did not hold or was not found."""
+    err.print(text, style="red", soft_wrap=True)
+
+
+def print_error(error: object) -> None:
+    """Print an error that ends a command."""
+    err.print(Text.assemble(("error:", "red"), f" {error}"), soft_wrap=True)
 
 
 class _Stream(io.RawIOBase):
@@ -60,13 +76,13 @@ def own_streams() -> None:
 
 def line_printer(name: str) -> Callable[[str], None]:
     """Prints lines about a scenario as errors are printed, above a bar if one is shown."""
-    return lambda words: err.print(f"{name}: {words}", soft_wrap=True, markup=False)
+    return lambda words: err.print(f"{name}: {words}", soft_wrap=True)
 
 
 @contextmanager
 def bars() -> Iterator[Callable[[str, float], Callable[[float], None]]]:
     """A progress display; gives a function that adds a bar and returns its updater. Silent without a terminal."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
 
         def add(label: str, total: float) -> Callable[[float], None]:

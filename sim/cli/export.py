@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from sortie.scenarios.traces import TraceError
-from sortie.sim.cli.console import out
+from sortie.sim.cli.console import print_written
+from sortie.sim.cli.options import ReplaceOption
 from sortie.sim.export.endpoint import read_key
 from sortie.sim.export.origin import parse_origin
 from sortie.sim.folders import RunError, ensure_files, ensure_folder
@@ -49,8 +50,12 @@ def export(
     drone: Annotated[
         int | None, typer.Option(help="With --tlog: write this drone alone; default: all drones.", min=0)
     ] = None,
+    replace: ReplaceOption = False,
 ) -> None:
-    """Write a run for other tools: a ROS 2 bag (also for Foxglove), a log for ground stations, or a packet capture."""
+    """Write a run for other tools: a ROS 2 bag (also for Foxglove), a log for ground stations, or a packet capture.
+
+    A file or a bag that exists needs --replace.
+    """
     if mcap + tlog + pcap != 1:
         raise typer.BadParameter("name one format: --mcap, --tlog or --pcap")
     if key is not None and not tlog:
@@ -67,27 +72,27 @@ def export(
         from sortie.sim.export.telemetry import save_tlog
 
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
-        ensure_files(path)
+        ensure_files(path, replace=replace)
         try:
             frames = save_tlog(run_folder.load(run), path, began_us, where, secret, drone)
         except TraceError as error:
             raise RunError(f"{error}; the log's origin is in it, or --origin names one") from error
-        out.print(f"{frames} MAVLink frames, in [bold]{path}[/bold]", soft_wrap=True)
+        print_written(f"{frames} MAVLink frames, in", path)
         return
     if pcap:
         from sortie.sim.export.pcap import write_pcap
 
         path = out_path or run / PCAP
-        ensure_files(path)
+        ensure_files(path, replace=replace)
         sent = write_pcap(run_folder.load(run), path, began_us * 1000)
         parts = ", ".join(f"{count} {kind}" for kind, count in sent.items())
-        out.print(f"{sum(sent.values())} packets ({parts}), in [bold]{path}[/bold]", soft_wrap=True)
+        print_written(f"{sum(sent.values())} packets ({parts}), in", path)
         return
     from sortie.sim.export.foxglove import LAYOUT
 
     path = out_path or run / BAG
     path = path if path.name.strip(".") else path.resolve()  # the bag is called as its folder is
-    ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap", LAYOUT})
+    ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap", LAYOUT}, replace=replace)
     record = run_folder.load(run)
     try:
         from sortie.sim.export.bag import write_bag
@@ -95,8 +100,8 @@ def export(
         counts = write_bag(record, path, began_us * 1000, where)
     except TraceError as error:
         raise RunError(f"{error}; the bag's origin is in it, or --origin names one") from error
-    out.print(f"{sum(counts.values())} messages on {len(counts)} topics, in [bold]{path}[/bold]", soft_wrap=True)
-    out.print(f"layout for Foxglove, in [bold]{path / LAYOUT}[/bold]", soft_wrap=True)
+    print_written(f"{sum(counts.values())} messages on {len(counts)} topics, in", path)
+    print_written("layout for Foxglove, in", path / LAYOUT)
 
 
 def moment(text: str, first: int, end: int) -> datetime:

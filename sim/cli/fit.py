@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sortie.sim.cli.console import out, stages
+from sortie.sim.cli.console import out, print_written, stages
 from sortie.sim.cli.options import refuse
 from sortie.sim.folders import ensure_files, write_text
 
@@ -62,7 +62,7 @@ def fit_codebook(
     for length, lost in facts["unexplained"].items():
         table.add_row(str(length), f"{100 * lost:.1f} %")
     out.print(table)
-    out.print(f"kept in [bold]{target}[/bold], its card beside it")
+    print_written("kept in", target, ", its card beside it")
 
 
 @app.command("errors")
@@ -129,4 +129,4 @@ def fit_errors(
         f"{fitted.boxes} boxes: {100 * fitted.within[0]:.1f} % of the errors within one standard deviation, "
         f"{100 * fitted.within[1]:.1f} % within two; {100 * model.common:.0f} % of a variance is common to several drones"
     )
-    out.print(f"kept in [bold]{target}[/bold]")
+    print_written("kept in", target)

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 
 import sortie
 from sortie.scenarios.reading.load import ScenarioError, library, load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
-from sortie.sim.cli.console import bars, line_printer, out
+from sortie.sim.cli.console import bars, line_printer, out, print_written
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded, refuse
 from sortie.sim.cli.view import view
 from sortie.sim.engine.needs import Forecast, ensure_room, needs
@@ -121,12 +120,12 @@ def fly(
     report(flight.outcome)
     recorded = (path / run_folder.RECORDING).is_file()
     see = f", see it with: sortie view {path}" if recorded else ""
-    out.print(f"kept in [bold]{path}[/bold]{escape(note)}{see}", soft_wrap=True)
+    print_written("kept in", path, f"{note}{see}")
     if not recorded and recording is None:
-        out.print("without a recording, as Rerun is missing: pip install 'sortie-sim[view]'", markup=False)
+        out.print("without a recording, as Rerun is missing: pip install 'sortie-sim[view]'")
     if expected is not None:
-        same = "is" if flight.fingerprint[:16] == expected else "[red]is not[/red]"
-        out.print(f"the record {same} the campaign's")
+        same = flight.fingerprint[:16] == expected
+        out.print(f"the record is{'' if same else ' not'} the campaign's", style=None if same else "red")
     if view_:
         view(path)
 

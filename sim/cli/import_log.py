@@ -100,7 +100,7 @@ def import_log(
         who = ", ".join(f"drone {drone} is {_called(flight, flights)}" for drone, flight in enumerate(flights))
         out.print(f"{len(flights)} vehicles: {who}", soft_wrap=True)
     for line in told(flights, columns):
-        out.print(f"  [yellow]{line}[/yellow]", soft_wrap=True)
+        out.print(f"  {line}", style="yellow", soft_wrap=True)
     out.print(f"sortie fly {folder / SCENARIO}", soft_wrap=True)
 
 

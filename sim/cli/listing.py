@@ -8,7 +8,7 @@ from typing import Annotated, Any, get_args
 
 import typer
 from pydantic import BaseModel
-from rich.markup import escape
+from rich.text import Text
 
 from sortie.fleet.flight.mobility import MOBILITY
 from sortie.perception.detectors import DETECTORS
@@ -23,7 +23,7 @@ from sortie.scenarios.schema.campaign import Campaign
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import err, out
 
-Lines = Iterator[str]
+Lines = Iterator[str | Text]
 KINDS = list(dict.fromkeys([*(kind for kind in MODELS.values() if kind != "recorded_fusion"), "event", "metric"]))
 """Kinds of models that can be replaced from outside."""
 PLURALS = {"policies": "policy", "detectors": "detector", "fusions": "fusion"}
@@ -91,11 +91,11 @@ def _campaigns() -> Lines:
 
 def _invariants() -> Lines:
     for name, word in WORDS.items():
-        yield f"{_line(name, {}, word.about + (' (of each link)' if word.of_link else ''))}\n    {escape(word.example)}"
+        yield _line(name, {}, f"{word.about}{' (of each link)' * word.of_link}\n    {word.example}")
     yield "words about time, judged in flight and over whole courses:"
     for name, (about, example) in TIME_WORDS.items():
-        yield f"{_line(name, {}, about)}\n    {escape(example)}"
-    yield f"fresh.FIELD  what the policy decides for the link if every descriptor has age 0\n    {escape('rate_hz <= fresh.rate_hz')}"
+        yield _line(name, {}, f"{about}\n    {example}")
+    yield "fresh.FIELD  what the policy decides for the link if every descriptor has age 0\n    rate_hz <= fresh.rate_hz"
     yield f"functions over all links: {', '.join(LINK_FUNCTIONS)}"
     yield f"names of values: {', '.join(CONSTANTS)}"
 
@@ -145,9 +145,9 @@ def _installed(kind: str) -> Lines:
             yield _line(name, {}, f"({package}) {error}")
 
 
-def _line(name: str, given: Mapping[str, object], about: str) -> str:
+def _line(name: str, given: Mapping[str, object], about: str) -> Text:
     inside = ", ".join(f"{key}={value}" for key, value in given.items())
-    return f"[bold]{name}[/bold]{escape(f'({inside})' if inside else '')}  {escape(about)}".rstrip()
+    return Text.assemble((name, "bold"), f"{f'({inside})' if inside else ''}  {about}".rstrip())
 
 
 def _summary(model: Any) -> str:

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from sortie.scenarios.exit_codes import INTERRUPTED
-from sortie.sim.cli.console import err, out, stages
+from sortie.sim.cli.console import err, out, print_written, stages
 from sortie.sim.cli.options import PolicyOption, SetOption, loaded, refuse
 from sortie.sim.folders import RunError, ensure_files, write_text
 
@@ -118,13 +118,13 @@ def live(
             mavlink=mavlink or (),
             origin=given_origin(flown.fleet) if origin is None else parse_origin(origin),
             mavlink_key=None if mavlink_key is None else read_own_key(mavlink_key),
-            warn=lambda text: err.print(text, soft_wrap=True, markup=False),
+            warn=lambda text: err.print(text, soft_wrap=True),
             progress=lambda what, done, of: report(what, round(done), round(of)),
         )
     _show(result)
     if out_file is not None:
         write_text(out_file, json.dumps(result.as_json(), indent=2) + "\n")
-        out.print(f"kept in [bold]{out_file}[/bold]", soft_wrap=True)
+        print_written("kept in", out_file)
     if result.interrupted:
         err.print(f"interrupted after {result.flown_s:.1f} s")
         raise typer.Exit(INTERRUPTED)
@@ -177,7 +177,7 @@ def _show(result: LiveResult) -> None:
     out.print(table)
     lines = describe_changes(result)
     for line in lines[:SHOWN]:
-        out.print(line, soft_wrap=True, markup=False)
+        out.print(line, soft_wrap=True)
     if len(lines) > SHOWN:
         out.print(f"… and {len(lines) - SHOWN} more changes; --out keeps all")
     out.print(f"{result.machine}; {result.decisions} decisions", soft_wrap=True)

@@ -36,7 +36,7 @@ def new(
     write_text(path, text)
     write_text(Path(SCHEMA), schema)
     out.print(f"{path} written; {SCHEMA} beside it completes and checks it in editors with a YAML language server")
-    out.print(f"fly it with: sortie fly {path}", soft_wrap=True, markup=False)
+    out.print(f"fly it with: sortie fly {path}", soft_wrap=True)
 
 
 def _ensure_ours(path: Path) -> None:

@@ -27,6 +27,7 @@ SeedOption = Annotated[
 PolicyOption = Annotated[
     str | None, typer.Option(help="A policy's name, name(key=value), or path/to/file.py:function.")
 ]
+ReplaceOption = Annotated[bool, typer.Option("--replace", help="Replace files that exist, whoever wrote them.")]
 DeviceOption = Annotated[str | None, typer.Option(help="cpu, cuda, or auto: cuda where available; default: auto.")]
 WorkersOption = Annotated[
     int | None, typer.Option(help="Number of frames evaluated in parallel; default: one per core.", min=1)

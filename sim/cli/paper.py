@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from sortie.perception.evaluation import report
 from sortie.perception.evaluation.condition import Absent, CellsBy, Serve, Ways
 from sortie.perception.evaluation.rows import INSTRUMENTS, ClaimRow, differ_by_chance
 from sortie.perception.evaluation.verdict import ClaimVerdict
-from sortie.sim.cli.console import out, stages
+from sortie.sim.cli.console import out, print_written, stages
 from sortie.sim.cli.options import DeviceOption, WorkersOption, refuse
 from sortie.sim.folders import RunError, ensure_between
+from sortie.sim.terminal import Terminal
 
 if TYPE_CHECKING:
     from sortie.perception.evaluation.picture import Picture
@@ -130,20 +131,18 @@ def paper(
     with stages() as progress:
         result = making.make(job, work, progress)
     making.write(result, out_dir)
-    wide = out if out.is_terminal else Console(width=PIPED_WIDTH)
+    wide = out if out.is_terminal else Terminal(width=PIPED_WIDTH)
     wide.print(verdicts_table(result.rows, masked=wide.width >= NARROW))
     out.print(_tally(result.rows))
     if not figures.available():
-        out.print("no figures: they need matplotlib, as in pip install 'sortie-sim\\[report]'")
-    out.print(
-        f"{result.facts['cpu_s']:.0f} CPU-seconds, {result.facts['wall_s']:.0f} s; kept in [bold]{out_dir}[/bold]"
-    )
+        out.print("no figures: they need matplotlib, as in pip install 'sortie-sim[report]'")
+    print_written(f"{result.facts['cpu_s']:.0f} CPU-seconds, {result.facts['wall_s']:.0f} s; kept in", out_dir)
     if against is not None:
         out.print(_differences(result.rows, other, against))
     if readme is not None:
         link = _relative(out_dir / making.REPORT, readme.parent)
         making.put_into_readme(readme, result.rows, result.facts, link)
-        out.print(f"results section of [bold]{readme}[/bold] written")
+        print_written("results section of", readme, " written")
 
 
 def verdicts_table(rows: Sequence[ClaimRow], *, masked: bool = True) -> Table:
@@ -165,12 +164,12 @@ def verdicts_table(rows: Sequence[ClaimRow], *, masked: bool = True) -> Table:
         if first.section != section:
             section = first.section
             table.add_section()
-            table.add_row(f"[bold]{section}[/bold]")
-        cells: list[str] = []
+            table.add_row(Text(section, "bold"))
+        cells: list[str | Text] = []
         for k, i in enumerate(shown):
             it = several.get(i) or (several.get("") if k == 0 else None)
-            cells += ["", ""] if it is None else [_safe(report.ours(it)), _coloured(it)]
-        table.add_row(_safe(first.says), _safe(report.papers(first)), *cells)
+            cells += ["", ""] if it is None else [report.ours(it), _coloured(it)]
+        table.add_row(first.says, report.papers(first), *cells)
     return table
 
 
@@ -198,23 +197,18 @@ def _differences(ours: Sequence[ClaimRow], theirs: Sequence[ClaimRow], where: Pa
     return "\n".join([first + (", but:" if lines else ""), *lines])
 
 
-def _coloured(row: ClaimRow) -> str:
-    colour = COLOURS.get(ClaimVerdict(row.verdict), "dim")
-    return f"[{colour}]{row.verdict}[/{colour}]" + (f", {row.size}" if row.size and row.rule != "exact" else "")
+def _coloured(row: ClaimRow) -> Text:
+    text = Text(row.verdict, COLOURS.get(ClaimVerdict(row.verdict), "dim"))
+    return Text.assemble(text, f", {row.size}" if row.size and row.rule != "exact" else "")
 
 
-def _safe(text: str) -> str:
-    return text.replace("[", r"\[")
-
-
-def _open_frame(picture: Picture, path: Path, out: Console, *, show: bool) -> None:
+def _open_frame(picture: Picture, path: Path, *, show: bool) -> None:
     from sortie.sim.playback.frame import save_frame
     from sortie.sim.playback.viewer import open_viewer
 
     save_frame(picture, path)
-    out.print(
-        f"{picture.name}, ego {picture.ego}: {len(picture.truth)} cars, {len(picture.found)} boxes; kept in [bold]{path}[/bold]"
-    )
+    what = f"{picture.name}, ego {picture.ego}: {len(picture.truth)} cars, {len(picture.found)} boxes; kept in"
+    print_written(what, path)
     if show:
         open_viewer(path)
 

@@ -9,7 +9,7 @@ import typer
 
 import sortie
 from sortie.scenarios.exit_codes import FAILED
-from sortie.sim.cli.console import err, out, stages
+from sortie.sim.cli.console import out, print_failure, print_written, stages
 from sortie.sim.cli.options import split_policies
 from sortie.sim.ranking.rank import SUITE
 
@@ -66,8 +66,8 @@ def rank(
         )  # fmt: skip
     out.print(ranking.summary())
     ranking.save(out_dir)
-    out.print(f"kept in [bold]{out_dir}[/bold]: ranking.json, ranking.png", soft_wrap=True)
+    print_written("kept in", out_dir, ": ranking.json, ranking.png")
     if ranking.faults:
         for line in ranking.faults:
-            err.print(f"[red]{line}[/red]", soft_wrap=True)
+            print_failure(line)
         raise typer.Exit(FAILED)

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from sortie.perception.recordings.recording import open_recording
-from sortie.sim.cli.console import bars, out
+from sortie.sim.cli.console import bars, out, print_written
 from sortie.sim.folders import RunError, ensure_files
 
 app = typer.Typer(no_args_is_help=True, help="Recordings of other models: features and boxes on disk.")
@@ -65,7 +65,7 @@ def evaluate(
     out.print(table)
     if save is not None:
         found.save(save)
-        out.print(f"kept in [bold]{save}[/bold]")
+        print_written("kept in", save)
 
 
 @app.command("from-uav3d")
@@ -78,4 +78,4 @@ def from_uav3d(
     from sortie.perception.recordings.uav3d import convert
 
     convert(root, split, out_path)
-    out.print(f"kept in [bold]{out_path}[/bold]")
+    print_written("kept in", out_path)

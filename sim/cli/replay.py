@@ -9,8 +9,8 @@ import typer
 
 import sortie
 from sortie.scenarios.exit_codes import FAILED
-from sortie.sim.cli.console import err, out
-from sortie.sim.cli.options import PolicyOption
+from sortie.sim.cli.console import out, print_failure, print_written
+from sortie.sim.cli.options import PolicyOption, ReplaceOption
 from sortie.sim.folders import ensure_files
 
 
@@ -25,17 +25,18 @@ def replay(
         ),
     ] = False,
     out_file: Annotated[Path | None, typer.Option("--out", help="Write every difference here, as CSV.")] = None,
+    replace: ReplaceOption = False,
 ) -> None:
     """Repeat the decisions of a run on its recorded views, and print where they differ and why.
 
     Without --policy the policies that flew decide again. A different decision does not change later views.
     """
-    ensure_files(out_file)
+    ensure_files(out_file, replace=replace)
     replayed = sortie.replay(sortie.open_run(run), policy, disagreement=disagreement)
     out.print(replayed.summary())
     if out_file is not None:
         replayed.save(out_file)
-        out.print(f"kept in [bold]{out_file}[/bold]", soft_wrap=True)
+        print_written("kept in", out_file)
     if expect_same and not replayed.same:
-        err.print(f"[red]{len(replayed.differences)} differences[/red]")
+        print_failure(f"{len(replayed.differences)} differences")
         raise typer.Exit(FAILED)

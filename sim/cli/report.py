@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 
 import sortie
-from sortie.sim.cli.console import out
+from sortie.sim.cli.console import print_written
+from sortie.sim.cli.options import ReplaceOption
+from sortie.sim.folders import ensure_files
 
 PAGE = "report.html"
 
@@ -18,7 +20,10 @@ def report(
     out_path: Annotated[
         Path | None, typer.Option("--out", help="The page; default: report.html in the run's folder.")
     ] = None,
+    replace: ReplaceOption = False,
 ) -> None:
-    """Write a run as one self-contained HTML page: figures, outcome and decisions."""
-    path = sortie.open_run(run).report(out_path or run / PAGE)
-    out.print(f"kept in [bold]{path}[/bold]", soft_wrap=True)
+    """Write a run as one self-contained HTML page: figures, outcome and decisions. A file that exists needs --replace."""
+    path = out_path or run / PAGE
+    opened = sortie.open_run(run)
+    ensure_files(path, replace=replace)
+    print_written("kept in", opened.report(path))

@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from sortie.scenarios.regular import regular
-from sortie.sim.cli.console import out, stages
+from sortie.sim.cli.console import out, print_written, stages
 from sortie.sim.cli.options import DeviceOption, WorkersOption
 from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing, writing_durably
 
@@ -41,10 +41,10 @@ def study_train(
         with stages(f"{job}: ") as progress:
             result = train_job(plan, job, work, bench_dir, shipped=SHIPPED, progress=progress)
         if result is None:
-            out.print(f"[bold]{job}[/bold] has its weights")
+            out.print(f"{job} has its weights")
         else:
             gain = result.validation
-            out.print(f"[bold]{job}[/bold] AP@0.5 alone {gain.ap_a:.3f}, all five {gain.ap_b:.3f}")
+            out.print(f"{job} AP@0.5 alone {gain.ap_a:.3f}, all five {gain.ap_b:.3f}")
 
 
 @study.command("run")
@@ -69,12 +69,12 @@ def study_run(
             plan, work, bench_dir, shipped=SHIPPED, frames=frames, workers=cores, device=where, progress=progress
         ):
             rows += some
-            out.print(f"[bold]{job}[/bold] measured")
+            out.print(f"{job} measured")
     if not rows:
         raise RunError(f"{work}: no network of the study has weights yet; `sortie study train` makes them")
     path = work / TABLE
     _write_table(to_table(rows), path)
-    out.print(f"kept in [bold]{path}[/bold], write the report with: sortie study report {path}")
+    print_written("kept in", path, f", write the report with: sortie study report {path}")
 
 
 @study.command("report")
@@ -107,12 +107,12 @@ def study_report(
         link = Path(os.path.relpath(out_dir.resolve() / REPORT, readme.resolve().parent)).as_posix()
         section = report.short(plan, rows, link)
         put_between(readme, section, report.BEGIN, report.END)
-        out.print(f"the study's sentences in [bold]{readme}[/bold] written")
+        print_written("the study's sentences in", readme, " written")
     for line in report.answers(plan, report.StudyRows(rows)):
         out.print(line)
     if not drawn:
-        out.print("no figures: they need matplotlib, as in pip install 'sortie-sim\\[report]'")
-    out.print(f"kept in [bold]{out_dir}[/bold]")
+        out.print("no figures: they need matplotlib, as in pip install 'sortie-sim[report]'")
+    print_written("kept in", out_dir)
 
 
 @study.command("doses")
@@ -152,11 +152,11 @@ def study_doses(
     found = doses.verdicts(rows)
     for k, hypothesis in enumerate(plan.hypotheses):
         holds = [name for name, several in found.items() if several[k]]
-        out.print(f"{hypothesis} [bold]Holds in {len(holds)} of {len(found)}[/bold]: {', '.join(holds) or 'none'}.")
+        print_written(hypothesis, f"Holds in {len(holds)} of {len(found)}", f": {', '.join(holds) or 'none'}.")
     if common.available():
         path = work / "doses.png"
         common.save(dose_figure.draw(plan, rows), path)
-        out.print(f"figure: [bold]{path}[/bold]")
+        print_written("figure:", path)
 
 
 def _read_rows(path: Path) -> list[StudyRow]:

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from sortie.sim.check.expectations import Verdict
 
@@ -22,9 +22,9 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     for column in ("", "expected", "got", "because"):
         table.add_column(column)
     for v in verdicts:
-        because = escape(v.because) + (f"\n[dim]the record: {escape(v.explanation)}[/dim]" if v.explanation else "")
-        verdict = "[green]ok[/green]" if v.holds else "[red]FAILED[/red]"
-        table.add_row(verdict, escape(v.expected), escape(v.got), because)
+        because = Text(v.because).append(f"\nthe record: {v.explanation}" if v.explanation else "", "dim")
+        verdict = Text("ok", "green") if v.holds else Text("FAILED", "red")
+        table.add_row(verdict, v.expected, v.got, because)
     return table
 
 

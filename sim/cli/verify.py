@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 import sortie
 from sortie.policies.contract import FleetView, Policy
@@ -37,7 +37,7 @@ from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_
 from sortie.sim.check.kits import KITS
 from sortie.sim.check.kits import verify as verify_model
 from sortie.sim.check.over_time import COURSES, Subject, TimeVerdict, judge_over_time
-from sortie.sim.cli.console import bars, err, out
+from sortie.sim.cli.console import bars, out, print_failure, print_written
 from sortie.sim.cli.options import refuse, split_policies
 from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.policy_text import name_and_params
@@ -132,27 +132,27 @@ def verify(
             verdicts = judge_over_time(
                 subject, over_time, drones=drones, budget_s=budget, scenario=flown, courses=courses, flights=flights
             )
-            out.print(_verdicts(f"{escape(policy)}: over time, as the gates enforce it", verdicts))
+            out.print(_verdicts(f"{policy}: over time, as the gates enforce it", verdicts))
             broken += sum(v.outcome == "refuted" for v in verdicts)
             kept += [(v.name, v.view, v.scenario) for v in verdicts if v.scenario is not None]
         _keep(out_dir / slug(policy), kept)
     if broken:
-        err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
+        print_failure(f"{broken} {'do' if broken > 1 else 'does'} not hold")
         raise typer.Exit(FAILED)
 
 
 def _verify_model(kind: str, reference: str) -> None:
     """Print what a kind's kit says of a model. Exit code 1 if a rule fails."""
     name, params = _called(reference, kind)
-    table = Table("rule", "verdict", "what", title=f"{escape(reference)}: the conformance kit of kind {kind}")
+    table = Table("rule", "verdict", "what", title=f"{reference}: the conformance kit of kind {kind}")
     with watched(DECISION_S):
         checks = verify_model(kind, name, params)
     for check in checks:
-        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), escape(check.what))
+        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), check.what)
     out.print(table)
     broken = len(failing(checks))
     if broken:
-        err.print(f"[red]{broken} {'do' if broken > 1 else 'does'} not hold[/red]")
+        print_failure(f"{broken} {'do' if broken > 1 else 'does'} not hold")
         raise typer.Exit(FAILED)
 
 
@@ -185,7 +185,7 @@ def overhead(
             with bars() as bar:
                 row = measure(name, n, seconds, progress=bar(f"{name}, {n} drones", seconds))
             table.add_row(
-                escape(row.policy), f"{n}", f"{row.context_bytes_per_s / 1e3:.1f}", f"{row.data_bytes_per_s / 1e6:.1f}",
+                row.policy, f"{n}", f"{row.context_bytes_per_s / 1e3:.1f}", f"{row.data_bytes_per_s / 1e6:.1f}",
                 f"{row.context_share:.2%}", f"{row.p50_ms:.4f}", f"{row.p99_ms:.4f}",
             )  # fmt: skip
     out.print(table)
@@ -205,13 +205,13 @@ def _try(
     has_more: bool,
 ) -> tuple[int, list[Kept]]:
     """Print what the kit and the proofs say; how many rules and properties are broken, and what shows it."""
-    table = Table("rule", "verdict", "what", title=f"{escape(policy)}: the conformance kit, {views} drawn views")
+    table = Table("rule", "verdict", "what", title=f"{policy}: the conformance kit, {views} drawn views")
     checks = conform(decide, count=views, budget_s=budget)
     for check in checks:
-        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), escape(check.what))
+        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), check.what)
     out.print(table)
     verdicts = prove(decide, rules, max_drones=drones, budget_s=budget)
-    out.print(_verdicts(f"{escape(policy)}: proofs", verdicts))
+    out.print(_verdicts(f"{policy}: proofs", verdicts))
     if not rules and not has_more:
         out.print("No invariants: the plane's rules alone were checked. --invariants FILE names some.", soft_wrap=True)
     elif rules:
@@ -227,12 +227,12 @@ def _try(
 def _verdicts(title: str, verdicts: Sequence[ProofVerdict | TimeVerdict]) -> Table:
     table = Table("property", "verdict", "what", title=title)
     for verdict in verdicts:
-        table.add_row(escape(verdict.name), _verdict(verdict.outcome), escape(verdict.what))
+        table.add_row(verdict.name, _verdict(verdict.outcome), verdict.what)
     return table
 
 
-def _verdict(word: str) -> str:
-    return f"[{COLOURS[word]}]{word}[/{COLOURS[word]}]"
+def _verdict(word: str) -> Text:
+    return Text(word, COLOURS[word])
 
 
 def _section(policy: str) -> PolicySection:
@@ -310,9 +310,7 @@ def _keep(folder: Path, found: Iterable[Kept]) -> None:
         path = unused(folder, scenario.name)
         if view is not None:
             write_text(path.with_suffix(".json"), to_json(view))
-        out.print(
-            f"counterexample of [bold]{escape(name)}[/bold]{'' if view is None else f': {path}.json'}", soft_wrap=True
-        )
+        print_written("counterexample of", name, "" if view is None else f": {path}.json")
         if shows_in_flight(scenario):
             write_text(path.with_suffix(".yaml"), WRITTEN + dump(scenario))
             out.print(f"  fails until the policy is mended: sortie check {path}.yaml", soft_wrap=True)

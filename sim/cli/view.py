@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 import sortie
-from sortie.sim.cli.console import err, out
-from sortie.sim.folders import RunError
+from sortie.sim.cli.console import err, print_written
+from sortie.sim.cli.options import ReplaceOption
+from sortie.sim.folders import RunError, ensure_files
 
 
 def view(
@@ -25,11 +26,13 @@ def view(
     at_s: Annotated[
         float, typer.Option("--at", help="With --picture: the simulated time that it shows, s.", min=0)
     ] = 0.0,
+    replace: ReplaceOption = False,
 ) -> None:
     """Open a run's recording in the Rerun viewer. If the run has none, it is made now."""
     if at_s and picture is None:
         raise RunError("--at goes with --picture: the viewer has a time line of its own")
     opened = sortie.open_run(run)
+    ensure_files(picture, replace=replace)
     if picture is None:
         opened.view()
         return
@@ -38,4 +41,4 @@ def view(
         opened.picture(picture, at_s)
     for complaint in complaints:
         err.print(str(complaint.message), soft_wrap=True)
-    out.print(f"kept in [bold]{picture}[/bold]", soft_wrap=True)
+    print_written("kept in", picture)

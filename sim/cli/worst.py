@@ -42,7 +42,6 @@ def worst(
         out.print(
             f"see the first with: sortie fly --from-campaign {folder} --run {first} --view",
             soft_wrap=True,
-            markup=False,
         )
     for row in found.rows[:fly]:
         fly_again(context, campaign=folder, run=row["run"], out_dir=folder / "worst" / f"run-{row['run']}")

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from sortie.scenarios.intervals import Estimate
 from sortie.scenarios.report_text import NONE, interval, listed, number, percent, size
 from sortie.sim.ranking.flights import Flight
 from sortie.sim.ranking.places import Standing
 from sortie.sim.ranking.rank import Ranked
-from sortie.sim.results.summary import Summary
+from sortie.sim.results.summary import Summary, titled
 
 SHOWN = 6
 """Policies that one sentence names."""
@@ -63,7 +63,7 @@ def summary(ranked: Ranked) -> Summary:
 
 
 def _table(ranked: Ranked, title: str, columns: Mapping[str, Callable[[Standing], str]]) -> Table:
-    table = Table(title=title, box=SIMPLE, padding=(0, 1, 0, 0))
+    table = titled(title, box=SIMPLE, padding=(0, 1, 0, 0))
     table.add_column("place", no_wrap=True)
     table.add_column("policy", overflow="fold")
     for column in columns:
@@ -71,7 +71,7 @@ def _table(ranked: Ranked, title: str, columns: Mapping[str, Callable[[Standing]
     for row in ranked.rows:
         cells = (text(row) for text in columns.values())
         style = "bold" if row.policy in ranked.entries else ""
-        table.add_row(place_text(row.place), escape(row.policy), *cells, style=style)
+        table.add_row(place_text(row.place), row.policy, *cells, style=style)
     return table
 
 
@@ -85,42 +85,45 @@ def _of(name: str, text: Callable[[float], str]) -> Callable[[Standing], str]:
     return cell
 
 
-def sentences(ranked: Ranked) -> Iterator[str]:
+def sentences(ranked: Ranked) -> Iterator[str | Text]:
     """What the tables say of the policies that were asked for, and how far they can be trusted."""
     for policy in ranked.entries:
         row, of = ranked.row(policy), len(ranked.rows)
-        yield f"[bold]{escape(policy)}[/bold] takes place {place_text(row.place)} of {of}."
+        yield Text.assemble((policy, "bold"), f" takes place {place_text(row.place)} of {of}.")
         against = ranked.against(policy)
         for sign, words in ((1, "better than"), (-1, "worse than"), (0, "not separated from")):
             names = [p for p, pair in against.items() if pair.sign == sign]
             if names:
                 yield f"  {words} {listed(_few(names))}"
         for condition in row.failed:
-            yield f"  failed in {condition}: {escape(ranked.flights[policy][condition].error)}"
+            yield f"  failed in {condition}: {ranked.flights[policy][condition].error}"
         if ranked.verified[policy].broken:
             yield f"  breaks the rules {listed(ranked.verified[policy].broken)}; `sortie verify` shows why"
-    yield (
-        "[dim]AP: average precision in the mission region in conditions with one, else in the full scene; 0 where a policy "
+    yield Text(
+        "AP: average precision in the mission region in conditions with one, else in the full scene; 0 where a policy "
         "failed. Intervals cover conditions, each with its own town and draws. A place is a range where the paired "
         "differences, corrected for all pairs, do not separate policies. found, seen: share of the time with boxes on the "
         "target, share of the region in view. unsafe: decisions of a sortie after which a drone with a low battery sent more than boxes, "
         "or told no peer of the target in its region. verified: what `sortie verify` finds. decides: median time of a "
-        "decision on this machine.[/dim]"
+        "decision on this machine.",
+        "dim",
     )
     if ranked.control is not None:
         further = len(ranked.control.suite.conditions) - ranked.conditions
-        yield (
-            f"[dim]AP is by {ranked.detector}, made more precise by the surrogate: it flew the same conditions and {further} "
+        yield Text(
+            f"AP is by {ranked.detector}, made more precise by the surrogate: it flew the same conditions and {further} "
             "further ones of the same kind (control variates; unbiased whatever the surrogate's error). Intervals of "
             f"differences are {ranked.width:.2f} times as wide as by {ranked.detector} alone. All other figures are of the "
-            f"flights by {ranked.detector}.[/dim]"
+            f"flights by {ranked.detector}.",
+            "dim",
         )
     if ranked.stored is not None:
-        yield f"[dim]The built-in policies were flown with Sortie {ranked.stored}; --again flies them here.[/dim]"
+        yield Text(f"The built-in policies were flown with Sortie {ranked.stored}; --again flies them here.", "dim")
     if ranked.stale:
-        yield (
-            f"[yellow]This version, {ranked.sortie}, flies otherwise than that one: the built-in policies' results are not "
-            "its own. Use --again.[/yellow]"
+        yield Text(
+            f"This version, {ranked.sortie}, flies otherwise than that one: the built-in policies' results are not "
+            "its own. Use --again.",
+            "yellow",
         )
 
 
@@ -219,7 +222,7 @@ def _spread(heights: Sequence[float], apart: float = 0.044) -> list[float]:
 
 
 def _few(names: Sequence[str]) -> list[str]:
-    shown = [escape(n) for n in names[:SHOWN]]
+    shown = [*names[:SHOWN]]
     return shown if len(names) <= SHOWN else [*shown, f"{len(names) - SHOWN} more"]
 
 

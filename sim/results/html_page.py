@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from html import escape
+
+from sortie.scenarios.report_text import visible
 
 STYLE = """
 :root { color-scheme: light; }
@@ -27,32 +29,73 @@ footer { color: #5a6472; font-size: .85rem; margin-top: 2rem; }
 """
 
 
-def html_page(title: str, of: str, body: str) -> str:
+class Html(str):
+    """A text that is HTML; every other text is escaped where it enters a page."""
+
+    __slots__ = ()
+
+
+def html(template: str, *values: object, **named: object) -> Html:
+    """HTML from a template of `str.format`; its values are escaped, unless they are HTML.
+
+    Control characters and marks of direction are escaped as well, as `\\x1b`.
+
+    Example:
+        >>> html("<b>{}</b>{}", "a < b", Html("<br>"))
+        '<b>a &lt; b</b><br>'
+    """
+    return Html(template.format(*map(_escaped, values), **{name: _escaped(value) for name, value in named.items()}))
+
+
+def joined(parts: Iterable[Html]) -> Html:
+    """Pieces of HTML one behind the other."""
+    return Html("".join(parts))
+
+
+def table(*rows: Html) -> Html:
+    """A table of `table_row`s."""
+    return html("<table>{}</table>", joined(rows))
+
+
+def table_row(tag: str, *cells: object) -> Html:
+    """A row of a table: `th` for a head, `td` for cells."""
+    return html("<tr>{}</tr>", joined(html("<{0}>{1}</{0}>", tag, cell) for cell in cells))
+
+
+def _escaped(value: object) -> str:
+    return value if isinstance(value, Html) else escape(visible(str(value)))
+
+
+def html_page(title: str, of: str, body: Html) -> str:
     """A whole page.
 
     Args:
         title: as text.
         of: what the page is of, as text; one line below the title.
-        body: the rest, as HTML that ends with a line's end.
+        body: the rest; it ends with a line's end.
     """
-    return f"""<!doctype html>
+    return html(_PAGE, title=title, style=Html(STYLE), of=of, body=body)
+
+
+_PAGE = """<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>{STYLE}</style>
+<title>{title}</title>
+<style>{style}</style>
 </head>
 <body><main>
-<h1>{escape(title)}</h1>
-<p class="of">{escape(of)}</p>
+<h1>{title}</h1>
+<p class="of">{of}</p>
 {body}</main></body>
 </html>
 """
 
 
-def figures_html(figures: Mapping[str, str]) -> str:
+def figures_html(figures: Mapping[str, str]) -> Html:
     """Figures as HTML, from their SVG texts by caption."""
-    return "".join(
-        f"<figure><figcaption>{escape(caption)}</figcaption>{svg}</figure>" for caption, svg in figures.items()
+    return joined(
+        html("<figure><figcaption>{}</figcaption>{}</figure>", caption, Html(visible(svg)))
+        for caption, svg in figures.items()
     )

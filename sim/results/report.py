@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ from sortie.scenarios.reading.load import dump
 from sortie.scenarios.report_text import number, percent, size
 from sortie.scenarios.schema import Fleet, GroundStation
 from sortie.sim.folders import write_text
-from sortie.sim.results.html_page import figures_html, html_page
+from sortie.sim.results.html_page import Html, figures_html, html, html_page, joined, table, table_row
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report_figures import colour, figures, moments
@@ -35,35 +34,49 @@ def page(record: SortieRecord) -> str:
     result, scenario = outcome(record), record.scenario
     title = f"{scenario.name} under {record.policy}"
     of = f"{scenario.fleet.drones} drones, {scenario.duration_s:g} s, seed {record.seed}, Sortie {record.version}"
-    body = f"""<p>{escape(scenario.description)}</p>
-<div class="tiles">{"".join(_tile(*tile) for tile in _tiles(result))}</div>
-<h2>What happened</h2>
-<p>Dashed lines: the mission's phase changes. Dotted lines: something happened to the fleet, by number:</p>
-{_happened(record)}{figures_html(figures(record))}
-<h2>Who decided what, and why</h2>
-{_decisions(result)}
-<h2>In numbers</h2>
-{_numbers(result, scenario.fleet)}
-<details><summary>The scenario as it was flown</summary><pre>{escape(dump(scenario))}</pre></details>
-{_own_files(result)}<footer>Fingerprint {result["fingerprint"]}: the same scenario, policy, seed and version give the same one.</footer>
-"""
+    body = html(
+        _BODY,
+        description=scenario.description,
+        tiles=joined(_tile(*tile) for tile in _tiles(result)),
+        happened=_happened(record),
+        figures=figures_html(figures(record)),
+        decisions=_decisions(result),
+        numbers=_numbers(result, scenario.fleet),
+        scenario=dump(scenario),
+        own_files=_own_files(result),
+        fingerprint=result["fingerprint"],
+    )
     return html_page(title, of, body)
 
 
-def _happened(record: SortieRecord) -> str:
+_BODY = """<p>{description}</p>
+<div class="tiles">{tiles}</div>
+<h2>What happened</h2>
+<p>Dashed lines: the mission's phase changes. Dotted lines: something happened to the fleet, by number:</p>
+{happened}{figures}
+<h2>Who decided what, and why</h2>
+{decisions}
+<h2>In numbers</h2>
+{numbers}
+<details><summary>The scenario as it was flown</summary><pre>{scenario}</pre></details>
+{own_files}<footer>Fingerprint {fingerprint}: the same scenario, policy, seed and version give the same one.</footer>
+"""
+
+
+def _happened(record: SortieRecord) -> Html:
     """The events by the numbers that they have in the figures."""
     events = moments(record)
-    items = "".join(
-        f"<li><b>{k}</b> {t_s:g} s: {escape('; '.join(texts))}</li>"
+    items = [
+        html("<li><b>{}</b> {} s: {}</li>", k, f"{t_s:g}", "; ".join(texts))
         for k, (t_s, texts) in enumerate(events[:MOST_EVENTS], start=1)
-    )
-    more = len(events) - MOST_EVENTS
-    items += f"<li>and {more} more in the table below</li>" if more > 0 else ""
-    return f'<ul class="events">{items or "<li>nothing</li>"}</ul>'
+    ]
+    if (more := len(events) - MOST_EVENTS) > 0:
+        items.append(html("<li>and {} more in the table below</li>", more))
+    return html('<ul class="events">{}</ul>', joined(items) or Html("<li>nothing</li>"))
 
 
-def _tile(name: str, value: str, note: str) -> str:
-    return f'<div class="tile"><span>{escape(name)}</span><b>{escape(value)}</b><span>{escape(note)}</span></div>'
+def _tile(name: str, value: str, note: str) -> Html:
+    return html('<div class="tile"><span>{}</span><b>{}</b><span>{}</span></div>', name, value, note)
 
 
 def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -110,48 +123,50 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     ]  # fmt: skip
 
 
-def _own_files(result: dict[str, Any]) -> str:
+def _own_files(result: dict[str, Any]) -> Html:
     """The files beside the package that flew, with their digests; empty where there are none."""
-    lines = "\n".join(f"{escape(name)}  {digest}" for name, digest in result["own_files"].items())
-    return f"<details><summary>Own files, SHA-256</summary><pre>{lines}</pre></details>\n" if lines else ""
+    lines = "\n".join(f"{name}  {digest}" for name, digest in result["own_files"].items())
+    page = "<details><summary>Own files, SHA-256</summary><pre>{}</pre></details>\n"
+    return html(page, lines) if lines else Html()
 
 
-def _decisions(result: dict[str, Any]) -> str:
+def _decisions(result: dict[str, Any]) -> Html:
     """Decisions and events in one list, in order of time."""
     rows = [
-        (t["t_s"], "", f'<i style="background:{colour(t["drone"])}"></i>{escape(decision_in_words(t))}')
+        (t["t_s"], "", html('<i style="background:{}"></i>{}', colour(t["drone"]), decision_in_words(t)))
         for t in result["transitions"]
     ]
-    rows += [(e["t_s"], ' class="event"', escape(event_in_words(e))) for e in result["events"]]
+    rows += [(e["t_s"], Html(' class="event"'), html("{}", event_in_words(e))) for e in result["events"]]
     if not rows:
-        return "<p>Nobody ever sent anything, and nothing happened to the fleet.</p>"
-    body = "".join(
-        f'<tr{kind}><td class="t">{t_s:.2f} s</td><td>{text}</td></tr>'
-        for t_s, kind, text in sorted(rows, key=lambda r: r[0])
+        return Html("<p>Nobody ever sent anything, and nothing happened to the fleet.</p>")
+    return table(
+        *(
+            html('<tr{}><td class="t">{} s</td><td>{}</td></tr>', kind, f"{t_s:.2f}", text)
+            for t_s, kind, text in sorted(rows, key=lambda r: r[0])
+        )
     )
-    return f"<table>{body}</table>"  # fmt: skip
 
 
-def _numbers(result: dict[str, Any], fleet: Fleet) -> str:
+def _numbers(result: dict[str, Any], fleet: Fleet) -> Html:
     """Phases, then drones and ground stations."""
-    head = "<tr><th>phase</th><th>AP full scene</th><th>AP mission</th><th>data</th><th>deadlines missed</th><th>descriptors lost</th></tr>"
-    phases = "".join(
-        f"<tr><td>{escape(p['phase'])}, {p['begin_s']:g}–{p['end_s']:g} s</td><td>{number(p['ap50']['full_scene'])}</td>"
-        f"<td>{number(p['ap50']['mission'])}</td><td>{p['data_rate_mbps']:.1f} Mb/s</td><td>{percent(p['deadline_miss_rate'])}</td>"
-        f"<td>{percent(p['context']['lost'])}</td></tr>"
+    phases = [
+        table_row(
+            "td", f"{p['phase']}, {p['begin_s']:g}–{p['end_s']:g} s", number(p["ap50"]["full_scene"]),
+            number(p["ap50"]["mission"]), f"{p['data_rate_mbps']:.1f} Mb/s", percent(p["deadline_miss_rate"]),
+            percent(p["context"]["lost"]),
+        )
         for p in result["phases"]
-    )
-    drones = "".join(_drone_row(i, d, fleet.station(int(i))) for i, d in result["drones"].items())
-    other = "<tr><th>drone</th><th>charge left</th><th>energy</th><th>voltage</th><th>at the end</th></tr>"
-    return f"<table>{head}{phases}</table><br><table>{other}{drones}</table>"
+    ]  # fmt: skip
+    drones = [_drone_row(i, d, fleet.station(int(i))) for i, d in result["drones"].items()]
+    head = table_row("th", "phase", "AP full scene", "AP mission", "data", "deadlines missed", "descriptors lost")
+    other = table_row("th", "drone", "charge left", "energy", "voltage", "at the end")
+    return html("{}<br>{}", table(head, *phases), table(other, *drones))
 
 
-def _drone_row(number: str, drone: dict[str, Any], station: GroundStation | None) -> str:
+def _drone_row(number: str, drone: dict[str, Any], station: GroundStation | None) -> Html:
     """A drone or a ground station at the end."""
-    energy = (
-        f"<td>{percent(drone['soc'])}</td><td>{drone['energy_j'] / 1e3:.1f} kJ</td><td>{drone['voltage_v']:.2f} V</td>"
-    )
+    energy = [percent(drone["soc"]), f"{drone['energy_j'] / 1e3:.1f} kJ", f"{drone['voltage_v']:.2f} V"]
     if station is not None and station.mains:
-        energy = "<td>mains</td><td></td><td></td>"
+        energy = ["mains", "", ""]
     name, up, down = ("drone", "flying", "down") if station is None else ("station", "on", "off")
-    return f"<tr><td>{name} {escape(number)}</td>{energy}<td>{up if drone['airborne'] else down}</td></tr>"
+    return table_row("td", f"{name} {number}", *energy, up if drone["airborne"] else down)

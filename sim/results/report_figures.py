@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any
@@ -101,13 +102,14 @@ def drawn(plots: Sequence[tuple[str, float, Callable[[Axes], None]]]) -> dict[st
     except ImportError as error:
         raise RunError("matplotlib is missing: pip install 'sortie-sim[report]'") from error
     style: dict[Any, Any] = {
-        "svg.hashsalt": "sortie", "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 12.0,
+        "svg.hashsalt": "sortie", "svg.fonttype": "none", "text.parse_math": False, "font.family": "sans-serif", "font.size": 12.0,
         "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#888888", "axes.grid": True,
         "grid.color": "#e6e6e6", "axes.axisbelow": True, "legend.frameon": False, "legend.fontsize": 12.0,
         "legend.handlelength": 1.2, "legend.borderaxespad": 0.2, "legend.labelspacing": 0.3,
     }  # fmt: skip
     made = {}
-    with mpl.rc_context(style):
+    with mpl.rc_context(style), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing")  # a browser draws the letters, with fonts of its own
         for caption, height_in, draw in plots:
             figure = Figure(figsize=(9.0, height_in), layout="constrained")
             draw(figure.add_subplot())

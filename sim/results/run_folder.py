@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,14 +13,22 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sortie.scenarios.reading.load import ScenarioError, dump, loads
-from sortie.scenarios.regular import regular
+from sortie.scenarios.reading.load import dump, loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import models_of_the_past
 from sortie.sim.folders import RunError, ensure_folder, replacing, settled
 from sortie.sim.results import beliefs, disagreement, rosters, views
 from sortie.sim.results.outcome import outcome
-from sortie.sim.results.record import TABLES, SortieRecord
+from sortie.sim.results.record import CLASS_COLUMN, OF_CLASSES, TABLES, SortieRecord
+from sortie.sim.results.run_checks import (
+    Checks,
+    ensure_each_once,
+    ensure_together,
+    read_about,
+    read_file,
+    read_json,
+    read_table,
+)
 from sortie.sim.results.spool import batches, schema_of
 
 OUTCOME, SCENARIO, RECORD, RECORDING = "outcome.json", "scenario.yaml", "record.json", "sortie.rrd"
@@ -105,7 +114,7 @@ def ensure_same(path: Path, scenario: Scenario, seed: int, replication: int, fil
         if not (path / OUTCOME).is_file():
             return
         try:
-            about = json.loads(regular(path / RECORD).read_text("utf-8"))
+            about = read_json(path / RECORD)
             old = {name: about[name] for name in new}
             there = _scenario_of(path).model_dump(mode="json")
         except (OSError, ValueError, TypeError, LookupError) as error:
@@ -189,7 +198,7 @@ def in_place_of(path: Path, fingerprint: str) -> str:
     if not (path / OUTCOME).is_file():
         return ""
     try:
-        old = json.loads((path / OUTCOME).read_text("utf-8"))
+        old = read_json(path / OUTCOME)
         there = f"a run of {old['scenario']} under {old['policy']}, seed {old['seed']}"
         return "" if old["fingerprint"] == fingerprint else there
     except (OSError, ValueError, TypeError, LookupError):
@@ -211,7 +220,7 @@ def _difference(old: Mapping[str, Any], new: Mapping[str, Any], within: str = ""
 def _is_of_the_run(page: Path) -> bool:
     """Whether a page belongs to the run in its folder, by that run's fingerprint."""
     try:
-        fingerprint = json.loads((page.parent / OUTCOME).read_text("utf-8"))["fingerprint"]
+        fingerprint = read_json(page.parent / OUTCOME)["fingerprint"]
         return str(fingerprint) in page.read_text(encoding="utf-8")
     except (OSError, ValueError, TypeError, LookupError):
         return False
@@ -219,7 +228,7 @@ def _is_of_the_run(page: Path) -> bool:
 
 def _scenario_of(path: Path) -> Scenario:
     """The scenario of a run. Packages that offered its models need not be installed."""
-    text = regular(path / SCENARIO).read_text("utf-8")
+    text = read_file(path / SCENARIO).decode()
     with models_of_the_past():
         scenario = loads(text, source=str(path / SCENARIO))
     if scenario.takes_turns and not re.search("^  egos:", text, re.MULTILINE):  # of a version in which all were scored
@@ -234,24 +243,43 @@ def load(path: Path) -> SortieRecord:
     Raises:
         RunError: no run there, or one that is damaged.
     """
-    if not (path / OUTCOME).is_file():
+    if not os.path.lexists(path / OUTCOME):
         raise RunError(f"{path}: no run there ({OUTCOME} is missing)")
     try:
-        about = json.loads(regular(path / RECORD).read_text("utf-8"))
-        scenario = _scenario_of(path)
-        expected = dict(TABLES)
-        if scenario.record.views:
-            expected |= views.NEEDED
-        if scenario.record.disagreement:
-            expected[disagreement.TABLE] = disagreement.COLUMNS
-        if scenario.publishes_rosters:
-            expected[rosters.TABLE] = rosters.COLUMNS
-        if scenario.record.beliefs:
-            expected[beliefs.TABLE] = beliefs.COLUMNS
-        tables = {name: pq.read_table(regular(path / f"{name}.parquet")) for name in expected}
-        for name, columns in expected.items():
-            if lacking := [c for c in columns if c not in tables[name].column_names]:
-                raise ValueError(f"{name}.parquet has no column {lacking[0]}; another version's, perhaps: fly it again")
-        return SortieRecord(scenario=scenario, tables=tables, **about)
-    except (OSError, ValueError, TypeError, ScenarioError) as error:
+        result, about, scenario = read_json(path / OUTCOME), read_about(path / RECORD), _scenario_of(path)
+        record = SortieRecord(scenario=scenario, tables=_tables_of(path, scenario), **about)
+        ensure_together(result, record)
+    except (OSError, ValueError) as error:
         raise RunError(f"{path}: the run is damaged: {error}") from error
+    return record
+
+
+def _tables_of(path: Path, scenario: Scenario) -> dict[str, pa.Table]:
+    """The checked tables of a run.
+
+    Raises:
+        OSError, ValueError: one is missing or damaged.
+    """
+    needed: dict[str, Mapping[str, pa.DataType]] = dict(TABLES)
+    if len(scenario.perception.classes) > 1:
+        needed |= {name: TABLES[name] | CLASS_COLUMN for name in OF_CLASSES}
+    known = dict(needed)
+    if scenario.record.views:
+        needed |= views.NEEDED
+        known |= views.TABLES
+    for name, columns, wanted in (
+        (disagreement.TABLE, disagreement.COLUMNS, scenario.record.disagreement),
+        (rosters.TABLE, rosters.COLUMNS, scenario.publishes_rosters),
+        (beliefs.TABLE, beliefs.COLUMNS, scenario.record.beliefs),
+    ):
+        if wanted:
+            needed[name] = known[name] = columns
+    every = scenario.frames * scenario.fleet.drones
+    rows = dict.fromkeys(("states", beliefs.TABLE), every)
+    tables = {n: read_table(path / f"{n}.parquet", needed[n], known[n], rows.get(n)) for n in needed}
+    checks = Checks(scenario, {name: len(table) for name, table in tables.items()})
+    for name, table in tables.items():
+        checks.check(name, table)
+    if scenario.record.views:
+        ensure_each_once(tables)
+    return tables

@@ -7,13 +7,14 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.jupyter import JupyterMixin
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from sortie.scenarios.report_text import number, percent, size
 from sortie.sim.results.sentences import losses_in_words, turns_in_words
+from sortie.sim.terminal import Terminal, harmless
 
 MAX_TRANSITIONS = 24
 MAX_LINKS = 24
@@ -34,19 +35,24 @@ class Summary(JupyterMixin):
     def __init__(self, *parts: RenderableType) -> None:
         self._parts = parts
 
-    def __rich__(self) -> Group:
-        return Group(*self._parts)
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        return harmless(console.render(Group(*self._parts), options.update(markup=False)))
 
     def __str__(self) -> str:
-        console = Console(file=io.StringIO(), width=WIDTH, emoji=False)
+        console = Terminal(file=io.StringIO(), width=WIDTH)
         console.print(self)
         assert isinstance(console.file, io.StringIO)  # noqa: S101
         return console.file.getvalue()
 
 
+def titled(title: str, **options: Any) -> Table:
+    """A table with a title in which brackets are brackets, in any console; `options` as of `rich.table.Table`."""
+    return Table(title=Text(title, "table.title"), **options)
+
+
 def outcome_table(result: dict[str, Any]) -> Table:
     """One sortie: what the fleet saw and what it cost."""
-    table = Table(title=f"{result['scenario']} · {result['policy']} · seed {result['seed']}", show_header=False)
+    table = titled(f"{result['scenario']} · {result['policy']} · seed {result['seed']}", show_header=False)
     table.add_column(style="bold")
     table.add_column()
     ap, data, mission = result["ap50"], result["bytes"], result["mission"]
@@ -116,9 +122,9 @@ def outcome_table(result: dict[str, Any]) -> Table:
     if result["disagreement"]["share"] is not None:
         table.add_row("disagreement", disagreement_in_words(result["disagreement"]))
     for name, value in result["metrics"].items():
-        table.add_row(escape(f"metrics.{name}"), number(value, ".4g"))
+        table.add_row(f"metrics.{name}", number(value, ".4g"))
     if result["own_files"]:
-        table.add_row("own files", escape(", ".join(" ".join(file) for file in result["own_files"].items())))
+        table.add_row("own files", ", ".join(" ".join(file) for file in result["own_files"].items()))
     table.add_row("fingerprint", result["fingerprint"][:16])
     return table
 
@@ -186,7 +192,7 @@ def transitions_table(result: dict[str, Any]) -> Table:
         alike.setdefault(key, (t["t_s"], []))[1].extend((t["drone"], peer) for peer in t["peers"])
     rows = [(t_s, _links_in_words(links), what, why) for (_, what, why), (t_s, links) in alike.items()]
     rows += [
-        (e["t_s"], "fleet" if e["drone"] < 0 else str(e["drone"]), f"[yellow]{e['kind']}[/yellow]", e["text"])
+        (e["t_s"], "fleet" if e["drone"] < 0 else str(e["drone"]), Text(e["kind"], "yellow"), e["text"])
         for e in result["events"]
     ]
     rows.sort(key=lambda row: row[0])
@@ -195,5 +201,5 @@ def transitions_table(result: dict[str, Any]) -> Table:
     for column in ("t (s)", "who", "what", "why"):
         table.add_column(column, justify="right" if column == "t (s)" else "left")
     for t_s, who, what, why in rows[:MAX_TRANSITIONS]:
-        table.add_row(f"{t_s:.2f}", who, what, escape(why))  # a policy's own words, in which brackets are brackets
+        table.add_row(f"{t_s:.2f}", who, what, why)
     return table

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sortie.sim.folders import write_text
-from sortie.sim.results.html_page import figures_html, html_page
+from sortie.sim.results.html_page import figures_html, html, html_page, joined, table, table_row
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report_figures import (
     accuracy_points,
@@ -57,26 +56,24 @@ def comparison_page(flown: Flown, precision: Precision | None = None) -> str:
         precision: of a comparison to a half-width, what it flew.
     """
     labels = list(dict.fromkeys(s.policy for s in flown.sorties))
-    head = "".join(f"<th>{escape(label)}</th>" for label in labels)
-    rows = "".join(
-        f"<tr><td>{escape(name.strip())}</td>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
-        for name, cells in side_by_side(flown).items()
-    )
+    rows = [table_row("td", name.strip(), *cells) for name, cells in side_by_side(flown).items()]
     told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
-    why = "".join(f"<li>{_bold(line)}</li>" for line in told)
-    figures = drawn([*_dots(flown, labels), *_over_time(flown)])
-    body = f"""<h2>In numbers</h2>
-<table><tr><th></th>{head}</tr>{rows}</table>
-<ul>{why}</ul>
-<h2>In figures</h2>
-<p>A small dot is one sortie, a large one the mean of a policy's sorties. Figures over time show the first seed's sorties.</p>
-{figures_html(figures)}
-"""
+    body = html(
+        _BODY,
+        table=table(table_row("th", "", *labels), *rows),
+        why=joined(html("<li>{}{}</li>", html("<b>{}</b>", name) if name else "", text) for name, text in told),
+        figures=figures_html(drawn([*_dots(flown, labels), *_over_time(flown)])),
+    )
     return html_page("Policies compared", heading(flown), body)
 
 
-def _bold(line: str) -> str:
-    return escape(line).replace("[bold]", "<b>").replace("[/bold]", "</b>")
+_BODY = """<h2>In numbers</h2>
+{table}
+<ul>{why}</ul>
+<h2>In figures</h2>
+<p>A small dot is one sortie, a large one the mean of a policy's sorties. Figures over time show the first seed's sorties.</p>
+{figures}
+"""
 
 
 def _dots(flown: Flown, labels: Sequence[str]) -> Iterator[Plot]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.table import Table
+from rich.text import Text
 
 from sortie.scenarios.report_text import number, percent, points, size, table
 from sortie.sim.results.sentences import turns_in_words
-from sortie.sim.results.summary import PLURAL
+from sortie.sim.results.summary import PLURAL, titled
 from sortie.sim.studies.compare import BLOCK_S, BY_BOTH, Compared, Flown, Gain
 from sortie.sim.studies.conditions import mean_of_known
 from sortie.sim.studies.multifidelity import Precision
@@ -19,9 +20,21 @@ from sortie.sim.studies.multifidelity import Precision
 BEGIN, END = "<!-- compare:begin -->", "<!-- compare:end -->"
 
 
+class Line(NamedTuple):
+    """A line about a policy, or about one figure."""
+
+    name: str
+    """What it is about, written in bold; may be empty."""
+    text: str
+    """What follows the name."""
+
+    def __rich__(self) -> Text:
+        return Text.assemble((self.name, "bold"), self.text)
+
+
 def comparison_table(flown: Flown) -> Table:
     """Policies side by side, a column each; gains are over the first, in AP points with paired 95 % intervals."""
-    table = Table(title=heading(flown), caption=_what_gains_are(flown) or None)
+    table = titled(heading(flown), caption=_what_gains_are(flown) or None)
     table.add_column("", style="bold")
     for policy in _by_policy(flown):
         table.add_column(policy, justify="right")
@@ -40,8 +53,17 @@ def comparison_markdown(flown: Flown, command: str, precision: Precision | None 
     what = " ".join(filter(None, [f"{head}.", _what_gains_are(flown)]))
     cells = ((name.strip(), *values) for name, values in side_by_side(flown).items())
     told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
-    why = [line.replace("[bold]", "**").replace("[/bold]", "**") for line in told]
-    lines = [BEGIN, "", what, "", *table(("", *_by_policy(flown)), cells), "", *(f"- {line}" for line in why), "", END]
+    lines = [
+        BEGIN,
+        "",
+        what,
+        "",
+        *table(("", *_by_policy(flown)), cells),
+        "",
+        *(f"- **{name}**{text}" if name else f"- {text}" for name, text in told),
+        "",
+        END,
+    ]
     return "\n".join(lines)
 
 
@@ -76,7 +98,7 @@ def heading(flown: Flown) -> str:
     return f"{first['scenario']} · {_seeds(flown)}{turns_in_words(first['ap50'])}"
 
 
-def explanations(flown: Flown) -> Iterator[str]:
+def explanations(flown: Flown) -> Iterator[Line]:
     """Why the figures differ, a line a policy, from the records of all its sorties."""
     for policy, sorties in _by_policy(flown).items():
         fates: dict[str, int] = {}
@@ -85,37 +107,42 @@ def explanations(flown: Flown) -> Iterator[str]:
                 fates[fate] = fates.get(fate, 0) + n
         total, in_all = sum(fates.values()), " in all sorties" * (len(sorties) > 1)
         if not total:
-            yield f"[bold]{policy}[/bold]: sent nothing; every drone saw with its own eyes only"
+            yield Line(policy, ": sent nothing; every drone saw with its own eyes only")
             continue
         parts = ", ".join(f"{percent(n / total)} {fate}" for fate, n in sorted(fates.items(), key=lambda f: -f[1]))
         age = mean_of_known(s.outcome["data_age_s"]["p50"] for s in sorties)
         fused = "nothing fused" if age is None else f"fused data {age:.2f} s old at the median"
-        yield f"[bold]{policy}[/bold]: {total} payloads{in_all}, {parts}; {fused}"
+        yield Line(policy, f": {total} payloads{in_all}, {parts}; {fused}")
 
 
-def precision_lines(found: Precision) -> Iterator[str]:
+def precision_lines(found: Precision) -> Iterator[Line]:
     """What a comparison to a half-width flew, and what it cost."""
     name = found.detector
     widest = max((c.half_width for c in found.contrasts if c.metric == found.metric), default=math.nan)
     verdict = "reached" if found.reached else "not reached, as the seeds were used up: --most-seeds allows more"
     width = f"{100 * widest:.2f} AP points" if widest else f"none, as the gains are all equal in {found.paired} seeds"
-    yield (
-        f"[bold]half-width[/bold] of {found.metric}: {width}, {100 * found.asked:g} asked, {verdict}; "
-        "intervals are widened for stopping there"
+    yield Line(
+        "half-width",
+        f" of {found.metric}: {width}, {100 * found.asked:g} asked, {verdict}; "
+        "intervals are widened for stopping there",
     )
     further = f", and {found.further} further seeds by the surrogate" if found.further else ""
-    yield f"[bold]flown[/bold]: {found.paired} seeds by {name}{further}; gains in the surrogate's scores correlate with those in {name}'s:"
+    correlate = f"gains in the surrogate's scores correlate with those in {name}'s:"
+    yield Line("flown", f": {found.paired} seeds by {name}{further}; {correlate}")
     for c in found.contrasts:
         used = f"coefficient {c.coefficient:.2f}" if found.control else "not used"
-        yield f"  {c.policy}, {c.metric}: correlation {number(c.correlation)}, predicted variance {percent(c.explained)}, {used}"
+        known = f"correlation {number(c.correlation)}, predicted variance {percent(c.explained)}, {used}"
+        yield Line("", f"  {c.policy}, {c.metric}: {known}")
     if not found.control:
-        yield (
-            f"[bold]{name} alone[/bold]: the surrogate was not used, because {name} alone reaches the half-width about as "
-            "cheaply. Gains are plain means over the seeds"
+        yield Line(
+            f"{name} alone",
+            f": the surrogate was not used, because {name} alone reaches the half-width about as "
+            "cheaply. Gains are plain means over the seeds",
         )
-    yield (
-        f"[bold]cost[/bold]: {found.seconds[0]:.1f} s of processor time for a seed by {name}, {found.seconds[1]:.1f} s by the surrogate; in all "
-        f"{number(found.cost_ratio, '.2f')} of what {name} alone is predicted to take"
+    yield Line(
+        "cost",
+        f": {found.seconds[0]:.1f} s of processor time for a seed by {name}, {found.seconds[1]:.1f} s by the surrogate; in all "
+        f"{number(found.cost_ratio, '.2f')} of what {name} alone is predicted to take",
     )
 
 

@@ -126,11 +126,12 @@ class Replay:
 
 
 def _parts(replayed: Replay) -> Iterable[Table | str]:
-    from rich.markup import escape
     from rich.table import Table
 
+    from sortie.sim.results.summary import titled
+
     differences = replayed.differences
-    total = Table(title=escape(f"{replayed.policy} over the views of {replayed.flown}"), show_header=False)
+    total = titled(f"{replayed.policy} over the views of {replayed.flown}", show_header=False)
     total.add_column(style="bold")
     total.add_column()
     total.add_row("decisions", f"{replayed.decisions}, for {replayed.directives} links in all")
@@ -155,7 +156,7 @@ def _parts(replayed: Replay) -> Iterable[Table | str]:
     for (flown, again), count in pairs.most_common(MOST):
         at = sorted({_link(d) for d in differences if (d.flown_reason, d.replayed_reason) == (flown, again)})
         shown = "  ".join(at[:4]) + (f" and {len(at) - 4} more" if len(at) > 4 else "")
-        why.add_row(str(count), shown, escape(flown), escape(again))
+        why.add_row(str(count), shown, flown, again)
     yield why
     alike: dict[tuple[str, ...], list[str]] = {}  # links that differ alike and at once, in one row
     for begin, end_s, _ in replayed.spans:
@@ -166,7 +167,7 @@ def _parts(replayed: Replay) -> Iterable[Table | str]:
     for column in ("from (s)", "to (s)", "links", "in flight", "now"):
         first.add_column(column, justify="right" if column.endswith("(s)") else "left")
     for (begin_s, last_s, flown, again), who in list(alike.items())[:MOST]:
-        first.add_row(begin_s, last_s, "  ".join(who), escape(flown), escape(again))
+        first.add_row(begin_s, last_s, "  ".join(who), flown, again)
     yield first
 
 

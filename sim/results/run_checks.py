@@ -1,0 +1,352 @@
+"""What the files of a run may hold, checked once when a run is opened: names, types, values, and that they belong together.
+
+A run may come from anybody, and may be damaged. So its files are read by what is declared here and in `TABLES`. All
+errors are `ValueError`, in one line that names the file, the column or field, and the value.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from sortie.fleet.energy.battery import CAUSES as ENERGY_CAUSES
+from sortie.fleet.energy.battery import RECORDED
+from sortie.fleet.staleness import LinkHealth
+from sortie.perception.classes import TargetClass
+from sortie.policies.contract import COVERAGE_BYTES, DIRECTIVE_BOUNDS, MAX_REASON, PHASE_OF, TaskPhase
+from sortie.policies.verification.enforced import CAUSES
+from sortie.radio.transmission import Status
+from sortie.scenarios.disc import LISTED_IDS
+from sortie.scenarios.representation import REPRESENTATION_OF
+from sortie.scenarios.schema import Scenario
+from sortie.sim.results import beliefs, disagreement, views
+from sortie.sim.results.record import HANDSHAKE, VIOLATIONS_OF
+
+MOST_BYTES = 64 << 20
+"""Of a file that is no table."""
+MOST_CHARACTERS = 10_000
+"""Of a text."""
+_LARGEST = 1e12
+"""Of any number of a table; far beyond what flies, and small enough to compute with."""
+_TOTALS = (
+    "context_descriptor_bytes", "context_directive_bytes", "medium_busy_fraction", "policy_changes",
+    "shield_interventions", "invariant_violations", "violated_ticks", *(f"{VIOLATIONS_OF}{cause}" for cause in CAUSES),
+)  # fmt: skip
+"""Those that the outcome needs."""
+
+Text = Annotated[str, Field(max_length=MOST_CHARACTERS)]
+Count = Annotated[float, Field(ge=0, le=_LARGEST)]
+
+
+class About(BaseModel):
+    """The fields of `record.json`."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    policy: Text
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    replication: Annotated[int, Field(ge=0, lt=2**32)]
+    version: Text
+    detector: Text
+    totals: dict[Text, Count]
+    calibration: Text | None = None
+    own_files: dict[Text, Text] = {}
+    metrics: dict[Text, float | None] = {}
+    wall: dict[Text, Count] = {}
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The fields of a JSON file of a run.
+
+    Raises:
+        OSError, ValueError: it cannot be read, or is no JSON object with each key once and finite numbers.
+    """
+    try:
+        found = json.loads(read_file(path), object_pairs_hook=_once, parse_constant=_refuse)
+    except RecursionError:
+        raise ValueError(f"{path.name}: its values are nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{path.name} holds a {type(found).__name__}, must hold fields")
+    return found
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a file of a run that is no table.
+
+    Raises:
+        OSError, ValueError: it cannot be read, is no plain file, or is far longer than any run's.
+    """
+    _ensure_plain(path)
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise ValueError(f"{path.name} has {size} bytes, must have at most {MOST_BYTES}")
+    return path.read_bytes()
+
+
+def read_about(path: Path) -> dict[str, Any]:
+    """The checked fields of `record.json`.
+
+    Raises:
+        OSError, ValueError: as `read_json`; or a field is missing, unknown or has a value that no run has.
+    """
+    about = read_json(path)
+    try:
+        About.model_validate(about)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part)[:60] for part in first["loc"])
+        value = "" if first["type"] == "missing" else f"{first['input']!r:.60}, "
+        raise ValueError(f"{path.name}: {where}: {value}{first['msg'][:1].lower()}{first['msg'][1:]}") from None
+    if lacking := [name for name in _TOTALS if name not in about["totals"]]:
+        raise ValueError(f"{path.name}: totals.{lacking[0]}: is missing")
+    return about
+
+
+def ensure_together(outcome: Mapping[str, Any], record: Any) -> None:
+    """Refuse files that are not of one run: what `outcome.json` has of the record must be the record's.
+
+    The fingerprint is among it, which is computed from all values of the tables.
+
+    Raises:
+        ValueError: naming the field that differs.
+    """
+    known = {
+        "scenario": record.scenario.name,
+        "duration_s": record.scenario.duration_s,
+        "frame_s": record.scenario.frame_s,
+        **{
+            name: getattr(record, name) for name in ("policy", "seed", "replication", "version", "own_files", "metrics")
+        },
+        "fingerprint": record.fingerprint,
+    }
+    for name, value in known.items():
+        if outcome.get(name, value if name != "fingerprint" else None) != value:
+            raise ValueError(f"outcome.json: {name} is {outcome.get(name)!r:.80}, the other files give {value!r:.80}")
+
+
+def read_table(path: Path, needed: Collection[str], known: Mapping[str, pa.DataType], rows: int | None) -> pa.Table:
+    """A table of a run, with its columns.
+
+    Args:
+        path: the Parquet file.
+        needed: the columns that it must have.
+        known: all that it may have, with their types.
+        rows: how many it must have; None is any number.
+
+    Raises:
+        OSError, ValueError: it cannot be read, or has other columns, types or rows.
+    """
+    _ensure_plain(path)
+    try:
+        with pq.ParquetFile(path) as file:
+            names, found = file.schema_arrow.names, file.metadata.num_rows
+            again = "another version's, perhaps: fly it again"
+            if lacking := [name for name in needed if name not in names]:
+                raise ValueError(f"{path.name} has no column {lacking[0]}; {again}")
+            if more := [name for k, name in enumerate(names) if name not in known or name in names[:k]]:
+                raise ValueError(f"{path.name} has a column {more[0]!r:.80} too many; {again}")
+            for field in file.schema_arrow:
+                if field.type != known[field.name]:
+                    raise ValueError(f"{path.name}: {field.name} is of type {field.type}, must be {known[field.name]}")
+            if rows is not None and found != rows:
+                raise ValueError(f"{path.name} has {found} rows, must have {rows}")
+            table = file.read()
+        table.validate(full=True)  # texts are UTF-8, lists end within their values
+    except pa.ArrowException as error:
+        raise ValueError(f"{path.name}: {error}") from error
+    return table
+
+
+class Checks:
+    """The values that the tables of one run may have."""
+
+    def __init__(self, scenario: Scenario, rows: Mapping[str, int]) -> None:
+        """Args:
+        scenario: what flew.
+        rows: of each table.
+        """
+        last = scenario.fleet.drones - 1
+        drones, drones_or_none, number_or_none = (0, last), (-1, last), (-1, 2**31)
+        share, instant = (0.0, 1.0), (0.0, scenario.duration_s)
+        bounds = {name: (0, bound.high) for name, bound in DIRECTIVE_BOUNDS.items()}
+        self._drones = scenario.fleet.drones
+        self._ranges: dict[str, tuple[float, float]] = {
+            **dict.fromkeys(("drone", "peer", "receiver", "peers", "cut_drones", "members", "other"), drones),
+            **dict.fromkeys(("agent_id", "source", "destination"), drones),
+            **dict.fromkeys(("bottleneck_sender", "bottleneck_receiver", "events.drone", "violations.peer"), drones_or_none),
+            **dict.fromkeys(("mcs", "target", "car", "person"), number_or_none),
+            **dict.fromkeys(("soc", "battery_soc", "cpu_headroom", "gpu_headroom", "busy_fraction", "trust"), share),
+            **dict.fromkeys(("t_s", "begin_s"), instant),
+            **bounds,
+            "transmissions.deadline_s": (0.0, scenario.duration_s + bounds["deadline_s"][1]),
+            "stamp_ns": (-1e16, 1e16),
+            "group": (0, len(scenario.mission.groups)),
+            "kind": (0, max(TargetClass)),
+            "connected_drones": (0, scenario.fleet.drones),
+            "task_phase": (0, max(TaskPhase)),
+            "views.descriptors": (0, rows.get(views.DESCRIPTORS, 0) - 1),
+            "views.directives": (0, rows.get(views.DIRECTIVES, 0) - 1),
+            **dict.fromkeys(("fusions.detections", "fusions.truths"), (0, 2**31)),
+        }  # fmt: skip
+
+    def check(self, name: str, table: pa.Table) -> None:
+        """Refuse a table with a value that no run has.
+
+        Raises:
+            ValueError: naming the file, the column, the row and the value.
+        """
+        for column in table.column_names:
+            row = 0
+            for chunk in table[column].chunks:
+                for part, values in _parts(column, chunk):
+                    fault = self._fault(name, part, values)
+                    if fault is not None:
+                        at, what = fault
+                        where = f" in row {row + at}" if values is chunk else ""
+                        raise ValueError(f"{name}.parquet: {part}{where} {what}")
+                row += len(chunk)
+        self._ensure_shapes(name, table)
+
+    def _fault(self, table: str, name: str, values: pa.Array) -> tuple[int, str] | None:
+        """The first wrong value of a column, and what is wrong with it."""
+        kind = values.type
+        if values.null_count and name not in _MAY_BE_MISSING:
+            return pc.index(values.is_null(), True).as_py(), "is missing"
+        if pa.types.is_string(kind):
+            choices = _CHOICES.get(f"{table}.{name}") or _CHOICES.get(name)
+            if choices is not None:
+                wrong = pc.invert(pc.is_in(values, pa.array(choices)))
+                return _first(values, wrong, f"must be one of {', '.join(filter(None, choices))}")
+            most = MAX_REASON if name == "reason" else MOST_CHARACTERS
+            return _first(values, pc.greater(pc.utf8_length(values), most), f"must have at most {most} characters")
+        if pa.types.is_integer(kind) or pa.types.is_floating(kind):
+            leaf = name.rpartition(".")[2]
+            whole = pa.types.is_integer(kind)
+            low, high = self._ranges.get(f"{table}.{name}") or self._ranges.get(
+                leaf, (0, 2**62) if whole else (-_LARGEST, _LARGEST)
+            )
+            sound = pc.and_(pc.greater_equal(values, low), pc.less_equal(values, high))  # NaN is not
+            if leaf in _MAY_BE_NAN:
+                sound = pc.or_(sound, pc.invert(pc.is_finite(values)) if leaf == "snr_db" else pc.is_nan(values))
+            return _first(values, pc.invert(sound), f"must be {low:.10g} to {high:.10g}")
+        return None
+
+    def _ensure_shapes(self, name: str, table: pa.Table) -> None:
+        """Refuse lists of other lengths, and rows that are not those of all drones in their order.
+
+        Raises:
+            ValueError: naming the file and the column.
+        """
+        n = self._drones
+        if name in ("states", beliefs.TABLE) and not np.array_equal(
+            table["drone"].to_numpy(), np.tile(np.arange(n), len(table) // n)
+        ):
+            raise ValueError(f"{name}.parquet: drone must count from 0 to {n - 1} in every frame")
+        for column, length in _LENGTHS.get(name, {}).items():
+            values = table[column]
+            lengths = pc.binary_length(values) if pa.types.is_binary(values.type) else pc.list_value_length(values)
+            right: Any = length
+            if isinstance(length, str):
+                right = pc.list_value_length(table[length])
+            elif length is None:
+                if n > LISTED_IDS:
+                    continue
+                right = n - 1
+            if pc.any(pc.not_equal(lengths, right)).as_py():
+                as_long = f"as many values as {length}" if isinstance(length, str) else f"{right} values"
+                raise ValueError(f"{name}.parquet: {column} must have {as_long} in every row")
+
+
+def ensure_each_once(tables: Mapping[str, pa.Table]) -> None:
+    """Refuse views with two descriptors of one drone.
+
+    Raises:
+        ValueError: naming the row.
+    """
+    held = tables[views.DECISIONS]["descriptors"].combine_chunks()
+    agents = tables[views.DESCRIPTORS]["agent_id"].to_numpy()[held.flatten().to_numpy()]
+    of_row = np.repeat(np.arange(len(held)), held.value_lengths().to_numpy())
+    pairs = np.sort(of_row * (int(agents.max(initial=0)) + 1) + agents)
+    if len(twice := pairs[1:][pairs[1:] == pairs[:-1]]):
+        row = int(twice[0]) // (int(agents.max()) + 1)
+        raise ValueError(f"{views.DECISIONS}.parquet: descriptors in row {row} has two of one drone")
+
+
+_MAY_BE_MISSING = frozenset({"region", "roster", "roi", "viewpoint"})
+"""Optional parts of what policies read and answer; no other value may be missing."""
+_MAY_BE_NAN = frozenset({
+    "region_x_m", "region_y_m", "region_radius_m", "roi_x_m", "roi_y_m", "roi_radius_m", "target_x_m", "target_y_m",
+    "bottleneck_mbps", "t_start_s", "t_done_s", "snr_db",
+})  # fmt: skip
+"""Columns in which NaN says that there is none. A link that carries nothing may have an SNR of minus infinity."""
+_CHOICES: dict[str, list[str]] = {
+    "representation": [*REPRESENTATION_OF],
+    "representations": [*REPRESENTATION_OF],
+    "transmissions.representation": [*REPRESENTATION_OF, HANDSHAKE],
+    "asked": [*REPRESENTATION_OF],
+    "link": [link.name.lower() for link in LinkHealth],
+    "status": [*map(str, Status)],
+    "phase": [*PHASE_OF],
+    "energy.cause": [*ENERGY_CAUSES, RECORDED],
+    "interventions.kind": ["policy", "gate"],
+    "violations.cause": [*CAUSES],
+    "disagreement.episodes.cause": [*disagreement.CAUSES],
+}
+_LENGTHS: dict[str, dict[str, int | str | None]] = {
+    "fusions": {"representations": "peers", "ages_s": "peers", "weights": "peers"},
+    "descriptors": {"coverage_grid": COVERAGE_BYTES, "goodput_mbps": None},
+    views.DECISIONS: {"ages_s": "descriptors"},
+    views.DESCRIPTORS: {
+        "coverage_grid": COVERAGE_BYTES, "position_m": 3, "orientation_xyzw": 4, "velocity_mps": 3,
+    },
+}  # fmt: skip
+"""How many values a cell has: so many, as many as another column, or (None) one for each other drone."""
+
+
+def _parts(name: str, values: pa.Array) -> Iterator[tuple[str, pa.Array]]:
+    """A column, and what its lists and structures hold, each with its name."""
+    yield name, values
+    if pa.types.is_list(values.type):
+        yield from _parts(name, values.flatten())
+    elif pa.types.is_struct(values.type):
+        there = values.drop_null()
+        for k in range(values.type.num_fields):
+            yield from _parts(f"{name}.{values.type.field(k).name}", there.field(k))
+
+
+def _first(values: pa.Array, wrong: pa.Array, must: str) -> tuple[int, str] | None:
+    at = pc.index(wrong, True).as_py()
+    return None if at < 0 else (at, f"is {values[at].as_py()!r:.60}, {must}")
+
+
+def _ensure_plain(path: Path) -> None:
+    """Refuse what is no plain file of the run's folder: it may lead elsewhere, or never end.
+
+    Raises:
+        ValueError: naming the file.
+    """
+    if path.is_symlink():
+        raise ValueError(f"{path.name} is a link, must be a file of the run's folder")
+    if not path.is_file():
+        raise ValueError(f"{path.name} is {'no plain file' if path.exists() else 'missing'}")
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"{next(n for n in found if names.count(n) > 1)!r:.60} stands there twice")
+    return found
+
+
+def _refuse(constant: str) -> Any:
+    raise ValueError(f"{constant} is no number that JSON has")
