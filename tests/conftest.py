@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import signal
+from pathlib import Path
 
 import pytest
 import typer.main
@@ -24,6 +25,32 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # begun in the background
 settings.register_profile("explore", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True)
 settings.register_profile("same", settings.get_profile("explore"), derandomize=True)
 settings.load_profile("same")  # the same examples in each run; `make nightly` explores others
+
+
+NIGHTLY = (
+    "api/test_install.py", "api/test_without_extras.py", "benchmarks", "fuzz", "perception/benchmark",
+    "perception/network/test_perception_codebook.py", "perception/network/test_perception_fine.py",
+    "perception/network/test_perception_fused_grids.py", "perception/recordings/test_perception_uav3d.py",
+    "perception/recordings/test_perception_unpickle.py", "perception/study",
+    "perception/surrogate/test_perception_surrogate_calibrate.py",
+    "perception/surrogate/test_perception_surrogate_correlation.py",
+    "perception/surrogate/test_perception_surrogate_shared_false_positives.py", "perception/training",
+    "policies/verification/test_policies_corpus.py", "policies/verification/test_policies_generated.py",
+    "policies/verification/test_policies_hidden.py", "policies/verification/test_policies_large_views.py",
+    "policies/verification/test_policies_solver.py", "policies/verification/test_policies_time_of_drawn_views.py",
+    "sim/campaign/test_sim_campaign_by_torch.py", "sim/campaign/test_sim_campaign_cluster.py",
+    "sim/campaign/test_sim_campaign_user_code.py", "sim/check/test_sim_over_time.py", "sim/cli/test_sim_cli_bench.py",
+    "sim/cli/test_sim_supervised.py", "sim/engine/test_sim_combinations.py", "sim/engine/test_sim_scoring_times.py",
+    "sim/live/test_sim_live_members.py", "sim/live/test_sim_live_watchdog.py", "sim/ranking", "sim/studies",
+    "site", "validation",
+)  # fmt: skip
+"""Slow tests of what rarely breaks. `make test` does not even import them; `make nightly` runs them."""
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out `NIGHTLY` where slow tests are left out."""
+    is_nightly = collection_path.relative_to(Path(__file__).parent).as_posix() in NIGHTLY
+    return True if is_nightly and config.option.markexpr == "not slow" else None
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

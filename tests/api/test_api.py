@@ -299,6 +299,7 @@ def test_how_many_seeds_are_flown(detector: str, seed: int | None, seeds: int | 
     assert chosen_seeds(sortie.load("track_target", {"perception.detector": detector}), seed, seeds) == flown
 
 
+@pytest.mark.slow
 def test_the_command_line_flies_the_seeds_of_the_api(tmp_path: Path) -> None:
     settings = [arg for key, value in SURROGATE.items() for arg in ("--set", f"{key}={value}")]
     command = ["compare", "track_target", "--policies", "worked,silence", *settings, "--out", str(tmp_path / "c.json")]

@@ -88,6 +88,7 @@ sys.stdout.write(digest)
 """
 
 
+@pytest.mark.slow
 def test_boxes_are_equal_across_processes() -> None:
 
     program = PROGRAM.format(tests=str(HELPERS))

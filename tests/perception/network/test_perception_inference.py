@@ -29,6 +29,7 @@ def exact(conv: nn.Conv2d, x: Tensor) -> Tensor:
     return F.relu(out)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     n=st.integers(1, 3),

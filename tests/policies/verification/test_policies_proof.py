@@ -99,6 +99,7 @@ def test_a_directive_of_other_types_is_refuted_and_named_by_every_property(
     assert rates.outcome == "proved" or rates.what == contract.what
 
 
+@pytest.mark.slow
 def test_what_cannot_be_searched_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawn, "LARGE_S", 0.2)  # each property would wait out its 10 s at the largest view
     verdict = quick(random_k)[0]

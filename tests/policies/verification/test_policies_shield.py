@@ -131,6 +131,7 @@ def test_a_shielded_policy_conforms(rules: str) -> None:
     assert not failing([c for c in conform(shield(worked, parse(RULES[rules])), count=60) if c.name != "budget kept"])
 
 
+@pytest.mark.slow
 def test_the_shielded_fault_is_proved_harmless() -> None:
     """The proof explores the shield together with the policy: it holds on every view, not on drawn ones alone."""
     faulty = planted("drops")

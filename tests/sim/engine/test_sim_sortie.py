@@ -436,6 +436,7 @@ def test_duty_cycle_rests_the_computer() -> None:
     assert rested - idle == pytest.approx(0.2 * (worked - idle), rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_detector_that_works_ahead_leaves_the_same_record(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = example("perception.detector=torch", "perception.sample_rate_hz=5", "duration_s=2.5")
     ahead = run_sortie(scenario)
