@@ -18,8 +18,6 @@ class Counters:
     data_lost_bytes: int = 0
     data_expired_bytes: int = 0
     data_wire_bytes: int = 0
-    context_sent_bytes: int = 0
-    context_wire_bytes: int = 0
     broadcasts: int = 0
     receptions: int = 0
     """Broadcasts heard, counted per receiver."""

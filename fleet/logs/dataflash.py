@@ -2,13 +2,14 @@
 
 A log describes itself: FMT messages name every message type's length, fields and their binary formats. Damage is
 expected, since logs end where the power did: what cannot be read is skipped, counted and told, and the rest stands.
+pymavlink's reader refuses a log with one damaged description, takes ten times as long, and is an extra.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,8 @@ class RawLog:
     """What was damaged, in plain words."""
     utc_s: float | None = None
     """Seconds since 1970 at which the log's clock is 0, if the file says so itself."""
+    orders: Mapping[str, Column] = field(default_factory=dict)
+    """Message name → where each row stands in the log. Left out: rows of one number stand side by side."""
 
     def parameters(self) -> dict[str, float]:
         """The vehicle's parameters, by name; the last value where one was set anew."""
@@ -101,7 +104,8 @@ def read_dataflash(data: bytes) -> RawLog:
         problems.append(f"{unknown} messages of a kind that the log does not describe")
     if cut:
         problems.append("the last message is cut off")
-    return RawLog(_tables(data, described, begins), tuple(problems))
+    orders = {described[kind][0]: np.array(offsets) for kind, offsets in begins.items()}
+    return RawLog(_tables(data, described, begins), tuple(problems), orders=orders)
 
 
 def _describe(body: bytes, described: _Kinds) -> None:

@@ -9,15 +9,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from sortie.fleet.logs.dataflash import RawLog, is_dataflash, read_dataflash
-from sortie.fleet.logs.fields import Found, from_dataflash, from_tlog, from_ulog, utc_at_zero_s, with_fields
-from sortie.fleet.logs.geodesy import metres_per_radian
+from sortie.fleet.logs.fields import (
+    CELL_V,
+    Found,
+    from_dataflash,
+    from_tlog,
+    from_ulog,
+    in_time,
+    utc_at_zero_s,
+    with_fields,
+)
+from sortie.fleet.logs.sources import GAP_S, Samples, judged, local_m, taken
 from sortie.fleet.logs.ulog import is_ulog, read_ulog
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.regular import regular
@@ -25,12 +34,7 @@ from sortie.scenarios.regular import regular
 Array = npt.NDArray[np.float64]
 
 MAX_BYTES = 2_000_000_000
-FAR_M = 20_000.0
-"""Positions further from the flight's median are taken for errors."""
-FAST_MPS = 200.0
-GAP_S = 1.0
-BACK_S = 0.5
-"""A clock that steps back by more has been restarted."""
+FULL_CELL_V = 4.25
 
 
 class LogError(SortieError):
@@ -76,6 +80,10 @@ class FlightLog:
     problems: tuple[str, ...]
     utc_s: float | None = None
     """Seconds since 1970 at its begin; None where the log does not say."""
+    cells: int | None = None
+    """In series: as the log says, or by the voltage; None without a voltage."""
+    capacity_ah: float | None = None
+    """Of the full pack; None where the log does not say."""
 
     @property
     def name(self) -> str:
@@ -133,7 +141,7 @@ def read_logs(path: str | Path) -> tuple[FlightLog, ...]:
 
 
 def _assemble(
-    path: Path, kind: str, raw: RawLog, translate: Callable[[RawLog], tuple[Found, str]], system: int | None = None
+    path: Path, kind: str, raw: RawLog, translate: Callable[[RawLog], Found], system: int | None = None
 ) -> FlightLog:
     """One clock from zero, sound values, and a list of what was not."""
     with np.errstate(all="ignore"):  # damaged numbers overflow; what is not finite is left out below
@@ -141,42 +149,45 @@ def _assemble(
 
 
 def _assembled(
-    path: Path, kind: str, raw: RawLog, translate: Callable[[RawLog], tuple[Found, str]], system: int | None
+    path: Path, kind: str, raw: RawLog, translate: Callable[[RawLog], Found], system: int | None
 ) -> FlightLog:
     problems = list(raw.problems)
-    several = sorted(name for name in raw.tables if name.startswith("battery_status."))
-    if several:
-        problems.append(f"{len(several) + 1} batteries, the first is taken")
-    whole = RawLog(with_fields(raw.tables, problems), raw.problems, raw.utc_s)
-    found, unit = translate(whole)
-    found = {name: _sound(name, *each, problems) for name, each in found.items() if len(each[0])}
-    found = {name: each for name, each in found.items() if len(each[0])}
-    fix = None
-    if (fixes := found.pop("fix", None)) is not None:
-        near = _near(
-            local_m(fixes[1]), [] if "position" in found else problems
-        )  # before one of them becomes the origin
-        if near.any():
-            fix = fixes[0][near], fixes[1][near]
-            found.setdefault("position", (fix[0], local_m(fix[1])))
-    begin_s = min((t_s[0] for t_s, _ in found.values()), default=0.0)
-    end_s = max((t_s[-1] for t_s, _ in found.values()), default=0.0)
+    whole = in_time(RawLog(with_fields(raw.tables, problems), (), raw.utc_s, raw.orders), problems)
+    found = translate(whole)
+    each = {what: [judged(what, source) for source in of] for what, of in found.sources.items()}
+    if fixes := each.get("fix"):
+        each.setdefault("position", []).extend(_as_position(samples) for samples in fixes)
+    chosen: dict[str, Samples] = {}
+    number = 0
+    for what in ("fix", "position", "velocity", "attitude", "battery", "charge", "rssi"):
+        of = each.get(what, [])
+        if what == "charge":  # of the same battery, if it says
+            of = sorted(of, key=lambda samples: samples.source.number != number)
+        samples = taken(what, of)
+        problems += [line for line in (samples or of[0]).told if line not in problems] if of else []
+        if samples is None:
+            continue
+        if what == "battery":
+            number = samples.source.number
+            if (several := len({other.source.number for other in of if len(other.time_s)})) > 1:
+                called = "the first" if samples.source is of[0].source else samples.source.name
+                problems.append(f"{several} batteries, {called} is taken")
+        chosen[what] = samples
+    begin_s = min((samples.time_s[0] for samples in chosen.values()), default=0.0)
+    end_s = max((samples.time_s[-1] for samples in chosen.values()), default=0.0)
     utc_s = utc_at_zero_s(whole)
     series = {}
-    for name, (t_s, values) in found.items():
-        if name == "position":
-            near = _near(values, problems)
-            t_s, values = t_s[near], values[near] - values[near][:1]
-        if name == "velocity":
-            slow = np.linalg.norm(values, axis=-1) <= FAST_MPS
-            if not slow.all():
-                problems.append(f"{(~slow).sum()} velocities above {FAST_MPS:g} m/s are left out")
-            t_s, values = t_s[slow], values[slow]
-        if name == "charge":
+    for what, samples in chosen.items():
+        values = samples.values
+        if what == "position":
+            values = values - values[:1]
+        if what == "charge":
             values = _falling(values, problems)
-        if len(t_s):
-            problems.extend(_gaps(name, t_s - begin_s))
-            series[name] = Series(t_s - begin_s, values)
+        if what != "fix":
+            problems += _gaps(what, samples.time_s - begin_s)
+        series[what] = Series(samples.time_s - begin_s, values)
+    pack = found.packs.get(number)
+    cells = _cells(series.get("battery"), pack.cells if pack else None, problems)
     return FlightLog(
         path=path,
         system=system,
@@ -189,41 +200,36 @@ def _assembled(
         battery=series.get("battery"),
         charge=series.get("charge"),
         rssi=series.get("rssi"),
-        rssi_unit=unit,
-        fix=None if fix is None else Series(fix[0] - begin_s, fix[1]),
+        rssi_unit=found.rssi_unit,
+        fix=series.get("fix"),
         parameters=raw.parameters(),
         problems=tuple(problems),
         utc_s=None if utc_s is None or not math.isfinite(utc_s) else utc_s + begin_s,
+        cells=cells,
+        capacity_ah=pack.capacity_mah / 1000 if pack and pack.capacity_mah else None,
     )
 
 
-def _sound(name: str, t_s: Array, values: Array, problems: list[str]) -> tuple[Array, Array]:
-    """Finite rows of the longest stretch in which the clock runs forward, a row at a time."""
-    finite = np.isfinite(t_s) & np.isfinite(values[:, :1] if name == "battery" else values).all(axis=-1)
-    if not finite.all():
-        problems.append(f"{(~finite).sum()} rows of {name} are not finite and are left out")
-    t_s, values = t_s[finite], values[finite]
-    restarts = np.flatnonzero(np.diff(t_s) < -BACK_S) + 1
-    if len(restarts):
-        pieces = np.split(np.arange(len(t_s)), restarts)
-        longest = max(pieces, key=len)
-        problems.append(f"the clock of {name} restarts {len(restarts)} times; the longest stretch is taken")
-        t_s, values = t_s[longest], values[longest]
-    forward = np.concatenate([[True], t_s[1:] > np.maximum.accumulate(t_s)[:-1]]) if len(t_s) else np.zeros(0, bool)
-    return t_s[forward], values[forward]
+def _as_position(fixes: Samples) -> Samples:
+    """Fixes as metres from the first."""
+    return replace(fixes, values=local_m(fixes.values) if len(fixes.values) else fixes.values)
 
 
-def _near(metres: Array, problems: list[str]) -> npt.NDArray[np.bool_]:
-    """Which places [K, 3] are no errors."""
-    near: npt.NDArray[np.bool_] = np.linalg.norm(metres - np.median(metres, axis=0), axis=-1) <= FAR_M
-    if not near.all():
-        problems.append(f"{(~near).sum()} positions lie over {FAR_M / 1000:g} km off and are left out")
-    return near
+def _cells(battery: Series | None, told: int | None, problems: list[str]) -> int | None:
+    """A pack's cells, as the log says, or as many as its highest voltages need: a single sample decides nothing."""
+    if battery is None:
+        return None
+    volts = np.sort(battery.values[:, 0])
+    high_v = float(volts[-min(len(volts), max(3, len(volts) // 100))])
+    by_voltage = min(max(math.ceil(high_v / FULL_CELL_V), 1), 24)
+    if told is None or CELL_V[0] <= high_v / told <= CELL_V[1]:
+        return told or by_voltage
+    problems.append(f"{told} cells would have {high_v / told:.1f} V each; {by_voltage} are taken")
+    return by_voltage
 
 
 def _falling(values: Array, problems: list[str]) -> Array:
-    """A charge within 0 … 1 that never rises."""
-    values = np.clip(values, 0.0, 1.0)
+    """A charge that never rises."""
     held = np.minimum.accumulate(values, axis=0)
     if (rise := float((values - held).max())) > 0.005:
         problems.append(f"the charge rises by up to {rise:.1%}; it is held")
@@ -240,16 +246,3 @@ def _gaps(name: str, t_s: Array) -> list[str]:
         return []
     worst = long[np.argmax(steps[long])]
     return [f"{name}: {len(long)} gaps, the longest {steps[worst]:.1f} s at {t_s[worst]:.1f} s"]
-
-
-def local_m(fixes: Array) -> Array:
-    """Latitudes and longitudes in degrees and altitudes in metres as ENU metres from the first, [K, 3].
-
-    On the plane tangent to the WGS-84 ellipsoid at the first, with its two radii of curvature: the inverse of
-    `sortie.fleet.logs.geodesy.geodetic`.
-    """
-    lat, lon, alt = fixes[0].tolist()
-    east_m, north_m = metres_per_radian(lat, alt)  # not by an `Origin`: a damaged first fix may lie anywhere
-    east = np.radians((fixes[:, 1] - lon + 180) % 360 - 180) * east_m
-    north = np.radians(fixes[:, 0] - lat) * north_m
-    return np.stack([east, north, fixes[:, 2] - alt], axis=-1)

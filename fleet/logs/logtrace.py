@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from sortie.fleet.logs.flightlog import FAR_M, GAP_S, FlightLog, LogError, Series, local_m
+from sortie.fleet.logs.flightlog import FlightLog, LogError, Series
+from sortie.fleet.logs.sources import FAR_M, GAP_S, local_m
 from sortie.fleet.traces import ATTITUDE, BOUNDS, COLUMNS, POSITION, VELOCITY
 from sortie.scenarios.traces import MAX_ROWS
 

@@ -2,7 +2,8 @@
 
 The definitions describe every topic's fields; data messages carry a subscription's number. A size that leads beyond
 the file or a kind that does not exist marks damage: reading goes on at the next place from where the chain of sizes
-holds, and what was skipped is told.
+holds, and what was skipped is told. pyulog stops reading there, and does not say in which order rows of several topics
+were written, by which damaged times and restarts are known (`sortie.fleet.logs.clocks`).
 """
 
 from __future__ import annotations
@@ -72,6 +73,7 @@ def read_ulog(data: bytes) -> RawLog:
             case "O" if size >= 2:
                 dropouts, dropped_ms = dropouts + 1, dropped_ms + int.from_bytes(data[body : body + 2], "little")
     tables: dict[str, dict[str, Column]] = {}
+    orders: dict[str, Column] = {}
     types = _Types(formats)
     for number, messages in rows.items():
         name, format_name = topics.get(number, ("", ""))
@@ -81,6 +83,7 @@ def read_ulog(data: bytes) -> RawLog:
         if dtype is not None and fitting:
             records = np.frombuffer(b"".join(data[p : p + dtype.itemsize] for p in fitting), dtype)
             tables[name] = {field: records[field] for field in dtype.names or ()}
+            orders[name] = np.array(fitting)
     problems = []
     if stretches:
         problems.append(f"{skipped_bytes} bytes at {stretches} places are no message")
@@ -91,7 +94,7 @@ def read_ulog(data: bytes) -> RawLog:
     if cut or 0 < end - at < 3:
         problems.append("the last message is cut off")
     tables["PARM"] = parameter_table(parameters)
-    return RawLog(tables, tuple(problems))
+    return RawLog(tables, tuple(problems), orders=orders)
 
 
 def _sound(data: bytes, at: int, end: int) -> bool:

@@ -1,7 +1,8 @@
 """A flying vehicle as its MAVLink messages describe it: pose, velocity, charge, and when each was last heard.
 
-The vehicle is the first system whose heartbeat names an autopilot, PX4, ArduPilot or another. Messages of other systems
-are passed over. MAVLink is NED, FRD and w-first quaternions; the state is ENU, FLU and x y z w.
+The vehicle is the first system with the heartbeat of an autopilot, PX4, ArduPilot or another. Only the component that
+sends this heartbeat counts. Messages of other systems, and of the vehicle's gimbal, cameras and computers, are passed
+over. MAVLink is NED, FRD and w-first quaternions; the state is ENU, FLU and x y z w.
 """
 
 from __future__ import annotations
@@ -19,6 +20,13 @@ WANTED_HZ = {30: 20.0, 31: 20.0, 32: 20.0, 33: 20.0, 1: 1.0, 147: 1.0, 245: 1.0}
 """Messages that a drone asks its vehicle for, by id: ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED,
 GLOBAL_POSITION_INT, SYS_STATUS, BATTERY_STATUS, EXTENDED_SYS_STATE; Hz."""
 _NO_AUTOPILOT, _ON_GROUND, _ARMED = 8, 1, 128  # MAV_AUTOPILOT_INVALID, MAV_LANDED_STATE_ON_GROUND, ..._SAFETY_ARMED
+_NO_VEHICLE = frozenset({6, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48})
+"""MAV_TYPE of ground stations, companion computers, gimbals, cameras and other parts: some name an autopilot as theirs."""
+
+
+def is_autopilot(autopilot: int, kind: int) -> bool:
+    """Whether a heartbeat with this MAV_AUTOPILOT and MAV_TYPE is that of a vehicle's autopilot."""
+    return autopilot != _NO_AUTOPILOT and kind not in _NO_VEHICLE
 
 
 class VehicleState(NamedTuple):
@@ -26,18 +34,22 @@ class VehicleState(NamedTuple):
 
     system: int | None = None
     """Its system id."""
+    component: int | None = None
+    """The autopilot's component id."""
     position_m: Vector = (0.0, 0.0, 0.0)
     velocity_mps: Vector = (0.0, 0.0, 0.0)
     orientation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     soc: float | None = None
     """Charge, 0 … 1; None where the vehicle does not say."""
+    battery: int = 0
+    """Which battery's: the first one of which the vehicle says a charge."""
     armed: bool = False
     landed: bool = False
     heartbeat_s: float = -math.inf
     position_s: float = -math.inf
     attitude_s: float = -math.inf
     others: int = 0
-    """Messages of other systems, which were passed over."""
+    """Messages of other systems and components, which were passed over."""
 
     @property
     def pose_s(self) -> float:
@@ -55,15 +67,14 @@ def after(state: VehicleState, message: Any, now_s: float, origin: Origin | None
             (0, 0, 0) is the origin of the vehicle's own estimator.
     """
     name = message.get_type()
+    autopilot = name == "HEARTBEAT" and is_autopilot(message.autopilot, message.type)
     if state.system is None:
-        if name != "HEARTBEAT" or message.autopilot == _NO_AUTOPILOT:
+        if not autopilot:
             return state
-        state = state._replace(system=message.get_srcSystem())
-    if message.get_srcSystem() != state.system:
+        state = state._replace(system=message.get_srcSystem(), component=message.get_srcComponent())
+    if message.get_srcSystem() != state.system or state.component not in (None, message.get_srcComponent()):
         return state._replace(others=state.others + 1)
-    if name == "HEARTBEAT":
-        if message.autopilot == _NO_AUTOPILOT:  # a camera or a companion computer of the same vehicle
-            return state
+    if autopilot:
         return state._replace(heartbeat_s=now_s, armed=bool(message.base_mode & _ARMED))
     if name == "LOCAL_POSITION_NED" and origin is None:
         return _moved(
@@ -83,10 +94,10 @@ def after(state: VehicleState, message: Any, now_s: float, origin: Origin | None
         )
     if name == "ATTITUDE_QUATERNION":
         return _turned(state, to_xyzw([message.q1, message.q2, message.q3, message.q4]).tolist(), now_s)
-    if name == "BATTERY_STATUS" and message.id != 0:  # SYS_STATUS tells of the first battery too
-        return state
-    if name in ("SYS_STATUS", "BATTERY_STATUS") and message.battery_remaining >= 0:  # −1: it does not know
-        return state._replace(soc=min(message.battery_remaining / 100.0, 1.0))
+    if name in ("SYS_STATUS", "BATTERY_STATUS") and 0 <= message.battery_remaining <= 100:  # −1: it does not know
+        number = message.id if name == "BATTERY_STATUS" else 0
+        if state.soc is None or number <= state.battery:
+            return state._replace(soc=message.battery_remaining / 100.0, battery=number)
     if name == "EXTENDED_SYS_STATE":
         return state._replace(landed=message.landed_state == _ON_GROUND)
     return state

@@ -61,15 +61,12 @@ class Broadcasts:
         airtime_s = self._airtime_s.get(payload_bytes)
         if airtime_s is None:
             airtime_s = self._airtime_s[payload_bytes] = group_frame_s(payload_bytes, self._rate_mbps)
-        counters = self._counters
-        counters.broadcasts += 1
-        counters.context_sent_bytes += payload_bytes
+        self._counters.broadcasts += 1
         return Broadcast(sender, airtime_s, payload_bytes + _GROUP_OVERHEAD_BYTES, on_heard)
 
     def end(self, frame: Broadcast, receivers: NDArray[np.int64], fates: bytes) -> None:
         """The medium is through with a frame; receivers that it does not name are out of its reach."""
         counters, sender, gone = self._counters, frame.sender, self._gone
-        counters.context_wire_bytes += frame.wire_bytes
         living = self._n - 1 - (len(gone - {sender}) if gone else 0)
         if gone:  # receptions at drones that are gone do not count
             of_all = np.frombuffer(fates, np.uint8).copy()

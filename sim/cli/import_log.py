@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import typer
 
 from sortie.fleet.energy.cell import MEAN_CELL_V
-from sortie.fleet.logs.geodesy import Origin, local_enu
+from sortie.fleet.logs.geodesy import Origin, geodetic, local_enu
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Battery
@@ -29,7 +28,6 @@ Array = np.ndarray[Any, Any]
 TRACE, SCENARIO = "trace.parquet", "scenario.yaml"
 MADE = "made by `sortie import`"
 """By which its scenarios are known."""
-FULL_CELL_V = 4.25
 LONGEST_S = 7200.0
 LEAST_SOC = 0.001
 """What a flight's charge is held at least at: an estimate of nothing left grounds a drone, and it flew on."""
@@ -152,9 +150,12 @@ def flown_log(
         if zero is None:
             raise RunError(f"{log}: has no place on the globe, so that --ground cannot be placed beside it")
         columns = _with_stations(columns, ground, zero)
-    capacities_ah = [flight.parameters.get("BATT_CAPACITY", 0.0) / 1000 for flight in flights]
+    cells = next((flight.cells for flight in flights if flight.cells is not None), None)
+    capacities_ah = [flight.capacity_ah for flight in flights if flight.capacity_ah is not None]
     source = " and the ".join(f"{next(f.kind for f in flights if f.path == each)} log {each.name!r}" for each in logs)
-    text = scenario_text(slug(log), columns, capacities_ah, folder / TRACE, source, origin=zero, stations=stations)
+    text = scenario_text(
+        slug(log), columns, cells, capacities_ah, folder / TRACE, source, origin=zero, stations=stations
+    )
     try:
         loads(text, str(folder / SCENARIO))  # an impossible log is refused before anything is written
     except SortieError as error:
@@ -174,10 +175,15 @@ def _zero(flights: Sequence[FlightLog], lifted_m: float) -> Origin | None:
     placed = next((flight for flight in flights if flight.fix is not None), None)
     if placed is None or placed.fix is None:
         return None
-    at_s = placed.fix.time_s[0] if len(flights) > 1 or placed.position is None else placed.position.time_s[0]
+    at_s, moved_m = placed.fix.time_s[0], (0.0, 0.0, 0.0)
+    if len(flights) == 1 and placed.position is not None:  # the first fix may come after the first place
+        at_s = max(at_s, placed.position.time_s[0])
+        moved_m = tuple(-float(np.interp(at_s, placed.position.time_s, column)) for column in placed.position.values.T)
     latitude, longitude, altitude = (np.interp(at_s, placed.fix.time_s, column) for column in placed.fix.values.T)
     try:
-        return Origin(float(latitude), float(longitude), float(altitude) - lifted_m)
+        place = Origin(float(latitude), float(longitude), float(altitude))
+        latitude, longitude, altitude = geodetic(moved_m, place)
+        return Origin(latitude, longitude, altitude - lifted_m)
     except ValueError:  # at a pole, where damage may lie too
         return None
 
@@ -231,6 +237,7 @@ def described(columns: Mapping[str, Array]) -> str:
 def scenario_text(
     name: str,
     columns: Mapping[str, Array],
+    cells: int | None,
     capacities_ah: Sequence[float],
     trace: Path,
     source: str,
@@ -244,8 +251,7 @@ def scenario_text(
     damage makes capacities of any size.
     """
     battery = []
-    if "voltage_v" in columns:
-        cells = min(max(math.ceil(float(np.nanmax(columns["voltage_v"])) / FULL_CELL_V), 1), 24)
+    if cells is not None:
         battery.append(f"cells: {cells}")
         capacities_wh = (each * cells * MEAN_CELL_V for each in capacities_ah)
         bounds: list[Any] = Battery.model_fields["capacity_wh"].metadata

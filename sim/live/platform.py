@@ -107,7 +107,7 @@ class MavlinkLink:
             state, now_s = self.state, time.monotonic()
             for message in self._listener.heard(data):
                 state = after(state, message, now_s, self._origin)
-                if message.get_srcSystem() == state.system:
+                if (message.get_srcSystem(), message.get_srcComponent()) == (state.system, state.component):
                     self._peer = sender
             self.state = state
 

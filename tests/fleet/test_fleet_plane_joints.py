@@ -358,6 +358,95 @@ def test_the_smallest_lag_tells_the_offset_and_only_peers_that_are_asked_for_cou
     assert clocks.own_offset_s([3]) == 0.0
 
 
+class Reports(Rig):
+    """Keeps its events: when, and the text."""
+
+    def __init__(self, *given: Any, **rules: Any) -> None:
+        self.reported: list[tuple[float, str]] = []
+        super().__init__(*given, dwell_s=0.0, **rules)
+
+    def event(self, t_s: float, drone: int, kind: str, text: str) -> None:
+        assert (drone, kind) == (0, "clock")
+        self.reported.append((round(t_s, 2), text))
+
+
+AGREES = "clock agrees with the fleet's again"
+
+
+def off(way: str) -> str:
+    return f"clock {way} the fleet's, ± 0.05 s: ages are corrected for it"
+
+
+@pytest.mark.parametrize(
+    ("offsets_s", "reported"),
+    [
+        # an offset is known to half a frame: up to 0.05 s on either side is no fault
+        ([0.0, 0.05, -0.05, 0.049], {}),
+        ([0.06], {0: off("0.06 s ahead of")}),
+        ([-0.06], {0: off("0.06 s behind")}),
+        # it is reported again once it has changed by more than that, and not before
+        ([0.06, 0.1, 0.11, 0.12, 0.12], {0: off("0.06 s ahead of"), 3: off("0.12 s ahead of")}),
+        ([-0.2, -0.16, -0.24, -0.26], {0: off("0.20 s behind"), 3: off("0.26 s behind")}),
+        ([0.06, -0.06, 0.0], {0: off("0.06 s ahead of"), 1: off("0.06 s behind"), 2: AGREES}),
+        # its end is reported, and then the begin of the next fault
+        ([3.0, 0.0, 0.0, 0.05, 0.06], {0: off("3.00 s ahead of"), 1: AGREES, 4: off("0.06 s ahead of")}),
+    ],
+)
+def test_a_drone_reports_its_clock_once_it_is_off_by_more_than_can_be_measured(
+    offsets_s: list[float], reported: dict[int, str]
+) -> None:
+    """By second, as the descriptors of three peers show it; half a frame is 0.05 s."""
+    rig = Reports(lambda view: [])
+    for second, offset_s in enumerate(offsets_s):
+        rig.hear(1, 2, 3)
+        rig.memory.clocks.offset_s = dict.fromkeys((1, 2, 3), offset_s)
+        rig.env.run(until=second + 0.95)
+    assert rig.reported == [(second + 0.01, text) for second, text in reported.items()]
+
+
+@pytest.mark.parametrize(("peers", "offset_s"), [(1, 0.0), (2, 0.5), (3, 1.0)])
+def test_the_offset_of_a_clock_is_the_median_over_itself_and_its_peers(peers: int, offset_s: float) -> None:
+    """It is a second ahead of some of three peers, and agrees with the others and with itself."""
+    rig = Reports(lambda view: [])
+    rig.hear(1, 2, 3)
+    rig.memory.clocks.offset_s = dict.fromkeys(range(1, peers + 1), 1.0)
+    rig.env.run(until=0.5)
+    assert rig.reported == [(0.01, off(f"{offset_s:.2f} s ahead of"))] * (offset_s > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("stamps_s", "reported"),
+    [
+        # a descriptor may take a frame; one that comes older than that, and old enough to reduce the link, is reported
+        ([0.0, 0.1, 0.29], []),
+        ([0.0, 0.32], [1]),
+        ([1.05], [0]),
+        # once while it lasts, and again after it was over
+        ([0.32, 0.35, 0.4], [0]),
+        ([0.32, 0.0, 0.32], [0, 2]),
+        # stamps of the future make nothing old
+        ([-0.5, -3.0], []),
+    ],
+)
+def test_a_link_that_a_faulty_clock_reduces_is_reported_once(stamps_s: list[float], reported: list[int]) -> None:
+    """A peer's descriptors, each so old by its stamp when it comes. A link that silence reduces is not reported."""
+    rig = Reports(lambda view: [FEATURES] if 1 in view.peers else [])
+    for k, late_s in enumerate(stamps_s):
+        rig.env.run(until=0.1 * k + 0.004)
+        rig.memory.hold(descriptor(1, rig.env.now - late_s), rig.env.now)
+    rig.env.run(until=0.1 * len(stamps_s))
+    of_clocks = len(rig.reported)
+    if stamps_s[-1] <= 0.1:  # else age adds to what its clock makes of it
+        rig.env.run(until=3.0)
+        assert len(rig.reported) == of_clocks
+    wanted = []
+    for k in reported:
+        link, old_s = "detached" if stamps_s[k] > 1.0 else "degraded", stamps_s[k] + 0.006
+        came = f"link to 1 {link}: its descriptor came 0.01 s ago and is {old_s:.2f} s old by its stamp: "
+        wanted.append((round(0.1 * k + 0.01, 2), f"{came}a clock is wrong, or it waited for the channel"))
+    assert rig.reported[:of_clocks] == wanted
+
+
 @pytest.mark.parametrize("gnss", [True, False])
 def test_a_clock_begins_with_its_offset_and_drifts_without_gnss_alone(gnss: bool) -> None:
     (oscillator,) = oscillators(Clocks(offset_s=2.0, drift_ppm=50.0), 1, 3, 0)

@@ -167,6 +167,11 @@ def test_goodput_against_what_arrived() -> None:
     assert goodput_doubt(151.0, came) == "goodput: 151 Mb/s claimed, frames came at 100"
     assert goodput_doubt(0.1, [Arrival(500, 0.001, 600.0)]) == "", "a small payload says too little"
     assert goodput_doubt(500.0, []) == "", "nothing came, nothing is known"
+    fast, slow = Arrival(160_000, 0.02, 600.0), Arrival(160_000, 0.2, 100.0)
+    assert goodput_doubt(899.0, [slow, fast, slow]) == "", "the fastest of several bounds it"
+    assert goodput_doubt(901.0, [slow, fast, slow]) == "goodput: 901 Mb/s claimed, frames came at 600"
+    assert goodput_doubt(903.9, [fast], 4.0) == "", "a step of 4 Mb/s may have been added"
+    assert goodput_doubt(904.1, [fast], 4.0) == "goodput: 904 Mb/s claimed, frames came at 600"
 
 
 def test_battery_against_the_past_and_the_fleet() -> None:

@@ -47,24 +47,54 @@ def test_boxes_of_two_classes_in_one_place_both_stay(rule: Rule) -> None:
     assert same.kind.tolist() == [TRUCK]
 
 
+def people(*rows: tuple[float, float]) -> Boxes:
+    """People on one line, by place and score."""
+    return boxes(*((PERSON, x_m, 0.0, score) for x_m, score in rows))
+
+
+@pytest.mark.parametrize(
+    ("own", "peers", "best_m", "mean_m"),
+    [
+        # whoever one camera sees beside each other are two, though their boxes overlap: the ego's, and a peer's
+        ([(0.0, 0.9), (0.3, 0.8)], [[(30.0, 0.7)]], [0.0, 0.3, 30.0], [0.0, 0.3, 30.0]),
+        ([], [[(0.0, 0.9), (0.3, 0.8)]], [0.0, 0.3], [0.0, 0.3]),
+        # two cameras see one person within 2 m, and place her by score: (0 × 0.8 + 1.2 × 0.4) / 1.2
+        ([(0.0, 0.8)], [[(1.2, 0.4)]], [0.0], [0.4]),
+        ([(0.0, 0.8)], [[(2.1, 0.4)]], [0.0, 2.1], [0.0, 2.1]),
+        # a box near two people of another camera is of the better one: (0.6 × 0.7) / 1.6
+        ([(0.0, 0.9), (1.0, 0.8)], [[(0.6, 0.7)]], [0.0, 1.0], [0.2625, 1.0]),
+        ([(1.0, 0.8), (0.0, 0.9)], [[(0.6, 0.7)]], [0.0, 1.0], [0.2625, 1.0]),
+        # three cameras: two boxes 3 m apart are of one person between them: (1.5 × 0.8 − 1.5 × 0.7) / 2.4
+        ([(0.0, 0.9)], [[(1.5, 0.8)], [(-1.5, 0.7)]], [0.0], [0.0625]),
+        # no chain: the third box is near the second alone, which is the first one's
+        ([(0.0, 0.9)], [[(1.8, 0.8)], [(3.4, 0.7)]], [0.0, 3.4], [1.8 * 0.8 / 1.7, 3.4]),
+    ],
+)
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize(("apart_m", "people"), [(0.0, 1), (1.9, 1), (2.1, 2)])
-def test_people_are_one_person_within_two_metres(rule: Rule, apart_m: float, people: int) -> None:
-    out = joined(rule, boxes((PERSON, 0, 0, 0.9)), boxes((PERSON, apart_m, 0, 0.8)))
-    assert out.kind.tolist() == [PERSON] * people
-    assert out.size_m[0].tolist() == pytest.approx(list(PERSON_SIZE_M[:2]))
+def test_boxes_of_people_are_merged_between_cameras_and_never_of_one(
+    rule: Rule,
+    own: list[tuple[float, float]],
+    peers: list[list[tuple[float, float]]],
+    best_m: list[float],
+    mean_m: list[float],
+) -> None:
+    """Suppression leaves the best box of each person, averaging the mean place by score. Cars stand far off, merged as ever."""
+    cars = boxes((CAR, 60.0, 0.0, 0.5))
+    out = joined(rule, Boxes.join([people(*own), cars]), *[Boxes.join([people(*rows), cars]) for rows in peers])
+    places = sorted(zip(out.kind.tolist(), out.xy_m[:, 0].tolist(), strict=True))
+    wanted = [(CAR, 60.0), *((PERSON, x_m) for x_m in sorted(best_m if rule == "nms" else mean_m))]
+    assert [kind for kind, _ in places] == [kind for kind, _ in wanted]
+    assert [x_m for _, x_m in places] == pytest.approx([x_m for _, x_m in wanted], abs=1e-5)
+    np.testing.assert_allclose(out.size_m[out.kind == PERSON], [PERSON_SIZE_M[:2]] * len(best_m))
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_two_people_whom_one_camera_sees_side_by_side_stay_two(rule: Rule) -> None:
-    out = joined(rule, boxes((PERSON, 0, 0, 0.9), (PERSON, 1.0, 0, 0.8)), boxes((PERSON, 30, 0, 0.7)))
-    assert len(out) == 3
-
-
-def test_a_persons_place_is_the_mean_of_what_cameras_say() -> None:
-    out = joined("average", boxes((PERSON, 0, 0, 0.8)), boxes((PERSON, 1.2, 0, 0.4)))
-    assert out.xy_m[0].tolist() == pytest.approx([0.4, 0.0], abs=1e-6)
-    assert out.score[0] == pytest.approx(0.6)
+def test_people_that_two_egos_know_of_are_not_merged_between_egos(rule: Rule) -> None:
+    """They are joined in one call, and stand close to each other. Each keeps its own place of the person."""
+    far = [SourceBoxes(people((40.0, 0.5)), 1.0, HERE)]
+    egos = [EgoSources((0.5 * k, 0.0, 0.0), people((0.5 * k, 0.9 - 0.1 * k)), False, far) for k in range(3)]
+    for k, out in enumerate(joined_many(egos, rule)):
+        assert sorted(out.xy_m[:, 0].tolist()) == pytest.approx([0.5 * k, 40.0])
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -81,6 +81,28 @@ def test_boxes_lose_by_their_whole_age_where_the_ego_has_no_look(rule: str) -> N
     assert found.score == pytest.approx(0.8 * still_right(reach_m(lone.size_m), 0.7), rel=1e-5)
 
 
+@pytest.mark.parametrize("rule", ["nms", "average"])
+def test_a_peer_that_is_not_trusted_at_all_changes_nothing_by_being_fresh(rule: str) -> None:
+    """What all others bring is as old as the ego's own look, so that nobody's boxes lose by their age."""
+    own, theirs = boxes_at((20.0, 0.0, 0.6)), boxes_at((40.0, 0.0, 0.8), (20.5, 0.0, 0.5))
+    others = [SourceBoxes(theirs, 1.0, HERE, age_s=0.5), SourceBoxes(boxes_at((60.0, 0.0, 0.9)), 0.0, HERE)]
+    lost, fresh = (
+        joined_many([EgoSources(HERE, own, False, some, age_s=0.5)], rule)[0] for some in (others[:1], others)
+    )  # type: ignore[arg-type]
+    assert fresh.xy_m.tolist() == lost.xy_m.tolist()
+    assert fresh.score.tolist() == lost.score.tolist()
+    assert fresh.score[0] == pytest.approx(0.8 if rule == "nms" else 0.55)
+
+
+@pytest.mark.parametrize("known", [(0.35**2, np.nan), (np.nan, 0.35**2)])
+def test_of_two_boxes_of_a_drone_for_one_car_the_surer_one_is_its_vote(known: tuple[float, float]) -> None:
+    """One of both is known to be where it was, whatever its age; the drone's vote loses nothing by the other."""
+    twice = boxes_at((20.0, 0.0, 0.8), (20.6, 0.0, 0.8))
+    late = SourceBoxes(twice, 1.0, HERE, age_s=0.8, variance_m2=np.array(known))
+    (found,) = joined_many([EgoSources(HERE, Boxes.empty(), False, [late], looked=False)], "average")
+    assert found.score.tolist() == pytest.approx([0.8])
+
+
 def test_a_late_box_exactly_on_the_fresh_one_counts_as_one_beside_it() -> None:
     """That it lies there tells that the car stands, a tenth of a millimetre off as well."""
     own = boxes_at((20.0, 0.0, 0.6))

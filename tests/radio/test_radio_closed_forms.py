@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from sortie.radio.channel.draws import fade_table_db
 from sortie.radio.channel.pathloss import path_loss_db
 from sortie.radio.channel.snr import earshot_m, noise_dbm
 from sortie.radio.goodput import Goodput
-from sortie.radio.mac.airtime import BLOCK_ACK_S, MPDU_DELIMITER, frame_bytes, repair_wire_bytes, sample_wire
+from sortie.radio.mac.airtime import MPDU_DELIMITER, frame_bytes, repair_wire_bytes, sample_wire
 from sortie.radio.mac.contention import SIFS_S, SLOT_S
 from sortie.radio.rates import CURVES, STANDARDS, group_curve, rate_table, snr_index
 from sortie.radio.sample import Service
@@ -29,17 +30,27 @@ def service(**settings: object) -> Service:
 
 @pytest.mark.parametrize("access", ["voice", "best_effort", "background"])
 @pytest.mark.parametrize("goodput_mbps", [0.5, 3.0, 24.0, 180.0])
+@pytest.mark.parametrize(
+    ("more", "around_s"),
+    [
+        ({}, 32e-6),
+        # a block ack of more than 64 frames is 24 B longer: two symbols
+        ({"block_ack_window": 256}, 40e-6),
+        ({"block_ack_window": 256, "max_ampdu_frames": 256}, 40e-6),
+        # request and answer of 28 µs each, a SIFS behind each
+        ({"rts": True}, 32e-6 + 2 * 28e-6 + 2 * 16e-6),
+    ],
+)
 def test_full_frames_alone_on_a_traced_link_carry_its_goodput_to_the_microsecond(
-    goodput_mbps: float, access: AccessName
+    goodput_mbps: float, access: AccessName, more: dict[str, Any], around_s: float
 ) -> None:
     """A wait for the medium (half of the smallest window on average), preamble, frames, answer: payload over that time."""
-    link = service(payload_class=access)
-    rate_mbps, frames = link._rate_of(goodput_mbps)
-    c = AirSettings(payload_class=access)
+    c = AirSettings(payload_class=access, **more)
+    rate_mbps, frames = service(payload_class=access, **more)._rate_of(goodput_mbps)
     edca = getattr(c.edca, access)
     wait_s = SIFS_S + (edca.aifsn + edca.cw_min / 2) * SLOT_S
     bits = frames * 8 * (frame_bytes(c.fragment_bytes, fragmented=True) + MPDU_DELIMITER)
-    took_s = wait_s + STANDARDS["ax"].preamble_s + bits / (rate_mbps * 1e6) + SIFS_S + BLOCK_ACK_S
+    took_s = wait_s + STANDARDS["ax"].preamble_s + bits / (rate_mbps * 1e6) + SIFS_S + around_s
     assert frames * c.fragment_bytes * 8e-6 / took_s == pytest.approx(goodput_mbps, rel=1e-6)
     assert 1 <= frames <= c.max_ampdu_frames
 

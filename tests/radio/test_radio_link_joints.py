@@ -27,7 +27,6 @@ from sortie.radio.channel.snr import Channel, earshot_m, noise_dbm
 from sortie.radio.channel.traces import LinkTrace
 from sortie.radio.counters import CAUSES, Counters
 from sortie.radio.goodput import Goodput
-from sortie.radio.mac.airtime import frame_bytes, repair_wire_bytes
 from sortie.radio.mac.broadcasts import Broadcasts
 from sortie.radio.mac.rate_control import INTERVAL_S, Minstrel
 from sortie.radio.overrides import LinkNow, Overrides
@@ -322,23 +321,45 @@ def sample(payload: int, fragments: int, piece_bytes: int = 0, *, reliable: bool
     )
 
 
-def test_frames_are_as_long_as_what_they_carry() -> None:
-    """Also those of a repair: one that is left of three is a fragment still, and may be the last, short one or not."""
-    service = Service(CALM, -88.0)
-    whole = sample(3000, 3)
-    service.prepare(whole)
-    of = {"fragmented": True}
-    assert (whole.frames, whole.full_bytes, whole.last_bytes) == (3, frame_bytes(1344, **of), frame_bytes(312, **of))
-    assert whole.pass_wire == pytest.approx((3000 + 3 * frame_bytes(0, **of)) / 3)
-    whole.left = 1
-    service.prepare(whole)
-    assert (whole.frames, whole.last_bytes) == (1, frame_bytes(1344, **of))
-    alone = sample(1000, 1, reliable=True)
-    service.prepare(alone)
-    assert alone.last_bytes == frame_bytes(1000) + repair_wire_bytes(1)
-    pieces = sample(2500, 3, 1000)
-    service.prepare(pieces)
-    assert (pieces.full_bytes, pieces.last_bytes) == (frame_bytes(1000), frame_bytes(500))
+@pytest.mark.parametrize(
+    ("payload", "fragments", "piece", "reliable", "left", "frames"),
+    [
+        # fragments have 150 B around them; in a repair any of three is a fragment still, and may be a long one
+        (3000, 3, 0, False, 3, (1494, 462, 3450)),
+        (3000, 3, 0, False, 2, (1494, 1494, 2988)),
+        (3000, 3, 0, False, 1, (1494, 1494, 1494)),
+        # a sample of one frame has 142 B, and so has each piece that is of use alone
+        (1000, 1, 0, False, 1, (1142, 1142, 1142)),
+        (2500, 3, 1000, False, 3, (1142, 642, 2926)),
+        (2500, 3, 1000, False, 2, (1142, 1142, 2284)),
+        (700, 1, 1000, False, 1, (842, 842, 842)),
+        # a heartbeat and its answer of 268 B take time behind the last frame, and are counted elsewhere
+        (1000, 1, 0, True, 1, (1142, 1142 + 268, 1142)),
+        (3000, 3, 0, True, 3, (1494, 462 + 268, 3450)),
+        (2500, 3, 1000, True, 2, (1142, 1142 + 268, 2284)),
+    ],
+)
+def test_frames_are_as_long_as_what_they_carry(
+    payload: int, fragments: int, piece: int, reliable: bool, left: int, frames: tuple[int, int, int]
+) -> None:
+    """Each frame but the last, the last one, and all of them on the wire, by hand."""
+    s = sample(payload, fragments, piece, reliable=reliable)
+    s.left = left
+    Service(CALM, -88.0).prepare(s)
+    assert (s.frames, s.full_bytes, s.last_bytes, s.pass_wire * left) == (left, *frames[:2], pytest.approx(frames[2]))
+
+
+@pytest.mark.parametrize(("unreachable", "frames"), [("", 10), ("no_link", 4), ("receiver_gone", 4)])
+@pytest.mark.parametrize("passes", [0, 2])
+def test_tries_of_a_dead_link_put_no_bytes_on_the_wire(unreachable: str, frames: int, passes: int) -> None:
+    """Of ten frames four were sent before the link died. Passes that are over count likewise."""
+    s = sample(3000, 3)
+    Service(CALM, -88.0).prepare(s)
+    for k in range(passes + 1):
+        s.sent_frames, s.sent_before, s.unreachable = 10, 4, unreachable
+        if k < passes:
+            s.end_pass()
+    assert s.row_of(Status.LOST, "", 1.0).wire_bytes == (passes + 1) * frames * 1150
 
 
 def test_pieces_and_fragments_of_one_length_count_for_the_time_that_each_takes() -> None:

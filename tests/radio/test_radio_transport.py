@@ -13,7 +13,7 @@ from radio_flights import Hover, trace
 from scipy import stats
 
 from sortie.radio import Status
-from sortie.radio.mac.airtime import frame_bytes, sample_wire
+from sortie.radio.mac.airtime import sample_wire
 from sortie.radio.settings import AirSettings, BurstSettings
 
 
@@ -117,11 +117,6 @@ def test_reliable_pieces_come_back_and_the_sample_is_whole(tmp_path: Path) -> No
     done = [r for r in flight.rows if r.reason != "replaced"]
     assert {r.status for r in done} == {Status.DELIVERED}
     assert all(r.arrived_bytes == 133_610 and r.missing == () and r.repairs > 0 for r in done)
-
-
-def test_a_piece_costs_no_fragment_header() -> None:
-    assert sample_wire(10 * 1336, 1336, alone=True)[1] == 10 * frame_bytes(1336)
-    assert sample_wire(10 * 1336, 1336)[1] == sample_wire(10 * 1336, 1336, alone=True)[1] + 10 * 8
 
 
 def test_a_piece_has_a_byte() -> None:

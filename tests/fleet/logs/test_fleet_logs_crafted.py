@@ -219,7 +219,7 @@ def test_a_vehicle_that_is_heard_later_begins_later(local: bool, tmp_path: Path)
 
 
 def test_a_vehicle_without_a_place_on_the_globe_is_not_put_beside_others(tmp_path: Path) -> None:
-    (tmp_path / "a.tlog").write_bytes(fleet_log(examples.state, 2, drop=("2 GLOBAL_POSITION_INT",)))
+    (tmp_path / "a.tlog").write_bytes(fleet_log(examples.state, 2, drop=("2 GLOBAL_POSITION_INT", "2 GPS_RAW_INT")))
     columns = context_trace(read_logs(tmp_path / "a.tlog"))
     assert np.isnan(columns["x_m"][40:]).all()
     assert not np.isnan(columns["x_m"][:40]).any()

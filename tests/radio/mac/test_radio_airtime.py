@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from sortie.radio.mac import airtime
@@ -32,8 +34,11 @@ def test_fragments(payload_bytes: int, count: int) -> None:
 
 
 def test_wire_bytes_of_a_sample_are_its_fragments_headers() -> None:
-    assert airtime.sample_wire(1000, 1344)[1] == 1000 + 20 + 12 + 16 + 28 + 28 + 38
-    assert airtime.sample_wire(2000, 1344)[1] == 2000 + 2 * (20 + 12 + 16 + 36 + 28 + 38)
+    """A piece that is of use alone has the headers of a sample of its own."""
+    whole, fragment = 20 + 12 + 16 + 28 + 28 + 38, 20 + 12 + 16 + 36 + 28 + 38
+    assert airtime.sample_wire(1000, 1344) == airtime.sample_wire(1000, 1344, alone=True) == (1, 1000 + whole)
+    assert airtime.sample_wire(2000, 1344) == (2, 2000 + 2 * fragment)
+    assert airtime.sample_wire(2000, 1344, alone=True) == (2, 2000 + 2 * whole)
     assert airtime.repair_wire_bytes(40) == 2 * (20 + 16 + 28 + 38) + 32 + 28 + 8
 
 
@@ -42,21 +47,62 @@ def test_control_frames_last_as_the_standard_says() -> None:
     assert pytest.approx(32e-6) == airtime.BLOCK_ACK_S
 
 
-def test_an_ampdu_ends_at_its_number_or_at_5484_us() -> None:
-    assert airtime.ampdu_frames(1494, 600.5, 64) == 64
-    slow = airtime.ampdu_frames(1494, 36.0, 64)
-    assert airtime.ppdu_s(slow * 1498, 36.0) <= 5.484e-3 + 13.6e-6
-    assert airtime.ppdu_s((slow + 1) * 1498, 36.0) > 5.484e-3
-    assert airtime.ampdu_frames(65_000, 8.6, 64) == 1
+N, AX = STANDARDS["n"], STANDARDS["ax"]
 
 
-def test_a_sample_is_cut_into_full_ampdus_and_a_rest() -> None:
-    whole = airtime.sample_exchanges(130 * 1344, 1344, 600.5, 64)
-    assert whole.count == 3
-    frame = 1344 + 20 + 12 + 16 + 36 + 28 + 38 + 4
-    ppdus = 2 * airtime.ppdu_s(64 * frame, 600.5) + airtime.ppdu_s(2 * frame, 600.5)
-    assert whole.ppdu_s == pytest.approx(ppdus)
-    assert whole.clean_s == pytest.approx(ppdus + 3 * (SIFS_S + airtime.BLOCK_ACK_S + DIFS_S + SLOT_S))
+@pytest.mark.parametrize(
+    ("frame", "rate_mbps", "most", "standard", "count"),
+    [
+        # by number: what is asked for, and what the standard's block ack can answer
+        (1494, 600.5, 64, AX, 64),
+        (1494, 600.5, 300, AX, 256),
+        (1494, 390.0, 256, STANDARDS["ac"], 64),
+        # by length, delimiters included: 65,535 B hold 43 frames of 1524 B, and only 42 with 4 B more each
+        (1494, 135.0, 256, N, 43),
+        (1524, 135.0, 256, N, 42),
+        (1520, 135.0, 256, N, 43),
+        # by time: 5,484 µs less the preamble's 44 µs carry 5,848 B at 8.6 Mb/s; without its 44 µs they were 5,895 B
+        (1458, 8.6, 64, AX, 4),
+        (1460, 8.6, 64, AX, 3),
+        (1494, 36.0, 64, AX, 16),
+        # one frame goes, however long it takes
+        (65_000, 8.6, 64, AX, 1),
+    ],
+)
+def test_an_ampdu_ends_at_its_number_its_length_or_at_5484_us(
+    frame: int, rate_mbps: float, most: int, standard: Standard, count: int
+) -> None:
+    assert airtime.ampdu_frames(frame, rate_mbps, most, standard) == count
+
+
+@pytest.mark.parametrize(
+    ("payload_bytes", "fragment_bytes", "alone", "rate_mbps", "most", "ampdus"),
+    [
+        # fragments have 150 B around them, and 4 B of delimiter in an A-MPDU
+        (130 * 1344, 1344, False, 600.5, 64, [64 * 1498, 64 * 1498, 2 * 1498]),
+        (128 * 1344, 1344, False, 600.5, 64, [64 * 1498, 64 * 1498]),
+        # the last, short one rides behind the others, or alone in an A-MPDU of its own
+        (63 * 1344 + 100, 1344, False, 600.5, 64, [63 * 1498 + 254]),
+        (64 * 1344 + 100, 1344, False, 600.5, 64, [64 * 1498, 254]),
+        *[(3 * 1344 + rest, 1344, False, 8.6, 64, [3 * 1498, rest + 154]) for rest in range(1, 60, 3)],
+        *[(1344 + rest, 1344, False, 8.6, 64, [1498 + rest + 154]) for rest in range(1, 60, 3)],
+        # whole samples and pieces that are of use alone have 142 B around them
+        *[(size, 1344, False, 8.6, 64, [size + 146]) for size in range(100, 160, 3)],
+        *[(5 * 500 + rest, 500, True, 8.6, 4, [4 * 646, 646 + rest + 146]) for rest in range(1, 60, 3)],
+        # frames that travel one by one have no delimiter
+        *[(2 * 500 + rest, 500, False, 8.6, 1, [650, 650, rest + 150]) for rest in range(1, 60, 3)],
+    ],
+)
+def test_a_sample_takes_its_ampdus_and_what_lies_between(
+    payload_bytes: int, fragment_bytes: int, alone: bool, rate_mbps: float, most: int, ampdus: list[int]
+) -> None:
+    """Of each A-MPDU its preamble of 44 µs and whole symbols of 13.6 µs for 22 bits and its bytes; then SIFS, ack, DIFS, a slot."""
+    whole = airtime.sample_exchanges(payload_bytes, fragment_bytes, rate_mbps, most, alone=alone)
+    symbols = sum(math.ceil((22 + 8 * size) / (rate_mbps * 13.6)) for size in ampdus)
+    assert whole.count == len(ampdus)
+    assert whole.ppdu_s == pytest.approx(len(ampdus) * 44e-6 + symbols * 13.6e-6, rel=1e-9)
+    between_s = SIFS_S + airtime.BLOCK_ACK_S + DIFS_S + SLOT_S
+    assert whole.clean_s == pytest.approx(whole.ppdu_s + len(ampdus) * between_s, rel=1e-9)
 
 
 def test_tries_and_residual_loss() -> None:
@@ -127,11 +173,8 @@ def test_rates_follow_from_subcarriers_modulation_code_and_symbol(standard: Stan
         assert rates == pytest.approx(exact, abs=0.051)
 
 
-def test_generations_differ_in_preamble_symbol_and_aggregation() -> None:
+def test_generations_differ_in_preamble_and_symbol() -> None:
     n, ac, ax = (STANDARDS[name] for name in ("n", "ac", "ax"))
     assert airtime.ppdu_s(1538, 65.0, n) == pytest.approx(36e-6 + 48 * 4e-6)
     assert airtime.ppdu_s(1538, 65.0, ac) == pytest.approx(40e-6 + 48 * 4e-6)
     assert airtime.ppdu_s(1538, 86.0, ax) == pytest.approx(44e-6 + 11 * 13.6e-6)
-    assert airtime.ampdu_frames(1494, 135.0, 256, n) == 65_535 // 1498
-    assert airtime.ampdu_frames(1494, 390.0, 256, ac) == 64
-    assert airtime.ampdu_frames(1494, 600.5, 256, ax) == 256

@@ -117,11 +117,25 @@ def test_a_lone_sample_takes_its_frames_answers_and_the_time_between() -> None:
     assert b.medium.data_busy_s == pytest.approx(exchange_s(4) + BLOCK_ACK_S, abs=2e-9)
 
 
-def test_a_lone_frame_has_a_plain_ack() -> None:
-    b = Bench(-50.0)
-    b.submit(0, 1)
+@pytest.mark.parametrize("rts", [False, True])
+@pytest.mark.parametrize("window", [64, 256])
+@pytest.mark.parametrize(
+    ("frames", "last", "size"),
+    [(1, 1494, 1500), (1, 197, 204), (4, 200, 3 * 1500 + 204), (4, 1491, 3 * 1500 + 1496), (4, 1493, 4 * 1500)],
+)
+def test_a_sample_has_the_channel_for_its_frames_and_answers(
+    rts: bool, window: int, frames: int, last: int, size: int
+) -> None:
+    """Frames with 4 B of delimiter each, padded to 4 B; an ack of one, a block ack of several, longer where there may be 256."""
+    b = Bench(-50.0, rts=rts, block_ack_window=window)
+    job = b.job(0, frames)
+    job.last_bytes = last
+    b.medium.submit(job)
     b.run(1.0)
-    assert b.medium.transmit_s[1] == pytest.approx(ACK_S, abs=1e-9)
+    answer_s = ACK_S if frames == 1 else BLOCK_ACK_S if window == 64 else 40e-6
+    sent_s = ppdu_s(size, 360.3)
+    assert job.granted_s == pytest.approx(sent_s + SIFS_S + answer_s + rts * 2 * (28e-6 + SIFS_S), abs=2e-9)
+    assert b.medium.transmit_s[:2] == pytest.approx([sent_s + rts * 28e-6, answer_s + rts * 28e-6], abs=2e-9)
 
 
 def test_a_descriptor_on_an_idle_medium_goes_at_once() -> None:

@@ -123,6 +123,23 @@ def test_what_is_not_safe_is_refused_and_said_once() -> None:
     assert texts(shut, 0) == ["Goes: GoTo refused, it would leave the fence"]
 
 
+@pytest.mark.parametrize(("mover", "other"), [(0, 3), (2, 3)])
+def test_a_refusal_names_the_drone_that_is_in_the_way(mover: int, other: int) -> None:
+    """One of four is sent to where another stands. Drone 1 is gone for good, and shifts nobody's number."""
+    settings = (
+        "fleet.drones=4",
+        "fleet.formation={shape: grid, spacing_m: 10}",
+        "fleet.steering.separation_m=9.5",
+        "duration_s=2",
+    )
+    lost = "events=[{kind: drone_lost, at_s: 0, drone: 1}]"
+    x_m, y_m, z_m = states(flown(GOES, params(only=mover, do="Hold"), *settings), "x_m", "y_m", "z_m")[
+        0, other
+    ].tolist()
+    record = flown(GOES, params(only=mover, x_m=x_m, y_m=y_m, z_m=z_m), *settings, lost)
+    assert texts(record, mover)[0] == f"Goes: GoTo refused, it would come too near drone {other}"
+
+
 def test_planners_read_what_their_policies_read(monkeypatch: pytest.MonkeyPatch) -> None:
     from sortie.sim.engine.pilot import plan_for
     from sortie.sim.engine.sortie import fly

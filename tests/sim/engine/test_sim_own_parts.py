@@ -1,9 +1,8 @@
-"""Each drone's own part where a fleet has several: its network counts, shows and detects; mains and meetings of who is there."""
+"""Each drone's own part where a fleet has several: its network counts, shows and detects; mains; headrooms; violations."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from sortie.policies.verification.enforced import Violation
 from sortie.scenarios.schema import Battery
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.mixed import Mixed
-from sortie.sim.engine.separation import Separation
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.record import VIOLATIONS_OF, Recorder
 
@@ -76,22 +74,6 @@ def test_the_mains_lose_nothing_to_a_fault() -> None:
     assert not packs.landed[0]
 
 
-MEET = "fleet.groups=[{drones: [1], formation: {shape: line, altitude_m: 60}, route: {waypoints_m: [[20, 0], [-20, 0]], speed_mps: 8, turn_time_s: 1}}]"
-STILL = ("fleet.drones=2", "duration_s=6", "fleet.route.waypoints_m=[[0, 0]]", "fleet.formation.shape=line", MEET)
-
-
-@pytest.mark.parametrize(("gone", "times"), [("", 1), ("{kind: drone_lost, at_s: 1, drone: 1}", 0)])
-@pytest.mark.parametrize("jitter_m", [0.0, 1.5])
-def test_who_left_the_air_meets_nobody_and_a_pair_meets_once(gone: str, times: int, jitter_m: float) -> None:
-    """Jitter about the separation is no second meeting."""
-    record = run_sortie(
-        example(
-            *STILL, f"events=[{gone}]", f"fleet.motion.pose_jitter_m={jitter_m}", "fleet.motion.pose_jitter_time_s=1.5"
-        )
-    )
-    assert sum(r["kind"] == "too_near" for r in record.tables["events"].to_pylist()) == times
-
-
 def test_a_headroom_is_of_the_time_that_was_flown() -> None:
     """A drone that has flown for less than a second has worked for less: its share is over that time, not over a second."""
     record = run_sortie(
@@ -101,26 +83,6 @@ def test_a_headroom_is_of_the_time_that_was_flown() -> None:
     busy = [1.0 - r["gpu_headroom"] for r in rows]
     assert busy[0] == 0.0
     assert busy[1:] == pytest.approx([0.03 / 0.1] * (len(busy) - 1), rel=0.02)  # a look of 30 ms in every frame
-
-
-def test_a_pair_has_parted_when_it_is_a_fifth_farther_away() -> None:
-    """By hand, metre by metre: nearer than 5 m is a meeting, and another one only after 6 m."""
-    away_m = [9.0, 4.9, 5.1, 5.9, 4.9, 6.1, 5.1, 4.9, 4.0]
-    place = np.zeros((len(away_m), 2, 3))
-    place[:, 1, 0] = away_m
-    told: list[tuple[int, str]] = []
-    world: Any = SimpleNamespace(
-        motion=SimpleNamespace(position_m=place), drones=[SimpleNamespace(airborne=True)] * 2,
-        note=lambda drone, kind, text: told.append((drone, text.partition(",")[0])),
-    )  # fmt: skip
-    watch = Separation(example(*STILL), world)
-    frames = []
-    for frame in range(len(away_m)):
-        before = len(told)
-        watch.check(frame)
-        frames += [frame] * (len(told) - before)
-    assert frames == [1, 7]
-    assert told == [(0, "4.9 m from drone 1")] * 2
 
 
 def test_a_decision_that_breaks_several_lines_is_one_violated_decision() -> None:

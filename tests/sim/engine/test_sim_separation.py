@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
 import pytest
 from sim_examples import example
 
 from sortie.scenarios.reading.load import build
-from sortie.sim.engine.separation import strangers
+from sortie.sim.engine.separation import Separation, strangers
 from sortie.sim.engine.sortie import run_sortie
 
 CALM = "fleet.motion={pose_jitter_m: 0, gust_sigma_mps: 0}"
@@ -60,3 +65,83 @@ def test_a_drone_over_a_ground_station_is_named_and_two_stations_are_not() -> No
 def test_who_may_meet(fleet: dict[str, object], pairs: set[tuple[int, int]]) -> None:
     apart = strangers(build({"name": "a", "fleet": fleet}).fleet)
     assert {(int(a), int(b)) for a, b in zip(*apart.nonzero(), strict=True) if a < b} == pairs
+
+
+SIX = {"drones": 6, "groups": [{"drones": [1]}, {"drones": [2, 5]}], "ground": [{"drone": 3}, {"drone": 4}]}
+"""Drone 0 keeps the fleet's formation, 1 and 2 with 5 those of two groups; 3 and 4 stand on the ground."""
+FAR = 100.0
+
+
+def noted(fleet: dict[str, object], *frames: Sequence[float], down: str = "", descends: str = "") -> list[str]:
+    """What is noted of drones on one line, as `FRAME: DRONE-OTHER DISTANCE`.
+
+    Args:
+        frames: of each, where the drones are. The separation is 5 m.
+        down: `FRAME:DRONE` of each drone that is on the ground in a frame.
+        descends: the drones that go home, which fly until they touch down.
+    """
+    place = np.zeros((len(frames), len(frames[0]), 3))
+    place[:, :, 0] = frames
+    told: list[str] = []
+    frame, drones = 0, [SimpleNamespace(airborne=True) for _ in frames[0]]
+    world: Any = SimpleNamespace(
+        motion=SimpleNamespace(position_m=place), drones=drones, homebound=set(map(int, descends.split())),
+        note=lambda drone, kind, text: told.append(f"{frame}: {drone}-{text.split(',')[0][-1]} {text.split()[0]}"),
+    )  # fmt: skip
+    watch = Separation(build({"name": "by_hand", "fleet": fleet}), world)
+    for frame in range(len(frames)):
+        for number, drone in enumerate(drones):
+            drone.airborne = f"{frame}:{number}" not in down.split()
+        watch.check(frame)
+    return told
+
+
+PAIR = {"drones": 2, "groups": [{"drones": [1]}]}
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "down", "told"),
+    [
+        # nearer than 5 m is a meeting, 5 m are none, and jitter up to 6 m is no second one
+        ([9.0, 5.0, 4.9, 5.1, 5.9, 4.9, 3.0], "", ["2: 0-1 4.9"]),
+        # from 6 m on the pair has parted: the next meeting is another one, as often as it happens
+        ([4.0, 5.9, 4.1, 6.0, 4.2, 9.0, 4.3, 5.0], "", ["0: 0-1 4.0", "4: 0-1 4.2", "6: 0-1 4.3"]),
+        # one that parted needs no wider berth than one that never met
+        ([4.0, 6.1, 5.1, 5.5], "", ["0: 0-1 4.0"]),
+        # either of the two on the ground is no meeting, whichever it is, and both together are none
+        ([4.0] * 4, "0:0 1:1 2:0 2:1", ["3: 0-1 4.0"]),
+        # who takes off again beside another meets it anew
+        ([4.0] * 4, "1:1", ["0: 0-1 4.0", "2: 0-1 4.0"]),
+    ],
+)
+def test_a_meeting_of_two_is_noted_once_by_hand(apart_m: list[float], down: str, told: list[str]) -> None:
+    """Frame by frame."""
+    assert noted(PAIR, *((0.0, x_m) for x_m in apart_m), down=down) == told
+
+
+def test_of_many_that_meet_each_pair_is_noted_once_by_its_lower_number() -> None:
+    """Members of one group and two stations are no pairs. All but the pairs of 2 and 5 and of 3 and 4 meet: 13 of 15."""
+    crowd = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+    every = [
+        f"{a}-{b} {(b - a) / 10:.1f}"
+        for a in range(6)
+        for b in range(a + 1, 6)
+        if (a, b) not in {(2, 5), (3, 4)}
+    ]  # fmt: skip
+    assert noted(SIX, crowd, crowd) == [f"0: {pair}" for pair in every]
+
+
+def test_a_meeting_of_one_pair_hides_none_of_another() -> None:
+    """Drone 1 flies past 0, then past 2, whom it leaves and meets again; 0 keeps drone 3 company all the while."""
+    x_m = [
+        (0.0, 1.0, FAR, 2.0, -FAR, 2 * FAR),
+        (0.0, 97.0, FAR, 2.0, -FAR, 2 * FAR),
+        (0.0, 50.0, FAR, 2.0, -FAR, 2 * FAR),
+    ]
+    told = ["0: 0-1 1.0", "0: 0-3 2.0", "0: 1-3 1.0", "1: 1-2 3.0", "3: 1-2 3.0"]
+    assert noted(SIX, *x_m, x_m[1]) == told
+
+
+def test_a_drone_that_goes_home_meets_others_until_it_touches_down() -> None:
+    assert noted(PAIR, (0.0, 9.0), (0.0, 4.0), descends="1") == ["1: 0-1 4.0"]
+    assert noted(PAIR, (0.0, 9.0), (0.0, 4.0), descends="1", down="1:1") == []

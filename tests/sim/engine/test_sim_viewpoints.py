@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from sim_examples import example
 
 from sortie.fleet.coverage import unpack_grid
 from sortie.fleet.flight.motion import MotionError
+from sortie.fleet.flight.viewpoints import Move
 from sortie.policies.catalogue.baselines import everyone
 from sortie.policies.catalogue.vantage import vantage
 from sortie.policies.contract import (
@@ -24,6 +27,7 @@ from sortie.policies.contract import (
     Reposition,
     looks_from,
 )
+from sortie.sim.engine import choreography
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
@@ -159,6 +163,39 @@ def test_nobody_keeps_clear_of_drones_that_left_the_air() -> None:
     told = [e["text"] for e in record.tables["events"].to_pylist() if e["kind"] == "viewpoint"]
     assert any(text.startswith("moves ") for text in told)
     assert not [text for text in told if re.search(r"too near drone [01]\b", text)]
+
+
+@pytest.mark.parametrize("comes", [True, False])
+def test_a_refused_request_waits_a_second_and_is_written_down_once(
+    comes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By hand, frame by frame: who asks, with whom left out, and what is noted. Drone 3 goes home, and 4 is on the ground: neither
+    asks. What stands in the way is left out where it is gone for good."""
+    joins = "events=[{kind: drone_joins, at_s: 5.5, drone: 4}]" if comes else "events=[]"
+    asked: list[tuple[int, int, list[int]]] = []
+    told: list[tuple[int, int, str]] = []
+    frame = 0
+    world: Any = SimpleNamespace(
+        motion=SimpleNamespace(time_s=np.arange(60) * 0.1), homebound={3}, reroute=lambda motion: None,
+        drones=[SimpleNamespace(airborne=i != 4) for i in range(5)],
+        note=lambda drone, kind, text: told.append((frame, drone, text.partition(",")[0])),
+    )  # fmt: skip
+
+    def answer(drone: int, *_: Any) -> Move | str | None:
+        asked.append((_[4], drone, _[5]))
+        moves = {20: Move(2.0, 1.0, (0.0, 0.0), (3.0, 0.0))}
+        return moves.get(frame, None if 20 < frame < 30 else "would come too near drone 1")
+
+    monkeypatch.setattr(choreography, "grant", answer)
+    monkeypatch.setattr(choreography, "displaced", lambda *_: None)
+    fleet = choreography.Choreography(example(joins), world, posed_by_trace=False)
+    for drone in (2, 3, 4):
+        fleet.request(drone, None)
+    for frame in range(45):
+        fleet.renew(frame)
+    gone: list[int] = [] if comes else [4]
+    assert asked == [(at, 2, gone) for at in (0, 10, *range(20, 31), 40)]
+    assert told == [(0, 2, "stays"), (20, 2, "moves 3.0 m in 1.0 s"), (30, 2, "stays")]
 
 
 def test_a_fleet_in_which_a_trace_flies_holds_its_slots(tmp_path: Path) -> None:

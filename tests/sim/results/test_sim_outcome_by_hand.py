@@ -5,6 +5,7 @@ The rows stand in `record_by_hand`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,9 @@ from record_by_hand import CAR, SCENARIO, record, rows, tables_of
 
 from sortie.scenarios.reading.load import loads
 from sortie.sim.results.outcome import outcome
+from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
+from sortie.sim.results.tracking_outcome import tracking_outcome
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +158,116 @@ def test_a_person_in_the_region_is_known_from_the_decision_of_a_frame_on(x_m: fl
     assert people["unknown_share"] == (pytest.approx(last_s / (2 + last_s)) if is_there else None)
     assert people["unknown_longest_s"] == (last_s if is_there else None)
     assert people["false_alert_share"] == (None if is_there else pytest.approx(2 / (2 + last_s)))
+
+
+def met(*drones: str, more: Sequence[tuple[str, dict[str, Any]]] = ()) -> SortieRecord:
+    """A record of one car at rest, with a letter for each drone and second.
+
+    x: the car and a box of it. m: the car, and no box. f: a box, and no car. -: neither, at a fusion all the same. g: the car
+    about a drone that is gone and does not fuse. A blank: nothing at all.
+
+    Args:
+        more: further rows of tables, of other classes.
+    """
+    given: dict[str, list[dict[str, Any]]] = {"fusions": [], "truths": [], "detections": []}
+    for k in range(max(map(len, drones))):
+        for drone, letters in enumerate(drones):
+            what, row = letters[k : k + 1] or " ", {"t_s": k + 0.5, "drone": drone, "x_m": 0.0, "y_m": 0.0, **CAR}
+            given["fusions"] += [row] * (what in "xmf-")
+            given["truths"] += [{**row, "car": 0}] * (what in "xmg")
+            given["detections"] += [{**row, "score": 0.9}] * (what in "xf")
+    scenario = loads(f"name: met\nduration_s: 60\nfleet: {{drones: {len(drones)}}}\nperception: {{sample_rate_hz: 1}}")
+    tables = tables_of(given)
+    for name in ("truths", "detections"):
+        both = sorted([*given[name], *(row for of, row in more if of == name)], key=lambda r: (r["t_s"], r["drone"]))
+        tables[name] = pa.table(
+            {f.name: pa.array([r[f.name] for r in both], f.type) for f in tables[name].schema}
+            | {"kind": pa.array([r.get("kind", 0) for r in both], pa.int8())}
+        )
+    return record(scenario=scenario, tables=tables)
+
+
+@pytest.mark.parametrize(
+    ("drones", "right", "missed", "false"),
+    [
+        # it is confirmed with the third box, and is a detection from then on
+        (["xxxxx"], 3, 2, 0),
+        # it coasts without a box, and is no detection then, whether the car is there or not
+        (["xxxmxx"], 3, 3, 0),
+        (["xxx-xx"], 3, 2, 0),
+        (["xxxmm"], 1, 4, 0),
+        # three boxes in four seconds are enough, in five they are not, and then it begins anew
+        (["xmxx"], 1, 3, 0),
+        (["xmxmxxx"], 1, 6, 0),
+        # boxes of no car are wrong once there are three of them
+        (["xxxff"], 1, 2, 2),
+        (["ff---xx"], 0, 2, 0),
+        # a drone without a fusion has not looked, and one that is gone misses nothing
+        (["xxxxxxx", "x x x x"], 7, 4, 0),
+        (["xxxx", "xxxg"], 3, 4, 0),
+    ],
+)
+def test_a_track_is_a_detection_when_it_is_confirmed_and_has_a_box(
+    drones: list[str], right: int, missed: int, false: int
+) -> None:
+    """Boxes lie exactly on the car, so DetA is the share of right detections in all cars and detections."""
+    found = tracking_outcome(met(*drones))
+    assert found["det_a"] == pytest.approx(right / (right + missed + false))
+    if len(drones) == 1:  # one track and one car: both parts are equal
+        assert found["ass_a"] == pytest.approx(right / (right + missed + false))
+        assert found["hota"] == pytest.approx(right / (right + missed + false))
+
+
+def test_tracks_of_two_drones_are_two_and_so_are_their_cars() -> None:
+    """Five of seven and two of four: AssA is the mean over all seven."""
+    found = tracking_outcome(met("xxxxxxx", "x x x x"))
+    ass_a = (5 * 5 / 7 + 2 * 2 / 4) / 7
+    assert found == pytest.approx({"det_a": 7 / 11, "ass_a": ass_a, "hota": (7 / 11 * ass_a) ** 0.5})
+
+
+def test_people_have_no_part_in_tracking() -> None:
+    """Neither one who is there and is found, nor one who stands where the car is."""
+    row = {"drone": 0, "y_m": 0.0, "length_m": 4.0, "width_m": 2.0, "yaw_rad": 0.0, "car": 1, "score": 0.9, "kind": 2}
+    more = [
+        (of, {**row, "t_s": k + 0.5, "x_m": x_m})
+        for of in ("truths", "detections")
+        for k in range(5)
+        for x_m in (0.3, 40.0)
+    ]
+    found = tracking_outcome(met("xxxmx", more=more))
+    assert found == pytest.approx({"det_a": 2 / 5, "ass_a": 2 / 5, "hota": 2 / 5})
+
+
+def test_people_are_located_by_boxes_of_people_in_the_region_of_a_drone_that_flies() -> None:
+    """Drone 1 is a ground station: what it knows of people does not count.
+
+    Of three people in drone 0's region two have a box within 2 m after sharing; its own camera found the third alone.
+    """
+    scenario = SCENARIO.replace("fleet: {drones: 2}", "fleet: {drones: 2, ground: [{drone: 1}]}")
+    scenario = scenario.replace("sample_rate_hz: 1}", "sample_rate_hz: 1, people: [{waypoints_m: [[2, 0]]}]}")
+    given = rows()
+    given["people"] = [{"t_s": float(k), "person": 0, "x_m": 2.0, "y_m": 0.0} for k in range(4)]
+    given["alerts"] = [{"t_s": 2.1, "drone": 1, "known": True}]
+    given["sightings"] = [
+        {"t_s": 2.0, "drone": 0, "x_m": -6.0, "y_m": 1.0}, {"t_s": 2.0, "drone": 1, "x_m": 2.0, "y_m": 0.0},
+        {"t_s": 1.0, "drone": 0, "x_m": 2.0, "y_m": 0.0}, {"t_s": 3.0, "drone": 0, "x_m": 2.0, "y_m": 0.0},
+    ]  # fmt: skip
+    tables = tables_of(given)
+    # time, drone, place and class; one is outside the region, one is a car, one is of a drone that is gone, one before the region
+    there = [(2.5, 0, 2.0, 2), (2.5, 0, 9.0, 2), (2.5, 0, -6.0, 2), (2.5, 0, 30.0, 2), (2.5, 0, 5.5, 0)]
+    there += [(2.5, 1, 2.0, 2), (3.5, 1, 2.0, 2), (0.5, 0, 2.0, 2)]
+    found = [(2.5, 0, 2.0, 2), (2.5, 0, 7.1, 2), (2.5, 0, -8.1, 2), (2.5, 0, -6.0, 0), (2.5, 1, 50.0, 2)]
+    for name, each in (("truths", there), ("detections", found)):
+        part = [
+            {"t_s": t_s, "drone": d, "x_m": x_m, "y_m": 0.0, **CAR, "car": k, "score": 0.5, "kind": kind}
+            for k, (t_s, d, x_m, kind) in enumerate(sorted(each))
+        ]
+        schema = {f.name: f.type for f in tables[name].schema} | {"kind": pa.int8()}
+        tables[name] = pa.table({c: pa.array([r[c] for r in part], t) for c, t in schema.items()})
+    people = outcome(record(scenario=loads(scenario), tables=tables))["people"]
+    assert (people["located_share"], people["located_alone_share"]) == pytest.approx((2 / 3, 1 / 3))
+    assert people["in_region_drone_s"] == 2.0
+    assert people["unknown_share"] == 1.0
 
 
 def test_counts_and_ratios(result: dict[str, Any]) -> None:

@@ -40,15 +40,6 @@ def test_it_stands_in_the_outcome() -> None:
     assert 0.0 < value["det_a"] < 1.0
 
 
-def test_a_perfect_detector_keeps_its_cars_apart_from_their_first_two_looks() -> None:
-    """A track is confirmed with its third box, so two of a car's boxes are missed, and none is another car's."""
-    record = flown()
-    truths = record.tables["truths"]
-    value = tracking_outcome(with_table(record, "detections", as_seen(truths)))
-    assert value["det_a"] == pytest.approx(0.88, abs=0.06)
-    assert value["ass_a"] == pytest.approx(value["det_a"], abs=0.06)
-
-
 def test_cars_that_change_places_cost_association_and_no_detection() -> None:
     record = flown()
     truths = record.tables["truths"]
