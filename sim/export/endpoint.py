@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 
 from sortie.fleet.logs.telemetry import KEY_BYTES
@@ -17,6 +18,33 @@ def parse_address(address: str) -> tuple[bool, str, int]:
     if kind not in ("udpout", "udpin") or not host or not port.isdecimal() or not least <= int(port) <= 65_535:
         raise RunError(f"{address!r} is no MAVLink address, must be as udpout:127.0.0.1:14550 or udpin:127.0.0.1:14550")
     return kind == "udpin", host, int(port)
+
+
+def open_address(address: str) -> tuple[socket.socket, tuple[str, int] | None]:
+    """A UDP socket for a MAVLink address, and the peer to send to: None with `udpin`, which waits for one.
+
+    With `udpin` it is bound to HOST. With `udpout` it is bound to the address of this host from which HOST is reached,
+    so that 127.0.0.1 opens no port to other hosts.
+
+    Raises:
+        RunError: an address that is none, is taken, or is not reached.
+    """
+    waits, host, port = parse_address(address)
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        # a name is looked up once, not for every frame
+        where: tuple[str, int] = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4][:2]  # type: ignore[assignment]
+        if waits:
+            opened.bind(where)
+            return opened, None
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect(where)  # sends nothing
+            opened.bind((probe.getsockname()[0], 0))
+        return opened, where
+    except (OSError, UnicodeError) as error:  # the latter of a name that none can be, as a..b
+        opened.close()
+        why = error.strerror if isinstance(error, OSError) else "no name of a host"
+        raise RunError(f"{address}: {why}") from error
 
 
 def read_key(path: Path) -> bytes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 import select
-import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -21,7 +20,7 @@ from sortie.fleet.logs.ground_station import answers, parameter_values, status_t
 from sortie.fleet.logs.mavlink import STATUS, Listener, Transmitter, messages, write_tlog
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
-from sortie.sim.export.endpoint import parse_address
+from sortie.sim.export.endpoint import open_address
 from sortie.sim.export.origin import origin_of
 from sortie.sim.export.telemeter import Telemeter
 from sortie.sim.folders import RunError
@@ -150,7 +149,7 @@ class MavlinkEndpoint:
         key: 32 B with which frames are signed; messages to the endpoint that are not signed with it are ignored.
 
     Raises:
-        RunError: an address that is none, or one that is taken; a pace out of its bounds.
+        RunError: an address that is none, is taken, or is not reached; a pace out of its bounds.
     """
 
     def __init__(
@@ -159,25 +158,16 @@ class MavlinkEndpoint:
     ) -> None:  # fmt: skip
         if pace is not None and not 1e-3 <= pace <= 1e3:
             raise RunError(f"pace is {pace:g}, must be 0.001 to 1000, or 0 for as fast as possible")
-        self._waits, host, port = parse_address(address)
         self._pace, self._origin, self._key, self._clock = pace, origin, key, clock
         self._stream: Stream | None = None
         self._listener = Listener(key)
         self._begin_s = 0.0
         self._datagram = b""
-        self._peer: Any = None
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            if self._waits:
-                self._socket.bind((host, port))
-            else:  # a name is looked up once, not for every frame
-                self._peer = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4][:2]
-            self._socket.setblocking(False)
-            self.address = self._socket.getsockname()
-        except (OSError, UnicodeError) as error:  # the latter of a name that none can be, as a..b
-            self._socket.close()
-            why = error.strerror if isinstance(error, OSError) else "no name of a host"
-            raise RunError(f"{address}: {why}") from error
+        self._peer: Any  # where it sends; None until a ground station has spoken
+        self._socket, self._peer = open_address(address)
+        self._waits = self._peer is None
+        self._socket.setblocking(False)
+        self.address = self._socket.getsockname()
 
     def begin(self, scenario: Scenario, scene: SceneModel) -> None:
         """Start the clock."""

@@ -13,6 +13,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
 from sortie.sim.export.topics import Topic, TopicKind
+from sortie.sim.live.loopback import on_loopback
 from sortie.sim.live.messages import dds_type
 from sortie.sim.live.transport import MAX_DEPTH
 
@@ -105,7 +106,7 @@ class Bus:
 def _domain(number: int) -> Domain | None:
     """The domain on loopback; None if this process has joined it already."""
     try:
-        return Domain(number, LOOPBACK)
+        return on_loopback(lambda: Domain(number, LOOPBACK))
     except DDSException as error:
         if error.code != DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:
             raise

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +19,7 @@ from sortie.fleet.plane import PlaneRules
 from sortie.fleet.senses import Sensed
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Disc, TaskPhase
-from sortie.sim.export.endpoint import parse_address
+from sortie.sim.export.endpoint import open_address
 from sortie.sim.folders import RunError
 from sortie.sim.live.context import ReplaySenses
 
@@ -42,24 +41,16 @@ class MavlinkLink:
                 vehicle is signed.
 
         Raises:
-            RunError: an address that is none, or one that is taken.
+            RunError: an address that is none, is taken, or is not reached.
         """
         # pymavlink is loaded for a drone with a vehicle alone
         from sortie.fleet.logs.mavlink import Companion, Listener
 
-        waits, host, port = parse_address(address)
         self.address, self._origin = address, origin
         self.state = VehicleState()
         self._listener, self._companion = Listener(key), Companion(key)
-        self._peer: tuple[str, int] | None = None if waits else (host, port)
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            if waits:
-                self._socket.bind((host, port))
-            self._socket.settimeout(0.2)
-        except (OSError, UnicodeError) as error:
-            self._socket.close()
-            raise RunError(f"{address}: {error}") from error
+        self._socket, self._peer = open_address(address)
+        self._socket.settimeout(0.2)
         self.port = self._socket.getsockname()[1]
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read, daemon=True)

@@ -152,9 +152,6 @@ def fly_live(
             while not (stop.is_set() or all(d.over for d in flown)):
                 now_s = begin_s + time.monotonic() - go.monotonic_s
                 t_s = min(end_s, now_s)
-                if now_s > end_s + LAST_REPORT_S:
-                    lost += _hanging(flown, fleet, begin_s)
-                    break
                 if kill is not None and t_s >= kill[1]:
                     _kill(next(d.process for d in flown if d.orders.drone == kill[0]))
                     kill = None
@@ -162,6 +159,9 @@ def fly_live(
                 bench.take()
                 _collect(flown, fleet, lost, t_s)
                 report_progress("in the air", t_s - begin_s, end_s - begin_s)
+                if now_s > end_s + LAST_REPORT_S:
+                    lost += _hanging(flown, fleet, begin_s)
+                    break
         interrupted = stop.is_set()
         if interrupted:
             _request_stop(flown)

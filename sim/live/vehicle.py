@@ -6,7 +6,6 @@ python -m sortie.sim.live.vehicle udpout:127.0.0.1:14550 --system 1
 from __future__ import annotations
 
 import math
-import socket
 import threading
 import time
 from pathlib import Path
@@ -17,8 +16,9 @@ import typer
 from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.logs.mavlink import STATUS, Transmitter, messages
 from sortie.fleet.logs.telemetry import Telemetry
-from sortie.sim.export.endpoint import parse_address
+from sortie.sim.export.endpoint import open_address
 from sortie.sim.export.origin import ORIGIN
+from sortie.sim.folders import RunError
 from sortie.sim.live.seals import read_own_key
 
 TELEMETRY_HZ = 20.0
@@ -49,10 +49,12 @@ class CirclingVehicle:
 
     def __init__(self, address: str, system: int = 1, origin: Origin = ORIGIN, key: bytes | None = None) -> None:
         """Args: `address` is `udpout:HOST:PORT`; with a `key` of 32 B its messages are signed."""
-        _, host, port = parse_address(address)
-        self._to, self._origin = (host, port), origin
+        self._origin = origin
         self._transmitter = Transmitter(system - 1, key, time.time_ns() // 1000)
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket, self._to = open_address(address)
+        if self._to is None:
+            self._socket.close()
+            raise RunError(f"{address}: must be udpout:HOST:PORT")
         self._began_s = time.monotonic()
         self._paused, self._stop = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._fly, daemon=True)
@@ -77,7 +79,7 @@ class CirclingVehicle:
                 continue
             for message in messages(state, self._origin):
                 if status or message.get_type() not in STATUS:
-                    self._socket.sendto(self._transmitter.pack(message), self._to)
+                    self._socket.sendto(self._transmitter.pack(message), self._to)  # type: ignore[arg-type]
 
 
 def main(

@@ -24,7 +24,7 @@ HANGS_S = 1.0
 """A policy that has not answered for this long is killed: after as long, a silent peer is detached."""
 RESTART_S = 1.0
 """The shortest time from one start of the process to the next."""
-LOAD_S = 60.0
+LOAD_S = 300.0
 """The longest time for a policy to load."""
 _EXIT_S = 2.0
 

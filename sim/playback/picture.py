@@ -7,7 +7,6 @@ viewer paints, and pixels differ from run to run: two pictures in a row that are
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import tempfile
 import time
@@ -18,14 +17,14 @@ from typing import TYPE_CHECKING
 
 from sortie.sim.folders import RunError
 from sortie.sim.playback.canvas import SIM_TIME
-from sortie.sim.playback.viewer import end, listens, viewer_binary
+from sortie.sim.playback.viewer import end, port_of, viewer_binary
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
 
 SIZE = (1920, 1080)
 _DRIVER = "it needs a Vulkan driver that renders on the CPU (Debian, Ubuntu: apt install mesa-vulkan-drivers)"
-PATIENCE_S = 120.0
+PATIENCE_S = 600.0
 """How long the viewer may take to load the recording and to paint it."""
 
 
@@ -42,17 +41,15 @@ def take_picture(recording: Path, picture: Path, at_s: float, *, size: tuple[int
         raise RunError(f"{recording}: no recording there")
     if not picture.absolute().parent.is_dir():
         raise RunError(f"{picture}: its folder does not exist")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
     command = [
-        viewer_binary(), "--headless", "--bind", "127.0.0.1", "--port", str(port),
+        viewer_binary(), "--headless", "--bind", "127.0.0.1", "--port", "0",
         "--window-size", f"{size[0]}x{size[1]}", str(recording.absolute()),
     ]  # fmt: skip
     with tempfile.TemporaryFile() as said:
         viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True)  # noqa: S603
         try:
-            if not listens(port, viewer):
+            port = port_of(viewer)
+            if port is None:
                 raise RuntimeError(f"it does not come up; {_DRIVER}")
             return _ask(port, picture, at_s)
         except (RuntimeError, TimeoutError, ConnectionError) as error:

@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -15,6 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+import psutil
 import pyarrow as pa
 import rerun as rr
 
@@ -26,8 +26,8 @@ from sortie.sim.playback.recording import APPLICATION, Playback
 
 Sink = Callable[[rr.RecordingStream, Scenario], None]
 """Connects a new recording to where it goes, with the layout for the scenario."""
-START_TIMEOUT_S = 15.0
-"""How long a viewer may take until it listens."""
+START_TIMEOUT_S = 300.0
+"""How long a viewer may take until it listens: a busy machine takes minutes."""
 
 
 class LiveViewer:
@@ -90,17 +90,14 @@ def to_new_viewer(recording: rr.RecordingStream, scenario: Scenario) -> None:
     """
     binary = viewer_binary()
     _need_display("--live needs one; fly without it and see the recording elsewhere")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [binary, "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
+    command = [binary, "--bind", "127.0.0.1", "--port", "0", "--hide-welcome-screen"]
     with tempfile.TemporaryFile() as said:
         try:
             viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True)  # noqa: S603
         except OSError as error:
             raise RunError(f"{binary}: the viewer cannot be started: {error.strerror}") from error
-        up = listens(port, viewer)
-        if viewer.poll() is not None or not up:
+        port = port_of(viewer)
+        if viewer.poll() is not None or port is None:
             end(viewer)
             said.seek(0)
             raise RunError(f"{binary}: the viewer does not come up: {_last_line(said.read())}")
@@ -112,17 +109,27 @@ def to_file(path: Path) -> Sink:
     return lambda recording, scenario: recording.save(path, default_blueprint=blueprint(scenario))
 
 
-def listens(port: int, viewer: subprocess.Popen[bytes]) -> bool:
-    """Wait until the viewer takes connections, and half a second more, in which one without a window dies."""
+def port_of(viewer: subprocess.Popen[bytes]) -> int | None:
+    """The port that the system gave a viewer, once it listens; None if it ends before.
+
+    It waits half a second more, in which a viewer without a window dies.
+    """
     until = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < until and viewer.poll() is None:
-        with socket.socket() as attempt:
-            attempt.settimeout(0.2)
-            if attempt.connect_ex(("127.0.0.1", port)) == 0:
+        for found in psutil.net_connections("tcp4"):
+            # the command is a script, and the viewer its child in the same session
+            if found.status == psutil.CONN_LISTEN and found.pid is not None and _session_of(found.pid) == viewer.pid:
                 time.sleep(0.5)
-                return True
+                return int(found.laddr.port)
         time.sleep(0.1)
-    return False
+    return None
+
+
+def _session_of(pid: int) -> int | None:
+    try:
+        return os.getsid(pid)
+    except ProcessLookupError:
+        return None
 
 
 def end(viewer: subprocess.Popen[bytes]) -> None:

@@ -1,12 +1,13 @@
 """A DDS peer of its own making: types written by hand as rosidl makes them, this project not imported.
 
-    python dds_peer.py DOMAIN FRAMES
+    python dds_peer.py DOMAIN
 
-Joins as drone 9: publishes FRAMES contexts at 10 Hz and one that cannot be, listens on, and when the fleet has been
-silent for a while prints what it heard as one JSON object.
+Joins as drone 9: publishes contexts at 10 Hz, and some that cannot be, until it has received five payloads. It listens
+on until its input ends, and prints what it heard as one JSON object.
 """
 
 import json
+import select
 import sys
 import time
 from collections import Counter
@@ -111,8 +112,7 @@ def say(text: str) -> None:
 
 
 def main() -> None:
-    domain, frames = int(sys.argv[1]), int(sys.argv[2])
-    me = DomainParticipant(domain)
+    me = DomainParticipant(int(sys.argv[1]))
     fleet = Topic(me, "rt/fleet/context", Context)
     speak, hear = DataWriter(me, fleet, qos=BEST_EFFORT), DataReader(me, fleet, qos=BEST_EFFORT)
     orders = DataReader(me, Topic(me, f"rt/drone_0/to_drone_{ME}/directive", Directive), qos=RELIABLE)
@@ -121,22 +121,19 @@ def main() -> None:
     last: dict[int, Context] = {}
     directives: list[Directive] = []
     sizes: list[int] = []
-    told, patient_until_s = 0, time.monotonic() + 120
     say("listening")
-    while time.monotonic() < patient_until_s:
+    over = False
+    while not over:
+        over = bool(select.select([sys.stdin], [], [], 0.1)[0])
         for c in hear.take(50):
             if isinstance(c, Context) and c.agent_id != ME and c.agent_id != 255:
                 contexts[c.agent_id] += 1
                 last[c.agent_id] = c
-                patient_until_s = time.monotonic() + 1.5
         directives += [d for d in orders.take(50) if isinstance(d, Directive)]
         sizes += [len(p.data) for p in payloads.take(50) if isinstance(p, Bytes)]
-        if last and told < frames:
-            told += 1
+        if last and len(sizes) < 5:
             speak.write(context(ME, time.time_ns()))
-            if told == frames:
-                speak.write(context(255, time.time_ns()))  # no drone has this number
-        time.sleep(0.1)
+            speak.write(context(255, time.time_ns()))  # no drone has this number
     heard = {
         "contexts": contexts,
         "last": {i: {k: list(v) if k == "coverage_grid" else v for k, v in asdict(c).items()} for i, c in last.items()},

@@ -17,7 +17,7 @@ def main(port: int, drones: int) -> None:
     sdk.add_any_connection(f"udpin://127.0.0.1:{port}")
     say("ready")
     known: dict[int, Telemetry] = {}
-    until_s = time.monotonic() + 60
+    until_s = time.monotonic() + 600
     while time.monotonic() < until_s:
         for system in sdk.get_systems():
             if system.get_system_id() not in known:

@@ -505,7 +505,7 @@ def test_a_late_function_is_not_called_again_within_a_watch_of_the_same_thread(t
     with watched(0.25, "a while"):
         with pytest.raises(TookTooLongError):
             resolve("power", name)()
-        with watched(5.0), pytest.raises(TookTooLongError, match="a while"):
+        with watched(600.0), pytest.raises(TookTooLongError, match="a while"):
             resolve("power", name)()
 
 
@@ -517,7 +517,7 @@ def test_a_call_within_a_call_is_one_call() -> None:
         inner()
         return Path.cwd()
 
-    with watched(60.0):
+    with watched(600.0):
         assert Guarded(outer)() == Path("/")
         assert Path.cwd() == here
 

@@ -19,7 +19,7 @@ from places import ROOT
 
 SITE = ROOT / "build" / "site"
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-PATIENCE_S = 300
+PATIENCE_S = 600
 
 pytestmark = [
     pytest.mark.slow,

@@ -127,7 +127,7 @@ def test_the_slurm_recipe_flies_the_same_rows_by_local_jobs(
     p, out = plan(tmp_path), tmp_path / "joined"
     run_campaign(p, tmp_path / "alone", InProcess())
     command = [sys.executable, "-c", BY_LOCAL_JOBS, str(RECIPES), str(tmp_path / "small_ones.yaml"), str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["2 workers"]), done.stderr
     assert table_bytes(out) == table_bytes(tmp_path / "alone")
     assert (out / "report.md").is_file()

@@ -346,7 +346,7 @@ def test_sigkill_of_the_driver_at_any_moment_leaves_no_trace(tmp_path: Path) -> 
     command = [sys.executable, "-c", DRIVER, str(campaign)]
     for kill in range(3):
         driver = subprocess.Popen([*command, str(folder)], stdout=subprocess.DEVNULL)
-        deadline = time.monotonic() + 300
+        deadline = time.monotonic() + 600
         while rows_on_disk(folder) < 9 * (kill + 1):
             assert driver.poll() is None
             assert time.monotonic() < deadline

@@ -76,7 +76,7 @@ def command(folder: Path, policy: str) -> list[str]:
 def test_the_exit_code_is_the_commands(tmp_path: Path, policy: str, code: int, line: str) -> None:
     (tmp_path / "numpy.py").write_text("raise SystemExit(7)")  # beside the call, as anybody may have one
     script = [str(Path(sys.executable).with_name("sortie")), *command(tmp_path, policy)[3:]]
-    done = subprocess.run(script, capture_output=True, text=True, check=False, timeout=120, cwd=tmp_path)
+    done = subprocess.run(script, capture_output=True, text=True, check=False, timeout=600, cwd=tmp_path)
     assert (done.returncode, line in done.stderr) == (code, True), done.stderr
 
 
@@ -90,5 +90,5 @@ def test_a_signal_to_the_command_ends_what_it_runs(tmp_path: Path, sent: signal.
     assert started.stdout.readline() == "decides\n"
     time.sleep(0.1)
     started.send_signal(sent)
-    started.communicate(timeout=60)
+    started.communicate(timeout=600)
     assert started.returncode == code

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import namedtuple
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -142,6 +143,7 @@ def test_a_fast_flight_is_measured_for_some_seconds_and_a_short_one_is_not_told_
 def test_fly_and_check_tell_how_long_they_take(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(module, "LONG_S", 0.0)
     monkeypatch.setattr(module, "MEASURED_WALL_S", 0.0)
+    monkeypatch.setitem(module.Forecast.__init__.__kwdefaults__, "clock", count(0.0, 0.01).__next__)  # type: ignore[index]
     monkeypatch.chdir(tmp_path)
     short = ["track_target", "--set", "duration_s=3", "--set", "perception.detector=none"]
     flown = CliRunner().invoke(app, ["fly", *short, "--no-recording", "--out", "run"])

@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import dds_peer
+import live_flights
 import pytest
 from dds_domains import domain
+from live_flights import LONGEST_S, PATIENT, Seen, ending_when, fly_until
 from missing_libraries import path_without
 from places import ROOT
 from sim_examples import BASE, example
@@ -82,10 +84,10 @@ def test_a_writer_s_farewell_is_no_sample_and_no_error() -> None:
     while not writer.listeners:
         time.sleep(0.01)
     writer.write(pack_bytes(b"abc"))
-    assert bus.wait(10.0)
+    assert bus.wait(600.0)
     assert [unpack_bytes(cdr) for cdr in reader.take()] == [b"abc"]
     del writer  # its participant goes with it, and tells so
-    assert bus.wait(10.0)
+    assert bus.wait(600.0)
     assert reader.take() == []
 
 
@@ -97,7 +99,7 @@ def test_a_reader_that_is_found_while_they_are_counted_breaks_nothing(monkeypatc
     monkeypatch.setattr(type(writer._writer), "_get_matched_subscriptions", lambda *_: next(said))
     assert writer.listeners == 0
     readers = [Bus(domain(__name__)).reader(topic, 1) for _ in range(2)]
-    until_s = time.monotonic() + 10.0
+    until_s = time.monotonic() + 600.0
     while writer.listeners < len(readers) and time.monotonic() < until_s:
         time.sleep(0.01)
     assert writer.listeners == len(readers)
@@ -206,21 +208,36 @@ class Flown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def flown() -> Flown:
-    """Three drones for five seconds; number 2 is killed at 2.5 s, and a peer of its own making says 10 contexts."""
+    """Three drones and a peer of its own making, which falls silent; number 2 is killed at 8 s. It ends when all have noticed."""
     environment = {**os.environ, "CYCLONEDDS_URI": LOOPBACK}
-    command = [sys.executable, str(Path(dds_peer.__file__)), str(domain(__name__)), "10"]
+    command = [sys.executable, str(Path(dds_peer.__file__)), str(domain(__name__))]
     pids: dict[int, int] = {}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as peer:
+
+    def noticed(seen: Seen) -> bool:
+        return all(
+            seen.healths(drone, gone)[-1:] == [LinkHealth.DETACHED]
+            and seen.carried(drone, gone)[-1:] == ["none"]
+            and "features" in seen.carried(drone, 1 - drone)
+            and "descriptor malformed" in (report := seen.last(drone)).refused  # type: ignore[union-attr]
+            and report.published > seen.last(2).published  # type: ignore[union-attr]
+            for drone in (0, 1)
+            for gone in (2, dds_peer.ME)
+        )
+
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as peer:
         try:
             assert peer.stdout is not None
             assert peer.stdout.readline() == "listening\n"
-            scenario = example(
+            result = fly_until(
+                noticed,
                 "fleet.drones=3",
                 "context.authentication=false",
                 "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}",
+                kill=(2, 8.0),
+                domain=domain(__name__),
+                begun=pids.update,
             )
-            result = fly_live(scenario, duration_s=5.0, kill=(2, 2.5), domain=domain(__name__), begun=pids.update)
-            told, _ = peer.communicate(timeout=60)
+            told, _ = peer.communicate(timeout=600)
         finally:
             peer.kill()
     return Flown(result, json.loads(told), pids)
@@ -246,15 +263,14 @@ def test_the_fleet_shares_with_a_peer_that_was_on_no_roster(flown: Flown) -> Non
     assert orders[-1]["representation"] == Representation.NONE  # it fell silent and was detached
     shared = [o for o in orders if o["representation"] == Representation.FEATURES]
     assert {round(o["rho"], 6) for o in shared} == {0.03125}
-    assert len(set(flown.peer["payload_bytes"])) == 1
-    assert 128 * 160 < flown.peer["payload_bytes"][0] < 129 * 160 + 600
+    assert 128 * 160 < min(flown.peer["payload_bytes"]) < 129 * 160 + 600
 
 
 def test_what_cannot_be_a_drone_is_refused(flown: Flown) -> None:
     for drone in flown.result.each:
         if drone.drone != 2:
             refused = {why: n for why, n in drone.refused.items() if why != "payload late"}  # a busy host is late
-            assert refused == {"descriptor malformed": 1}
+            assert list(refused) == ["descriptor malformed"]
 
 
 def test_a_killed_process_is_noticed_by_age_and_the_others_fly_on(flown: Flown) -> None:
@@ -274,7 +290,6 @@ def test_a_killed_process_is_noticed_by_age_and_the_others_fly_on(flown: Flown) 
         other = [o for o in result.orders if (o.drone, o.peer) == (drone, 1 - drone)]
         assert "features" in {o.representation for o in other}
     assert [d.drone for d in result.each] == [0, 1, 2]
-    assert result.each[0].published > result.each[2].published
     assert "drone 2: its process was killed by SIGKILL" in describe_changes(result)[0]
 
 
@@ -289,9 +304,8 @@ def test_the_bench_counts_every_topic(flown: Flown) -> None:
     result = flown.result
     by_kind = dict(zip(TopicKind, result.topics, strict=True))
     assert by_kind[TopicKind.CONTEXT].type == DESCRIPTOR_NAME
-    to_three = flown.peer["payload_bytes"][
-        0
-    ]  # what all-4 sends while three peers share its budget; of fewer each gets more
+    # what all-4 sends while three peers share its budget; of fewer each gets more
+    to_three = min(flown.peer["payload_bytes"])
     assert to_three - 1 <= by_kind[TopicKind.FEATURES].mean_bytes <= 3 * to_three
     assert by_kind[TopicKind.DIRECTIVE].mean_bytes == 36
     assert result.data_bytes_per_s > 0
@@ -312,12 +326,17 @@ def test_the_bench_counts_every_topic(flown: Flown) -> None:
 def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", path_without(tmp_path, "pymavlink"))  # no drone has a vehicle
     scenario, told = tmp_path / "s.yaml", tmp_path / "told" / "live.json"
-    scenario.write_text(BASE)
-    done = CliRunner().invoke(
-        app,
-        ["live", str(scenario), "--set", "fleet.drones=2", "--policy", "all-4(received_budget=0.02)", "--duration", "2", "--begin", "1",
-         "--loss", "0.5", "--domain", str(domain(__name__)), "--out", str(told)],
-    )  # fmt: skip
+    scenario.write_text(BASE.replace("duration_s: 6", f"duration_s: {LONGEST_S:g}"))
+    command = [
+        "live", str(scenario), "--set", "fleet.drones=2", "--set", PATIENT, "--policy", "all-4(received_budget=0.02)",
+        "--begin", "1", "--loss", "0.5", "--domain", str(domain(__name__)), "--out", str(told),
+    ]  # fmt: skip
+
+    def heard(seen: Seen) -> bool:
+        return all((r := seen.last(drone)) is not None and r.heard > 5 < r.lost for drone in (0, 1))
+
+    with ending_when(heard):
+        done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
     assert "50% of descriptors lost" in done.output
     assert "10.1 kB/s" in done.output
@@ -329,29 +348,25 @@ def test_half_the_context_lost_is_drawn_by_link_and_told(tmp_path: Path, monkeyp
     assert {row["health"] for row in result["health"]} >= {"fresh"}
 
 
-def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost_leaves_everybody_alone() -> None:
+def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost_leaves_everybody_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     pids: dict[int, int] = {}
+    took_over = "all-4 → best-2(received_budget=0.05): time 0.3 s"
+    changing = "policy={name: all-4, dwell_s: 0, changes: [{at_s: 0.3, name: best-2, params: {received_budget: 0.05}}]}"
 
-    def interrupt(begun: dict[int, int]) -> None:
-        pids.update(begun)
-        signal.setitimer(signal.ITIMER_REAL, 1.0)
+    def changed(seen: Seen) -> bool:
+        return all((r := seen.last(i)) is not None and r.lost > 0 and seen.notices(i) == [took_over] for i in (0, 1))
 
-    before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
-    try:
-        changing = (
-            "policy={name: all-4, dwell_s: 0, changes: [{at_s: 0.3, name: best-2, params: {received_budget: 0.05}}]}"
-        )
-        scenario = example("fleet.drones=2", changing)
-        result = fly_live(scenario, loss=1.0, domain=domain(__name__), begun=interrupt)
-    finally:
-        signal.signal(signal.SIGALRM, before)
+    # in place of asking the processes to stop, as the helper does
+    monkeypatch.setattr(live_flights, "stop", lambda _: signal.raise_signal(signal.SIGINT))
+    result = fly_until(changed, "fleet.drones=2", changing, loss=1.0, domain=domain(__name__), begun=pids.update)
     assert result.interrupted
-    assert result.flown_s < 6
+    assert result.flown_s < LONGEST_S
     assert result.lost == []
     assert [d.heard for d in result.each] == [0, 0]
     assert all(d.published > 0 and d.dropped_by_loss > 0 for d in result.each)
     assert (result.data_bytes_per_s, result.context_share, result.health) == (0, None, [])
-    took_over = "all-4 → best-2(received_budget=0.05): time 0.3 s"
     assert sorted((n.drone, n.text) for n in result.notices) == [(0, took_over), (1, took_over)]
     for pid in pids.values():
         with pytest.raises(ProcessLookupError):

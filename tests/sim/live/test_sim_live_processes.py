@@ -45,7 +45,6 @@ def fly(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
         monkeypatch.setattr(session, "traces", lambda scenario, progress: [None] * scenario.fleet.drones)
         monkeypatch.setattr(session, "summarise", lambda *of, **more: more)
         monkeypatch.setattr(session, "LAST_REPORT_S", 0.3)
-        monkeypatch.setattr(session, "CONNECT_S", 0.5)
         found = fly_live(example(f"fleet.drones={len(sent)}"), duration_s=0.2, **options)
         assert isinstance(found, dict)
         return {**found, "orders": orders_of}
