@@ -16,7 +16,8 @@ One row a drone and time, CSV or Parquet. Names, units and frames are those of t
     rssi_dbm, rssi_percent    what the drone's radio heard; kept for people, nothing reads it
 
 Latitudes and longitudes become ENU on the plane that touches the ellipsoid at `fleet.origin`, and altitudes heights above
-it. A ground station may be among the drones: one row with its place is enough (`fleet.ground`).
+it. They have the bounds of `x_m`, `y_m` and `z_m`. A ground station may be among the drones: one row with its place is
+enough (`fleet.ground`).
 
 Time and gaps follow the rules of all traces (scenarios/traces.py); attitudes run on the shorter arc. Before the first and
 after the last place a drone stands there, without velocity. A drone without a pose or a charge keeps its model there.
@@ -38,7 +39,7 @@ from sortie.fleet.flight.frames import swap_attitude, tangent_plane_m, yaw_rad
 from sortie.fleet.flight.motion import Trajectories, body_rates, fly
 from sortie.scenarios import scratch
 from sortie.scenarios.schema import Fleet, Origin
-from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
+from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_drones, check_increasing, first_row, read_columns
 
 Array = npt.NDArray[np.float64]
 
@@ -94,13 +95,13 @@ def read_traces(path: str | Path, drones: int, origin: Origin | None = None) -> 
     """Read a trace.
 
     Args:
-        path: *.csv, or anything else as Parquet.
+        path: as `sortie.scenarios.tables.read_table`.
         drones: drones of the fleet; a trace of another is refused.
         origin: where on the globe ENU (0, 0, 0) lies; None: at the first place, at the lowest altitude.
 
     Raises:
         TraceError: no such file, no table, a column missing or unknown, a value out of bounds, time that does not
-            increase, a charge that rises.
+            increase, a charge that rises, a place too far from the others; or nothing would be flown.
     """
     path = Path(path)
     columns = read_columns(path, BOUNDS)
@@ -113,17 +114,21 @@ def read_traces(path: str | Path, drones: int, origin: Origin | None = None) -> 
         both = [name for name in (*some, *others) if name in columns]
         if set(both) & set(some) and set(both) & set(others):
             raise TraceError(f"{path}: columns {' and '.join(both)} say the same, must be one of them")
-    columns = _placed(columns, origin)
+    columns = _placed(path, columns, origin)
     who = columns.get("drone", np.zeros(len(columns["t_s"])))
-    check_whole(path, "drone", who)
+    check_drones(path, "drone", who, drones)
     traces = {}
     for drone in np.unique(who).astype(int).tolist():
-        if drone >= drones:
-            raise TraceError(f"{path}: drone {drone}, must be below fleet.drones = {drones}")
         rows = np.flatnonzero(who == drone)
         check_increasing(path, columns["t_s"], rows, f"drone {drone}")
         own = {name: values[rows] for name, values in columns.items()}
-        traces[drone] = DroneTrace(_pose(own), _battery(own, f"{path}: drone {drone}"))
+        _check_charge(path, drone, rows, columns)
+        traces[drone] = DroneTrace(_pose(own), _battery(own))
+    if all(trace.pose is None and trace.battery is None for trace in traces.values()):
+        place = f"{', '.join(POSITION)} or {', '.join(GLOBE)}"
+        raise TraceError(
+            f"{path}: no row has a place ({place}) or a charge (soc), so nothing of the trace would be flown"
+        )
     return traces
 
 
@@ -196,14 +201,19 @@ def follow(motion: Trajectories, traces: Mapping[int, DroneTrace], frame_s: floa
 # --- reading -------------------------------------------------------------------------------------
 
 
-def _placed(columns: Mapping[str, Array], origin: Origin | None) -> dict[str, Array]:
-    """The columns with places on the globe and compass headings as ENU and as attitudes."""
+def _placed(path: Path, columns: Mapping[str, Array], origin: Origin | None) -> dict[str, Array]:
+    """The columns with places on the globe and compass headings as ENU and as attitudes.
+
+    Raises:
+        TraceError: a place that in ENU is out of the bounds of `POSITION`.
+    """
     placed = dict(columns)
     if GLOBE[0] in columns:
         fixes = _stack(columns, GLOBE)
         zero = _zero(fixes) if origin is None else tuple(origin.model_dump().values())
         if zero is not None and not np.isnan(fixes).any(axis=-1).all():
             metres = tangent_plane_m(fixes, zero)
+            _check_near(path, fixes, metres, origin)
             metres[:, 2] = fixes[:, 2] - zero[2]  # the ground is level in the simulator
             placed |= dict(zip(POSITION, metres.T, strict=True))
     if "heading_deg" in columns:
@@ -216,6 +226,26 @@ def _placed(columns: Mapping[str, Array], origin: Origin | None) -> dict[str, Ar
             attitude[known] = swap_attitude(Rotation.from_euler("ZYX", turns, degrees=True).as_quat())
         placed |= dict(zip(ATTITUDE, attitude.T, strict=True))
     return placed
+
+
+def _check_near(path: Path, fixes: Array, metres: Array, origin: Origin | None) -> None:
+    """Refuse places on the globe beyond the bounds of `POSITION`; `metres` is ENU with the earth's curvature."""
+    most_m = BOUNDS[POSITION[0]][1]
+    far = (np.abs(metres) > most_m).any(axis=-1)
+    if not far.any():
+        return
+    unset = (fixes[:, :2] == 0.0).all(axis=-1)  # what receivers report before they have a fix
+    if origin is None:
+        off_m = np.linalg.norm(metres - np.nanmedian(metres, axis=0), axis=-1)
+        far = unset if unset.any() else off_m == np.nanmax(off_m)
+    row = first_row(far)
+    others = np.zeros(3) if origin is not None else metres
+    away_km = np.nanmax(np.linalg.norm(metres[row - 1] - others, axis=-1)) / 1e3
+    raise TraceError(
+        f"{path}: lat_deg and lon_deg in row {row} are {fixes[row - 1, 0]:g} and {fixes[row - 1, 1]:g}, {away_km:,.0f} km "
+        f"from {'another place' if origin is None else 'fleet.origin'}, must be within {most_m / 1e3:g} km"
+        + ("; leave cells empty where a receiver had no fix" if unset[row - 1] else "")
+    )
 
 
 def _zero(fixes: Array) -> tuple[float, ...] | None:
@@ -252,21 +282,26 @@ def _pose(own: Mapping[str, Array]) -> PoseTrace | None:
     return PoseTrace(t_s, position[there], orientation, velocity)
 
 
-def _battery(own: Mapping[str, Array], where: str) -> BatteryTrace | None:
+def _check_charge(path: Path, drone: int, rows: npt.NDArray[np.intp], columns: Mapping[str, Array]) -> None:
+    """Refuse a charge of a drone that rises by more than rounding; `rows` are the drone's."""
+    known = rows[~np.isnan(columns["soc"][rows])] if "soc" in columns else rows[:0]
+    soc = columns.get("soc", np.zeros(0))[known]
+    rises = np.diff(soc) > ROUNDING
+    if rises.any():
+        at = first_row(rises)
+        raise TraceError(
+            f"{path}: soc in row {known[at] + 1} of drone {drone} rises from {soc[at - 1]:g} to {soc[at]:g}, "
+            "must not rise in flight"
+        )
+
+
+def _battery(own: Mapping[str, Array]) -> BatteryTrace | None:
     if "soc" not in own:
         return None
     there = ~np.isnan(own["soc"])
     if not there.any():
         return None
-    t_s, soc = own["t_s"][there], own["soc"][there]
-    rises = np.diff(soc) > ROUNDING
-    if rises.any():
-        at = first_row(rises)
-        raise TraceError(
-            f"{where}: soc rises from {soc[at - 1]:g} to {soc[at]:g} at {t_s[at]:g} s, must not rise in flight"
-        )
-
-    soc = np.minimum.accumulate(soc)
+    t_s, soc = own["t_s"][there], np.minimum.accumulate(own["soc"][there])
 
     def some(name: str) -> tuple[list[float], list[float]]:
         values = own.get(name, np.full(len(there), np.nan))

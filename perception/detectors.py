@@ -16,6 +16,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.box_bounds import wrong_box
 from sortie.perception.classes import TargetClass
 from sortie.perception.errors import InputError
 from sortie.perception.scene.scene_model import SceneModel
@@ -157,13 +158,13 @@ def _own(scene: SceneModel, config: Perception, seed: int, replication: int) -> 
                 raise PluginError(
                     f"detector {found.name}: {what} returns {column} of shape {value.shape}, must be {shape}"
                 )
-            if not np.isfinite(value).all():
-                raise PluginError(f"detector {found.name}: {what} returns {column} that is not finite")
         for column, low, high in (("kind", 0, max(TargetClass)), ("car", -1, 2**31 - 1)):
             value = np.asarray(getattr(made, column))
             if value.dtype.kind not in "iu" or not ((value >= low) & (value <= high)).all():
                 must = f"must be whole numbers from {low} to {high}"
                 raise PluginError(f"detector {found.name}: {what} returns {column} {value!r:.60}, {must}")
+        if wrong := wrong_box(np.column_stack([made.table(), made.score])):
+            raise PluginError(f"detector {found.name}: {what} returns boxes: {wrong}")
         return made
 
     def apart(jobs: Jobs) -> list[tuple[Capture, list[Share]]]:

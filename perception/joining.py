@@ -221,9 +221,9 @@ def _joined_many(
     if rule == "nms":
         score = (boxes.score * (np.minimum(weight, 1.0) * left)).astype(np.float32)
         boxes = replace(boxes, score=score)
-        order = best_first(score, ego)
+        order = best_first(boxes.table(), score, ego)
     else:
-        order = best_first(boxes.score * weight * left, ego)
+        order = best_first(boxes.table(), boxes.score * weight * left, ego)
     boxes, source, ego, left, known = boxes.take(order), source[order], ego[order], left[order], known[order]
     covariance = None if covariance is None else covariance[order]
     i, j = _of_one_thing(boxes, source, ego)

@@ -1,22 +1,22 @@
 """What all traces share: tables of numbers over time that drive drones (fleet/traces.py) and links (radio/channel/traces.py).
 
-A trace is a CSV or Parquet file whose columns are numbers with their unit in the name. `t_s` counts from the
-sortie's begin and increases for each drone or link; between rows values run linearly, before the first and after the
-last they hold; an empty cell says nothing of its column, and what no row says is the model's. Columns that a trace
-does not know are left unread, so that it can carry notes of its own.
+A trace is a text or Parquet file with named columns of numbers (scenarios/tables.py); their names say the unit. `t_s` counts
+from the sortie's begin and increases for each drone or link; between rows values run linearly, before the first and after
+the last they hold; an empty cell says nothing of its column, and what no row says is the model's. Columns that a trace
+does not know are left unread, so that it can carry notes of its own. A trace that says nothing of any known column but the
+time is refused.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from sortie.scenarios.errors import SortieError
 from sortie.scenarios.shipped import located
+from sortie.scenarios.tables import TableError, read_numbers
 
 Array = npt.NDArray[np.float64]
 Bounds = tuple[float, float]
@@ -26,7 +26,7 @@ DRONE: Bounds = (0.0, 254.0)
 MAX_ROWS = 5_000_000
 
 
-class TraceError(SortieError):
+class TraceError(TableError):
     """A trace is not as it must be; the message names the file, the column, the row and the bound."""
 
 
@@ -34,51 +34,34 @@ def read_columns(path: Path, bounds: Mapping[str, Bounds], required: Iterable[st
     """A trace's columns that `bounds` names, each within its bounds; empty cells are NaN.
 
     Args:
-        path: *.csv, or anything else as Parquet.
+        path: as `sortie.scenarios.tables.read_numbers`.
         bounds: column → least and greatest value.
         required: columns that must be there, without an empty cell.
 
     Raises:
         TraceError: no such file, no table, too many rows or none, a column missing, no number, or out of bounds.
     """
-    import pyarrow as pa  # here, because most sorties read none
-    import pyarrow.csv
-    import pyarrow.parquet
-
-    path = located(path)
-    if not os.path.isfile(path):
-        raise TraceError(f"{path}: no such trace")
+    path, required = located(path), tuple(required)
     try:
-        table = pa.csv.read_csv(path) if path.suffix.lower() == ".csv" else pa.parquet.read_table(path)
-        names = table.column_names
-    except UnicodeDecodeError as error:
-        raise TraceError(f"{path}: names of columns are in another encoding, must be UTF-8") from error
-    except (pa.ArrowException, OSError) as error:
-        raise TraceError(f"{path}: is not a {path.suffix or 'Parquet'} table: {str(error).splitlines()[0]}") from error
-    required = tuple(required)
+        columns, names = read_numbers(path, bounds)
+    except TableError as error:
+        raise TraceError(error) from error
     for name in required:
-        if name not in names:
-            raise TraceError(f"{path}: no column {name}, a trace needs {', '.join(required)}")
-    for name in bounds:
-        if names.count(name) > 1:
-            raise TraceError(f"{path}: {names.count(name)} columns {name}, must be one at most")
-    if not 0 < table.num_rows <= MAX_ROWS:
-        raise TraceError(f"{path}: {table.num_rows} rows, must be 1 to {MAX_ROWS}")
-    columns = {}
-    for name, (low, high) in bounds.items():
-        if name not in names:
-            continue
-        try:
-            values = table[name].cast(pa.float64()).to_numpy()
-        except pa.ArrowException:
-            raise TraceError(f"{path}: column {name} does not hold numbers") from None
+        if name not in columns:
+            raise TraceError(
+                f"{path}: no column {name}, a trace needs {', '.join(required)}; it has {', '.join(names) or 'none'}"
+            )
+    rows = len(next(iter(columns.values()), ()))
+    if not 0 < rows <= MAX_ROWS:
+        raise TraceError(f"{path}: {rows} rows, must be 1 to {MAX_ROWS}")
+    for name, values in columns.items():
+        low, high = bounds[name]
         wrong = ~((values >= low) & (values <= high))
         if name not in required:
             wrong &= ~np.isnan(values)
         if wrong.any():
             row = first_row(wrong)
             raise TraceError(f"{path}: {name} in row {row} is {values[row - 1]:g}, must be within {low:g} … {high:g}")
-        columns[name] = values
     return columns
 
 
@@ -86,7 +69,16 @@ def check_whole(path: Path, name: str, values: Array) -> None:
     """Refuse ids that are no whole numbers."""
     wrong = values != np.round(values)  # NaN too
     if wrong.any():
-        raise TraceError(f"{path}: {name} in row {first_row(wrong)}, must be a whole number")
+        row = first_row(wrong)
+        raise TraceError(f"{path}: {name} in row {row} is {values[row - 1]:g}, must be a whole number")
+
+
+def check_drones(path: Path, name: str, values: Array, drones: int) -> None:
+    """Refuse ids that are no drones of a fleet."""
+    check_whole(path, name, values)
+    if (beyond := values >= drones).any():
+        row = first_row(beyond)
+        raise TraceError(f"{path}: {name} in row {row} is {values[row - 1]:g}, must be below fleet.drones = {drones}")
 
 
 def check_increasing(path: Path, t_s: Array, rows: npt.NDArray[np.intp], whose: str) -> None:

@@ -31,7 +31,7 @@ from sortie.perception.evaluation.matched import (
 )
 from sortie.perception.geometry import CELLS, Geometry, to_world
 from sortie.perception.ground_truth import ground_truth
-from sortie.perception.metrics.ap import CONVENTIONS, Matched, best_first, hits, suppressed
+from sortie.perception.metrics.ap import CONVENTIONS, Matched, best_first, best_pairs, hits, suppressed
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.types import Boxes
 from sortie.scenarios.disc import Disc
@@ -260,7 +260,7 @@ def match_all(
     convention = CONVENTIONS[settings.convention]
     image = np.repeat(np.arange(len(local)), [len(boxes) for boxes in local])
     boxes = np.concatenate([np.zeros((0, 6)), *local])
-    order = best_first(boxes[:, 5], image)
+    order = best_first(boxes[:, :5], boxes[:, 5], image)
     boxes, image = boxes[order], image[order]
     pose = est_pose[ego_of[image]].T
     world = np.stack(
@@ -276,6 +276,8 @@ def match_all(
     i, j, value = overlapping(world, cars, ego, cars_of, convention.overlap)
     good = value >= IOU
     i, j, value = i[good], j[good], value[good]
+    order = best_pairs(world[i], score[i], cars[j], value)
+    i, j = i[order], j[order]
     out: dict[Region, list[Matched]] = {}
     for region, centre in discs.items():
         found, real = np.ones(len(world), bool), np.ones(len(cars), bool)
@@ -284,7 +286,7 @@ def match_all(
             real = np.hypot(*(cars[:, :2] - centre[cars_of]).T) <= REGION_M
         both = found[i] & real[j]
         # every image has cars of its own
-        hit = hits(len(world), i[both], j[both] + image[i[both]] * len(cars), value[both], convention.match)
+        hit = hits(len(world), i[both], j[both] + image[i[both]] * len(cars), convention.match)
         truths = np.bincount(cars_of[real], minlength=len(there))
         ends = np.searchsorted(image[found], np.arange(1, len(local)))
         scores, found_hits = np.split(score[found], ends), np.split(hit[found], ends)

@@ -2,11 +2,20 @@
 
 AP here is AP@0.5 by rotated bird's-eye IoU: detections of all frames sorted by score together, each matched
 greedily to the best *remaining* ground truth of its frame, area under the all-point interpolated curve.
-Equal scores form one point of the curve, so neither frame order nor box order among ties matters to it.
 The field has other conventions, and they differ by up to 20 points: `CONVENTIONS`.
 
-Everything works on the boxes of many images at once. Suppression and matching are greedy, best score first; both are
-settled in rounds that concern all images, and end as the loop over boxes would (each says why).
+**Equal scores.** The order in which boxes, truths, frames and egos come never changes AP. (In the convention of OpenCOOD
+the order of frames does: that is the convention.)
+
+- Matching goes by pairs: best score first, among equal scores the greatest overlap first. No detection of a group of equal
+  scores is better than another, so none chooses before the others. Without equal scores this is each detection's choice of
+  the best remaining truth.
+- Pairs that are equal in both go by the place and shape of their boxes (`best_pairs`). So does suppression among boxes of
+  equal score (`best_first`).
+- Equal scores of all frames form one point of the curve: a threshold keeps all of them or none.
+
+Everything works on the boxes of many images at once. Suppression and matching are greedy; both are settled in rounds
+that concern all images, and end as the loop over boxes or pairs would (each says why).
 """
 
 from __future__ import annotations
@@ -34,7 +43,7 @@ from sortie.scenarios.disc import Disc
 
 __all__ = [  # the overlap's two main functions are had from here too
     "CONVENTIONS", "ROTATED", "Convention", "Judged", "Matched", "area", "average_precision", "best_first",
-    "corners", "hits", "iou_pairs", "judge", "match", "match_many", "suppress", "suppressed",
+    "best_pairs", "corners", "hits", "iou_pairs", "judge", "match", "match_many", "paired", "ranked", "suppress", "suppressed",
 ]  # fmt: skip
 
 Bools = NDArray[np.bool_]
@@ -79,9 +88,17 @@ class Matched:
         return Matched(self.score[keep], self.hit[keep], self.truths)
 
 
-def best_first(score: Floats, image: Ints) -> Ints:
-    """The order in which boxes of several images are dealt with: image by image, best score first, ties as they come."""
-    return np.lexsort((-score, image))
+def best_first(boxes: Floats, score: Floats, image: Ints) -> Ints:
+    """The order in which boxes [n, 5 or more] of several images are dealt with: image by image, best score first, then by place."""
+    order = np.lexsort((-score, image))
+    tied = (np.diff(score[order]) == 0) & (np.diff(image[order]) == 0)
+    return np.lexsort((*boxes.T[::-1], -score, image)) if tied.any() else order
+
+
+def ranked(boxes: Boxes) -> Boxes:
+    """Boxes of one image in the order of `best_first`, those of one place by class."""
+    table = np.column_stack([boxes.table(), boxes.kind])
+    return boxes.take(best_first(table, boxes.score, np.zeros(len(boxes), np.int64)))
 
 
 def rivals(boxes: Floats, image: Ints) -> tuple[Ints, Ints, Floats]:
@@ -121,56 +138,73 @@ def suppressed(boxes: Floats, image: Ints, iou: float) -> Bools:
     return standing(len(boxes), i[clash], j[clash])
 
 
-def hits(count: int, i: Ints, j: Ints, value: Floats, match: Literal["remaining", "first"] = "remaining") -> Bools:
-    """Which detections find a car: best first, each takes the best truth that is left.
+def best_pairs(found: Floats, score: Floats, truth: Floats, value: Floats) -> Ints:
+    """The order in which pairs of detection and truth are matched: best score, then greatest overlap, then by place.
 
     Args:
-        count: how many detections there are, in the order of `best_first`.
-        i, j, value: pairs of detection and truth that overlap enough, and their IoU; equal ones go to the lower truth.
-        match: "first": a detection whose best truth is gone finds nothing.
-
-    Every open detection asks for the best truth that has not refused it, and a truth keeps the best that asked. That
-    is deferred acceptance; as all truths prefer alike, by rank, it ends where serving by rank does.
+        found, score, truth, value: of each of p pairs: its detection [p, 2 or more], its score, its truth [p, 2 or more],
+            and how well they match.
     """
-    order = np.lexsort((j, -value, i))
-    i, j = i[order], j[order]
+    order = np.lexsort((-value, -score))
+    tied = (np.diff(score[order]) == 0) & (np.diff(value[order]) == 0)
+    return np.lexsort((*truth.T[::-1], *found.T[::-1], -value, -score)) if tied.any() else order
+
+
+def paired(i: Ints, j: Ints) -> Bools:
+    """Which pairs of detection and truth are matched: one after the other, each whose two ends are both still free.
+
+    Args:
+        i, j: in the order of `best_pairs`.
+
+    In every round, pairs that come first for their detection and for their truth are taken, and all others of these
+    detections and truths go. The loop over pairs would say the same, and the first open pair is always taken, so the
+    rounds end.
+    """
+    taken, left = np.zeros(len(i), bool), np.arange(len(i))
+    while len(left):
+        of_i, of_j = (np.unique(end[left], return_index=True)[1] for end in (i, j))
+        now = left[np.intersect1d(of_i, of_j, assume_unique=True)]
+        taken[now] = True
+        left = left[~(np.isin(i[left], i[now]) | np.isin(j[left], j[now]))]
+    return taken
+
+
+def hits(count: int, i: Ints, j: Ints, match: Literal["remaining", "first"] = "remaining") -> Bools:
+    """Which of so many detections find a truth.
+
+    Args:
+        count: how many detections there are.
+        i, j: pairs of detection and truth that overlap enough, in the order of `best_pairs`.
+        match: "first": a detection whose best truth is gone finds nothing.
+    """
     if match == "first":
-        top = np.ones(len(i), bool)
-        top[1:] = i[1:] != i[:-1]
+        top = np.sort(np.unique(i, return_index=True)[1])
         i, j = i[top], j[top]
-    first = np.searchsorted(i, np.arange(count))
-    last = np.searchsorted(i, np.arange(count), side="right")
-    holder = np.full(int(j.max()) + 1 if len(j) else 0, count)
-    asking = np.flatnonzero(first < last)
-    while len(asking):
-        wish = j[first[asking]]
-        before = holder[wish]
-        np.minimum.at(holder, wish, asking)
-        lost = np.concatenate([asking, before[before < count]])
-        lost = np.unique(lost[holder[j[first[lost]]] != lost])
-        first[lost] += 1
-        asking = lost[first[lost] < last[lost]]
     out = np.zeros(count, bool)
-    out[holder[holder < count]] = True
+    out[i[paired(i, j)]] = True
     return out
 
 
 def alike(
     found: Boxes, truth: Boxes, image: Ints, cars: Ints, iou: float, overlap: Kind = "rotated"
-) -> tuple[Ints, Ints, Floats]:
-    """Pairs (i, j) of one image and class that match, and how well: vehicles by their IoU, people by their distance."""
-    i, j, value = overlapping(found.table(), truth.table(), image, cars, overlap)
+) -> tuple[Ints, Ints]:
+    """Pairs (i, j) of one image and class that match, as `best_pairs`: vehicles by their IoU, people by their distance."""
+    a, b = found.table(), truth.table()
+    i, j, value = overlapping(a, b, image, cars, overlap)
     good = value >= iou
-    if not (found.kind.any() or truth.kind.any()):
-        return i[good], j[good], value[good]
-    good &= (found.kind[i] == truth.kind[j]) & (found.kind[i] != PERSON)
-    near = close_people(found.xy_m, found.kind, truth.xy_m, truth.kind, image, cars)
-    return tuple(np.concatenate([v[good], w]) for v, w in zip((i, j, value), near, strict=True))  # type: ignore[return-value]
+    if found.kind.any() or truth.kind.any():
+        good &= (found.kind[i] == truth.kind[j]) & (found.kind[i] != PERSON)
+        near = close_people(found.xy_m, found.kind, truth.xy_m, truth.kind, image, cars)
+        i, j, value = (np.concatenate([v[good], w]) for v, w in zip((i, j, value), near, strict=True))
+    else:
+        i, j, value = i[good], j[good], value[good]
+    order = best_pairs(a[i], found.score[i], b[j], value)
+    return i[order], j[order]
 
 
 def suppress(boxes: Boxes, iou: float) -> Boxes:
     """Rotated non-maximum suppression of one image: best first, a box that overlaps a kept one by more than `iou` goes."""
-    boxes = boxes.take(np.argsort(-boxes.score, kind="stable"))
+    boxes = ranked(boxes)
     return boxes.take(suppressed(boxes.table(), np.zeros(len(boxes), np.int64), iou))
 
 
@@ -183,13 +217,12 @@ def match(
 ) -> Matched:
     """Match one frame's detections to its ground truth, best score first, each to the best remaining truth.
 
-    With a `disc` only detections and truths centred in it count. Only boxes of one class match.
+    The result has the detections in the order of `ranked`. With a `disc` only detections and truths centred in it count. Only boxes of one class match.
     """
     found, truth = found.inside(disc), truth.inside(disc)
-    found = found.take(np.argsort(-found.score, kind="stable"))
+    found = ranked(found)
     image, cars = np.zeros(len(found), np.int64), np.zeros(len(truth), np.int64)
-    i, j, value = alike(found, truth, image, cars, iou, convention.overlap)
-    hit = hits(len(found), i, j, value, convention.match)
+    hit = hits(len(found), *alike(found, truth, image, cars, iou, convention.overlap), convention.match)
     return Matched(found.score.astype(np.float64), hit, len(truth))
 
 
@@ -205,7 +238,7 @@ class Judged:
     """Detections of many images, and which truths each overlaps enough, so that parts of them are matched for little.
 
     `order` [n] puts the detections in the order of `best_first`; in that order `score` [n] and `image` [n]. `cars` [m]
-    is each truth's image. `i`, `j` and `value` are pairs of detection and truth, and their IoU.
+    is each truth's image. `i` and `j` are pairs of detection and truth, in each image as `best_pairs`.
     """
 
     images: int
@@ -215,16 +248,15 @@ class Judged:
     cars: Ints
     i: Ints
     j: Ints
-    value: Floats
 
     def matched(self, own: Bools | None = None, cars: Bools | None = None) -> list[Matched]:
         """Image by image; with masks (`own` in the order of `best_first`) as if there were those boxes alone."""
-        i, j, value, score, image, of_cars = self.i, self.j, self.value, self.score, self.image, self.cars
+        i, j, score, image, of_cars = self.i, self.j, self.score, self.image, self.cars
         if own is None or cars is None:
-            hit = hits(len(score), i, j, value)
+            hit = hits(len(score), i, j)
         else:
             both = own[i] & cars[j]
-            hit = hits(len(score), i[both], j[both], value[both])[own]
+            hit = hits(len(score), i[both], j[both])[own]
             score, image, of_cars = score[own], image[own], of_cars[cars]
         first = np.searchsorted(image, np.arange(self.images + 1)).tolist()
         truths = np.bincount(of_cars, minlength=self.images).tolist()
@@ -233,16 +265,16 @@ class Judged:
 
 def judge(found: Boxes, image: Ints, truth: Boxes, cars: Ints, images: int, iou: float = 0.5) -> Judged:
     """Detections and truths of so many images, joined; `image` and `cars` say of which each is, and ascend."""
-    order = best_first(found.score, image)
+    order = best_first(found.table(), found.score, image)
     found = found.take(order)
     cuts = [0, *range(MATCH_BATCH, images, MATCH_BATCH), images]
     parts = []
     first, first_car = np.searchsorted(image, cuts).tolist(), np.searchsorted(cars, cuts).tolist()
     for a, b, c, d in zip(first[:-1], first[1:], first_car[:-1], first_car[1:], strict=True):
-        i, j, value = alike(found.take(slice(a, b)), truth.take(slice(c, d)), image[a:b], cars[c:d], iou)
-        parts.append((i + a, j + c, value))
-    i, j, value = (np.concatenate(v) for v in zip(*parts, strict=True))
-    return Judged(images, order, found.score.astype(np.float64), image, cars, i, j, value)
+        i, j = alike(found.take(slice(a, b)), truth.take(slice(c, d)), image[a:b], cars[c:d], iou)
+        parts.append((i + a, j + c))
+    i, j = (np.concatenate(v) for v in zip(*parts, strict=True))
+    return Judged(images, order, found.score.astype(np.float64), image, cars, i, j)
 
 
 def average_precision(frames: Sequence[Matched], convention: Convention = ROTATED) -> float:

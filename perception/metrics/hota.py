@@ -47,8 +47,8 @@ class Followed(NamedTuple):
     """[n] its class, as `TargetClass`."""
 
     def by_frame(self) -> Followed:
-        """The same, frame by frame."""
-        order = np.argsort(self.frame, kind="stable")
+        """The same, frame by frame, and by identity in each: the order of a frame's boxes does not decide between equals."""
+        order = np.lexsort((self.identity, self.frame))
         return Followed(self.boxes[order], self.frame[order], self.identity[order], self.kind[order])
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.box_bounds import wrong_box
 from sortie.perception.geometry import CELLS, Geometry
 from sortie.perception.lateness import reach_m, still_right
 from sortie.perception.recordings.recording import Floats, Recording, RecordingError, cells_of
@@ -130,10 +131,10 @@ def fused(
         found = np.asarray(fuse(np.concatenate(agents), part, weight), np.float64)
     except Exception as error:  # the user's own code can raise anything; torch raises RuntimeError
         raise RecordingError(f"{recording.path}: the fusion failed, {type(error).__name__}: {error}") from error
-    if found.ndim != 2 or found.shape[1] != 6 or not np.isfinite(found).all():
-        raise RecordingError(
-            f"{recording.path}: the fusion gave shape {list(found.shape)}, must be finite boxes [m, 6]"
-        )
+    if found.ndim != 2 or found.shape[1] != 6:
+        raise RecordingError(f"{recording.path}: the fusion gave shape {list(found.shape)}, must be boxes [m, 6]")
+    if wrong := wrong_box(found):
+        raise RecordingError(f"{recording.path}: the fusion gave boxes: {wrong}")
     return found
 
 

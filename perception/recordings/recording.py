@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sortie.perception.box_bounds import YAW_RAD, wrong_box, wrong_yaw
 from sortie.perception.errors import InputError
 from sortie.perception.files import read_npz
 from sortie.perception.geometry import CELLS, CHANNELS, Geometry
@@ -226,6 +227,10 @@ def checked(path: Path, small: Mapping[str, NDArray[Any]], large: Mapping[str, A
     d = pose.shape[1]
     checks.require("pose", d > 0, "has no drones", "at least one")
     est_pose = checks.numbers("est_pose", (n, d, 3)) if "est_pose" in small else pose
+    for name, poses in (("pose", pose), ("est_pose", est_pose)):
+        if len(far := np.argwhere(wrong_yaw(poses[..., 2]))):
+            at = [*far[0].tolist(), 2]
+            checks.require(name, False, f"{at} is {poses[tuple(at)]:g}", f"within ±{YAW_RAD:.2f} rad, not degrees")
     parts = []
     for name, width, count in (("boxes", 6, n * d), ("truth", 5, n)):
         table = checks.numbers(name, (None, width))
@@ -238,12 +243,9 @@ def checked(path: Path, small: Mapping[str, NDArray[Any]], large: Mapping[str, A
             f"0 to {len(table)}, the rows of {name}",
         )
         checks.require(f"{name}_offset", bool((np.diff(offset) >= 0).all()), "falls", "ascending")
-        flat = np.flatnonzero((table[:, 2:4] <= 0).any(axis=1))
-        checks.require(name, not len(flat), f"row {flat[0] if len(flat) else 0} has a length or width ≤ 0", "above 0 m")
+        if wrong := wrong_box(table):
+            raise RecordingError(f"{path}: {name}: {wrong}")
         parts += [table, offset]
-    wrong = np.flatnonzero((parts[0][:, 5] < 0) | (parts[0][:, 5] > 1))
-    if len(wrong):
-        checks.require("boxes", False, f"row {wrong[0]} has the score {parts[0][wrong[0], 5]:g}", "0 to 1")
     _check_large(path, large, n, d)
     return Recording(path, t_s, scene, pose, est_pose, cell_m, dict(large), *parts)
 

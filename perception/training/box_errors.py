@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 
 from sortie.perception.errors import InputError
 from sortie.perception.joining import NMS_IOU
+from sortie.perception.metrics.ap import best_pairs, paired
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.types import Boxes
 from sortie.perception.uncertainty import TERMS, BoxErrors, Floats, Pose, terms
@@ -58,14 +59,10 @@ def errors_of(boxes: Boxes, pose: Pose, cars: NDArray[np.floating]) -> Errors:
     i, j, value = overlapping(
         boxes.table(), real, np.zeros(len(boxes), np.int64), np.zeros(len(real), np.int64), "rotated"
     )
-    free, pairs = np.ones(len(real), bool), []
-    for box in range(len(boxes)):
-        mine = np.flatnonzero((i == box) & (value > NMS_IOU) & free[j])
-        if len(mine):
-            car = int(j[mine[np.argmax(value[mine])]])
-            free[car] = False
-            pairs.append((box, car))
-    box_of, car_of = np.array(pairs, np.intp).reshape(-1, 2).T
+    order = best_pairs(boxes.table()[i], boxes.score[i], real[j], value)
+    order = order[value[order] > NMS_IOU]
+    order = order[paired(i[order], j[order])]
+    box_of, car_of = i[order], j[order]
     at = boxes.xy_m[box_of].astype(np.float64)
     sight = at - np.array(pose[:2])
     distance = np.hypot(*sight.T)

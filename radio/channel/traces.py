@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_increasing, check_whole, first_row, read_columns
+from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_drones, check_increasing, first_row, read_columns
 
 FloatArray = NDArray[np.float64]
 QUALITIES = ("snr_db", "loss", "goodput_mbps")
@@ -69,7 +69,7 @@ def read_links(path: str | Path, drones: int) -> LinkTrace:
     """Read a link trace.
 
     Args:
-        path: *.csv, or anything else as Parquet.
+        path: as `sortie.scenarios.tables.read_table`.
         drones: drones of the fleet; a trace of another is refused.
 
     Raises:
@@ -78,16 +78,16 @@ def read_links(path: str | Path, drones: int) -> LinkTrace:
     """
     path = Path(path)
     columns = read_columns(path, BOUNDS, required=("t_s", "sender", "receiver"))
-    if not any(name in columns for name in QUALITIES):
-        raise TraceError(f"{path}: a link trace needs a column {', '.join(QUALITIES[:-1])} or {QUALITIES[-1]}")
+    if all(np.isnan(columns.get(name, np.nan)).all() for name in QUALITIES):
+        wanted = f"{', '.join(QUALITIES[:-1])} or {QUALITIES[-1]}"
+        raise TraceError(f"{path}: no row has a value of {wanted}, so nothing of the trace would be flown")
     for name in ("sender", "receiver"):
-        check_whole(path, name, columns[name])
-        if (beyond := columns[name] >= drones).any():
-            drone = columns[name][first_row(beyond) - 1]
-            raise TraceError(f"{path}: {name} {drone:g}, must be below fleet.drones = {drones}")
+        check_drones(path, name, columns[name], drones)
     ends = np.stack([columns["sender"], columns["receiver"]], axis=1).astype(int)
     if (same := ends[:, 0] == ends[:, 1]).any():
-        raise TraceError(f"{path}: row {first_row(same)} links drone {ends[first_row(same) - 1, 0]} to itself")
+        raise TraceError(
+            f"{path}: sender and receiver in row {first_row(same)} are both drone {ends[first_row(same) - 1, 0]}"
+        )
     links = {}
     for i, j in np.unique(ends, axis=0).tolist():
         row = np.flatnonzero((ends[:, 0] == i) & (ends[:, 1] == j))

@@ -5,7 +5,6 @@ What is wrong is told as for scenarios, in one line with the campaign file's own
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,6 @@ from sortie.scenarios.reading.load import (
 )
 from sortie.scenarios.reading.nodes import MAX_DEPTH, Node, ScenarioError, as_node, assign, child, dotted, plain
 from sortie.scenarios.reading.strict_yaml import read_scalar
-from sortie.scenarios.regular import regular
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.campaign import (
     Campaign,
@@ -38,6 +36,7 @@ from sortie.scenarios.schema.campaign import (
     Triangular,
     Uniform,
 )
+from sortie.scenarios.tables import TableError, read_table
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +97,13 @@ def load_campaign(path_or_name: str | Path) -> Study:
     for name, spread in campaign.vary.items():
         at = varied[name]
         resolved = as_node(sections, at.source, at.line)
-        for value in extremes(spread, columns.get(name, ())):
-            made = validated(_put(resolved, name, as_node(value, at.source, at.line)), Scenario)
+        for row, value in enumerate(extremes(spread, columns.get(name, ())), 1):
+            try:
+                made = validated(_put(resolved, name, as_node(value, at.source, at.line)), Scenario)
+            except ScenarioError as error:
+                if not isinstance(spread, Column):
+                    raise
+                raise ScenarioError(f"{error} ({spread.file}: {spread.column} in row {row})") from None
             drones, phases = max(drones, made.fleet.drones), max(phases, len(made.mission.phases))
     return Study(campaign, base, columns, here, root, drones, phases)
 
@@ -188,26 +192,24 @@ def _column(spread: Column, here: Path, node: Node) -> tuple[Any, ...]:
     path = here / spread.file
     at = f"{node.where}: {path}"
     try:
-        with regular(path).open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.DictReader(file)
-            if spread.column not in (rows.fieldnames or ()):
-                has = ", ".join(rows.fieldnames or ()) or "nothing"
-                raise ScenarioError(f"{at}: no column {spread.column}, it has {has}")
-            values = tuple(_number(row[spread.column] or "") for row in rows)
-    except FileNotFoundError:
-        raise ScenarioError(f"{at}: no such file") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ScenarioError(f"{at}: cannot be read, {getattr(error, 'strerror', None) or error}") from None
-    if not values:
+        table = read_table(path, [spread.column])
+    except TableError as error:
+        raise ScenarioError(f"{node.where}: {error}") from None
+    if spread.column not in table.columns:
+        raise ScenarioError(f"{at}: no column {spread.column}, it has {', '.join(table.names) or 'nothing'}")
+    cells = table.columns[spread.column].to_pylist()
+    if not cells:
         raise ScenarioError(f"{at}: column {spread.column} has no rows, must have at least one")
-    return values
+    return tuple(_value(cell, table.decimal_comma) for cell in cells)
 
 
-def _number(text: str) -> Any:
-    """A whole number or a number, if it is one as scenarios write them; else the text itself."""
-    value, problem, doubt = read_scalar(text.strip())
+def _value(cell: Any, decimal_comma: bool) -> Any:
+    """A text as a whole number or a number, if it is one as scenarios write them; else the cell itself."""
+    if not isinstance(cell, str):
+        return "" if cell is None else cell
+    value, problem, doubt = read_scalar(cell.strip().replace(",", ".") if decimal_comma else cell.strip())
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and not (problem or doubt)
-    return value if is_number else text
+    return value if is_number else cell
 
 
 def _check_lengths(campaign: Campaign, columns: dict[str, tuple[Any, ...]], varied: dict[str, Node]) -> None:

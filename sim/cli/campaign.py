@@ -177,7 +177,12 @@ def _in_words(done: sortie.CampaignResult) -> str:
 @contextmanager
 def _bar(name: str) -> Iterator[Callable[[Progress], None]]:
     """A progress bar with throughput and time left. It prints nothing without a terminal."""
-    columns = (TextColumn(name, markup=False), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}", markup=False))
+    columns = (
+        TextColumn(name, markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.description}", markup=False),
+    )
     with Bar(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("starting", total=None)
 

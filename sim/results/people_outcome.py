@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from sortie.perception.classes import NEAR_M, PERSON
-from sortie.perception.metrics.ap import Matched, average_precision, hits
+from sortie.perception.metrics.ap import Matched, average_precision, best_pairs, hits
 from sortie.perception.thermal import in_cone
 from sortie.sim.results.outcome_fields import PeopleOutcome
 from sortie.sim.results.record import SortieRecord, classes_in
@@ -154,10 +154,10 @@ def _average_precision(record: SortieRecord, t_s: Floats, looking: Bools, people
         )
         if not len(found) and not len(truth):
             continue
-        found = found[np.argsort(-score[found], kind="stable")]
         away_m = np.linalg.norm(spots[found][:, None] - truth[None], axis=-1)
         i, j = np.nonzero(away_m <= NEAR_M)
-        matched.append(Matched(score[found], hits(len(found), i, j, -away_m[i, j]), len(truth)))
+        order = best_pairs(spots[found][i], score[found][i], truth[j], -away_m[i, j])
+        matched.append(Matched(score[found], hits(len(found), i[order], j[order]), len(truth)))
     if not any(m.truths for m in matched):
         return None
     return average_precision(matched)

@@ -21,19 +21,20 @@ from sortie.fleet.energy.battery import CAUSES as ENERGY_CAUSES
 from sortie.fleet.energy.battery import RECORDED
 from sortie.fleet.staleness import LinkHealth
 from sortie.perception.classes import TargetClass
-from sortie.policies.contract import COVERAGE_BYTES, DIRECTIVE_BOUNDS, MAX_REASON, PHASE_OF, TaskPhase
+from sortie.policies.contract import COVERAGE_BYTES, DIRECTIVE_BOUNDS, PHASE_OF, TaskPhase
 from sortie.policies.verification.enforced import CAUSES
 from sortie.radio.transmission import Status
 from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.results import beliefs, disagreement, views
+from sortie.sim.results.box_rows import columns_of, fusions_of
 from sortie.sim.results.record import HANDSHAKE, VIOLATIONS_OF
 
 MOST_BYTES = 64 << 20
 """Of a file that is no table."""
-MOST_CHARACTERS = 10_000
-"""Of a text."""
+MOST_CHARACTERS = 20_000
+"""Of a text: a reason may name the invariants of a shield, which have 10,000 characters at most."""
 _LARGEST = 1e12
 """Of any number of a table; far beyond what flies, and small enough to compute with."""
 _TOTALS = (
@@ -86,7 +87,7 @@ def read_file(path: Path) -> bytes:
     Raises:
         OSError, ValueError: it cannot be read, is no plain file, or is far longer than any run's.
     """
-    _ensure_plain(path)
+    ensure_plain(path)
     if (size := path.stat().st_size) > MOST_BYTES:
         raise ValueError(f"{path.name} has {size} bytes, must have at most {MOST_BYTES}")
     return path.read_bytes()
@@ -145,7 +146,7 @@ def read_table(path: Path, needed: Collection[str], known: Mapping[str, pa.DataT
     Raises:
         OSError, ValueError: it cannot be read, or has other columns, types or rows.
     """
-    _ensure_plain(path)
+    ensure_plain(path)
     try:
         with pq.ParquetFile(path) as file:
             names, found = file.schema_arrow.names, file.metadata.num_rows
@@ -226,8 +227,8 @@ class Checks:
             if choices is not None:
                 wrong = pc.invert(pc.is_in(values, pa.array(choices)))
                 return _first(values, wrong, f"must be one of {', '.join(filter(None, choices))}")
-            most = MAX_REASON if name == "reason" else MOST_CHARACTERS
-            return _first(values, pc.greater(pc.utf8_length(values), most), f"must have at most {most} characters")
+            wrong = pc.greater(pc.utf8_length(values), MOST_CHARACTERS)
+            return _first(values, wrong, f"must have at most {MOST_CHARACTERS} characters")
         if pa.types.is_integer(kind) or pa.types.is_floating(kind):
             leaf = name.rpartition(".")[2]
             whole = pa.types.is_integer(kind)
@@ -264,6 +265,21 @@ class Checks:
             if pc.any(pc.not_equal(lengths, right)).as_py():
                 as_long = f"as many values as {length}" if isinstance(length, str) else f"{right} values"
                 raise ValueError(f"{name}.parquet: {column} must have {as_long} in every row")
+
+
+def ensure_boxes(tables: Mapping[str, pa.Table]) -> None:
+    """Refuse boxes that are not those that the fusions count; drones that do not fuse have truths alone.
+
+    Raises:
+        ValueError: naming the file.
+    """
+    fusions = tables["fusions"]
+    keys = list(zip(fusions["t_s"].to_pylist(), fusions["drone"].to_pylist(), strict=True))
+    for name in ("detections", "truths"):
+        of = fusions_of(keys, columns_of(tables[name].select(["t_s", "drone"])))
+        counts = np.bincount(of[of >= 0], minlength=len(keys))
+        if not np.array_equal(counts, fusions[name].to_numpy()) or (name == "detections" and (of < 0).any()):
+            raise ValueError(f"{name}.parquet: has not the rows that fusions.parquet counts in `{name}`")
 
 
 def ensure_each_once(tables: Mapping[str, pa.Table]) -> None:
@@ -328,7 +344,7 @@ def _first(values: pa.Array, wrong: pa.Array, must: str) -> tuple[int, str] | No
     return None if at < 0 else (at, f"is {values[at].as_py()!r:.60}, {must}")
 
 
-def _ensure_plain(path: Path) -> None:
+def ensure_plain(path: Path) -> None:
     """Refuse what is no plain file of the run's folder: it may lead elsewhere, or never end.
 
     Raises:

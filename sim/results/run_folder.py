@@ -22,7 +22,9 @@ from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import CLASS_COLUMN, OF_CLASSES, TABLES, SortieRecord
 from sortie.sim.results.run_checks import (
     Checks,
+    ensure_boxes,
     ensure_each_once,
+    ensure_plain,
     ensure_together,
     read_about,
     read_file,
@@ -246,6 +248,8 @@ def load(path: Path) -> SortieRecord:
     if not os.path.lexists(path / OUTCOME):
         raise RunError(f"{path}: no run there ({OUTCOME} is missing)")
     try:
+        if os.path.lexists(path / RECORDING):
+            ensure_plain(path / RECORDING)
         result, about, scenario = read_json(path / OUTCOME), read_about(path / RECORD), _scenario_of(path)
         record = SortieRecord(scenario=scenario, tables=_tables_of(path, scenario), **about)
         ensure_together(result, record)
@@ -280,6 +284,7 @@ def _tables_of(path: Path, scenario: Scenario) -> dict[str, pa.Table]:
     checks = Checks(scenario, {name: len(table) for name, table in tables.items()})
     for name, table in tables.items():
         checks.check(name, table)
+    ensure_boxes(tables)
     if scenario.record.views:
         ensure_each_once(tables)
     return tables

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from sortie.perception.classes import CAR, TargetClass
-from sortie.perception.metrics.ap import Matched, match
+from sortie.perception.metrics.ap import Matched, match, ranked
 from sortie.perception.types import Boxes
 from sortie.scenarios.disc import Disc
 from sortie.sim.results.record import classes_in
@@ -54,7 +54,7 @@ def sightings(tables: Mapping[str, pa.Table], regions: Regions) -> Iterator[Sigh
         truth = truths.take(np.arange(truth_at, truth_at + truth_count))
         at, truth_at = at + count, truth_at + truth_count
         whole = match(own, truth)
-        own = own.take(np.argsort(-own.score, kind="stable"))  # the order of whole.hit
+        own = ranked(own)  # the order of whole.hit
         hits = own.take(whole.hit)
         missed = Boxes.join([_missed(truth.of_class(kind), hits.of_class(kind)) for kind in TargetClass])
         false = own.take(~whole.hit)

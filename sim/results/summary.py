@@ -190,6 +190,7 @@ def transitions_table(result: dict[str, Any]) -> Table:
     for t in result["transitions"]:
         key = (int(t["t_s"] / frame_s + 1e-6), f"{t['from']} → {t['to']}", t["reason"])
         alike.setdefault(key, (t["t_s"], []))[1].extend((t["drone"], peer) for peer in t["peers"])
+    rows: list[tuple[float, str, str | Text, str]]
     rows = [(t_s, _links_in_words(links), what, why) for (_, what, why), (t_s, links) in alike.items()]
     rows += [
         (e["t_s"], "fleet" if e["drone"] < 0 else str(e["drone"]), Text(e["kind"], "yellow"), e["text"])

@@ -115,21 +115,34 @@ def test_a_flight_written_as_states_flies_again(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.acceleration_mps2[1:-1], motion.acceleration_mps2[1:-1], atol=0.05)
 
 
+NOTHING = "no row has a place (x_m, y_m, z_m or lat_deg, lon_deg, alt_m) or a charge (soc), so nothing of the trace would be flown"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("drone,soc\n0,1\n", "no column t_s, a trace needs t_s"),
+        ("drone,soc\n0,1\n", "no column t_s, a trace needs t_s; it has drone, soc"),
         ("t_s,soc\n", "0 rows, must be 1 to 5000000"),
         ("t_s,soc\n0,0.9\n1,1.2\n", "soc in row 2 is 1.2, must be within 0 … 1"),
         ("t_s,soc\n,0.9\n", "t_s in row 1 is nan, must be within 0 … 86400"),
-        ("t_s,soc\n0,full\n", "column soc does not hold numbers"),
-        ("t_s,drone,soc\n0,0.5,1\n", "drone in row 1, must be a whole number"),
-        ("t_s,drone,soc\n0,5,1\n", "drone 5, must be below fleet.drones = 5"),
+        ("t_s,soc\n0,full\n", "soc in row 1 is 'full', must be a number"),
+        ("t_s,drone,soc\n0,0.5,1\n", "drone in row 1 is 0.5, must be a whole number"),
+        ("t_s,drone,soc\n0,5,1\n", "drone in row 1 is 5, must be below fleet.drones = 5"),
         ("t_s,drone,soc\n0,0,1\n0,1,1\n0,1,0.9\n", "t_s in row 3 of drone 1 is 0, must increase"),
-        ("t_s,soc\n0,0.9\n1,0.8\n2,0.85\n", "drone 0: soc rises from 0.8 to 0.85 at 2 s, must not rise in flight"),
+        ("t_s,soc\n0,0.9\n1,0.8\n2,0.85\n", "soc in row 3 of drone 0 rises from 0.8 to 0.85, must not rise in flight"),
         ("t_s,x_m,y_m\n0,1,1\n", "a pose needs all of x_m, y_m, z_m"),
         ("t_s,qx,qy,qz\n0,0,0,0\n", "an attitude needs all of qx, qy, qz, qw"),
         ("t_s,vx_mps,vy_mps\n0,1,1\n", "a velocity needs all of vx_mps, vy_mps, vz_mps"),
+        *(
+            (text, NOTHING)
+            for text in (
+                "t_s,x\n0,1\n",
+                "t_s,drone,rssi_dbm\n0,0,-60\n",
+                "t_s,voltage_v\n0,12\n",
+                "t_s,x_m,y_m,z_m\n0,1,,3\n",
+                "t_s,qx,qy,qz,qw\n0,0,0,0,1\n",
+            )
+        ),
     ],
 )
 def test_a_broken_trace_gives_its_one_line(tmp_path: Path, text: str, message: str) -> None:
@@ -140,7 +153,7 @@ def test_a_broken_trace_gives_its_one_line(tmp_path: Path, text: str, message: s
 
 
 def test_no_file_and_no_table(tmp_path: Path) -> None:
-    with pytest.raises(TraceError, match=r"missing\.csv: no such trace"):
+    with pytest.raises(TraceError, match=r"missing\.csv: no such file"):
         read_traces(tmp_path / "missing.csv", 1)
     (tmp_path / "trace.parquet").write_text("t_s,soc\n0,1\n")
     with pytest.raises(TraceError, match=r"trace\.parquet: is not a \.parquet table"):
@@ -180,6 +193,42 @@ def test_a_flight_in_latitude_and_longitude_flies_in_metres(tmp_path: Path) -> N
     placed = read_traces(path, 3, Origin(latitude_deg=47, longitude_deg=8.001, altitude_m=400))[1].pose
     assert placed is not None
     np.testing.assert_allclose(placed.position_m[0], (-76.06, 0, 100), atol=0.01)
+
+
+FIX, HINT = "47.0,8.0,450", "; leave cells empty where a receiver had no fix"
+
+
+@pytest.mark.parametrize(
+    ("rows", "origin", "message"),
+    [
+        (["0,0,0", FIX, FIX, FIX], None, f"row 1 are 0 and 0, 5,116 km from another place, must be within 20 km{HINT}"),
+        ([FIX, "0,0,0", FIX], None, f"row 2 are 0 and 0, 5,116 km from another place, must be within 20 km{HINT}"),
+        (["0,0,0"] * 3 + [FIX], None, f"row 1 are 0 and 0, 5,116 km from another place, must be within 20 km{HINT}"),
+        ([FIX, FIX, "47.0,9.0,450"], None, "row 3 are 47 and 9, 76 km from another place, must be within 20 km"),
+        (
+            [FIX, FIX, "-47.0,-172.0,450"],
+            None,
+            "row 3 are -47 and -172, 12,734 km from another place, must be within 20 km",
+        ),
+        ([FIX, ",,", FIX], (46.0, 8.0), "row 1 are 47 and 8, 111 km from fleet.origin, must be within 20 km"),
+        (["0,0,0", FIX], (47.0, 8.0), f"row 1 are 0 and 0, 5,116 km from fleet.origin, must be within 20 km{HINT}"),
+    ],
+)
+def test_places_in_degrees_have_the_bound_of_metres(
+    rows: list[str], origin: tuple[float, float] | None, message: str, tmp_path: Path
+) -> None:
+    path = written(tmp_path, "t_s,lat_deg,lon_deg,alt_m\n" + "".join(f"{k},{row}\n" for k, row in enumerate(rows)))
+    at = None if origin is None else Origin(latitude_deg=origin[0], longitude_deg=origin[1], altitude_m=0)
+    with pytest.raises(TraceError) as refused:
+        read_traces(path, 1, at)
+    assert str(refused.value) == f"{path}: lat_deg and lon_deg in {message}"
+
+
+def test_a_flight_across_the_180th_meridian_is_short(tmp_path: Path) -> None:
+    path = written(tmp_path, "t_s,lat_deg,lon_deg,alt_m\n0,0,179.9999,0\n1,0,-179.9999,0\n")
+    pose = read_traces(path, 1)[0].pose
+    assert pose is not None
+    np.testing.assert_allclose(pose.position_m[1], (22.26, 0, 0), atol=0.01)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,8 @@ from sortie.scenarios.plugins.reference import PluginError
 from sortie.scenarios.schema import Perception, Scene
 
 CODE = """
+import dataclasses
+
 import numpy as np
 from sortie.perception.types import Boxes
 
@@ -27,6 +29,16 @@ KINDS = {
     "kind 3": {"kind": np.array([0, 3])},
     "half a kind": {"kind": np.array([0.5, 1.0])},
     "one car": {"car": np.zeros(1, np.int32)},
+    "half": {"xy_m": np.array([[np.nan, 0.0], [1.0, 0.0]])},
+    "no width": {"size_m": np.array([[4.5, 1.9], [4.5, 0.0]])},
+    "negative": {"size_m": np.array([[-4.5, 1.9], [4.5, 1.9]])},
+    "no size": {"size_m": np.array([[4.5, 1.9], [np.nan, 1.9]])},
+    "millimetres": {"size_m": np.array([[4500.0, 1900.0], [4.5, 1.9]])},
+    "degrees": {"yaw_rad": np.array([0.0, 90.0])},
+    "no yaw": {"yaw_rad": np.array([np.inf, 0.0])},
+    "per cent": {"score": np.array([0.9, 90.0])},
+    "a logit": {"score": np.array([-0.1, 0.9])},
+    "no score": {"score": np.array([0.9, np.nan])},
 }
 
 
@@ -62,10 +74,9 @@ class Ahead:
             found = self.detect(jobs)
             if self.what == "infinite":
                 found[0] = Boxes(np.array([[np.inf, 0.0]]), np.ones((1, 2)), np.zeros(1), np.ones(1))
-            if self.what == "half":
-                found[0] = Boxes(np.array([[np.nan, 0.0], [1.0, 0.0]]), np.ones((2, 2)), np.zeros(2), np.ones(2))
             if self.what in KINDS:
-                found[0] = Boxes(np.zeros((2, 2)), np.ones((2, 2)), np.zeros(2), np.ones(2), **KINDS[self.what])
+                right = Boxes(np.zeros((2, 2)), np.ones((2, 2)), np.zeros(2), np.ones(2))
+                found[0] = dataclasses.replace(right, **KINDS[self.what])
             return found[1:] if self.what == "short" else found
 
         return finish
@@ -110,8 +121,17 @@ def test_it_is_given_scene_section_seed_replication_and_its_parameters(made: Cal
     [
         ("fails", "out of memory"),
         ("short", "must be Boxes for each of the jobs"),
-        ("infinite", "xy_m that is not finite"),
-        ("half", "xy_m that is not finite"),
+        ("infinite", r"detect returns boxes: x in row 0 \(from 0\) is inf, must be finite"),
+        ("half", r"detect returns boxes: x in row 0 \(from 0\) is nan, must be finite"),
+        ("no width", r"detect returns boxes: width in row 1 \(from 0\) is 0, must be 0.001 to 1000 m"),
+        ("negative", r"length in row 0 \(from 0\) is -4.5, must be 0.001 to 1000 m"),
+        ("no size", r"length in row 1 \(from 0\) is nan, must be 0.001 to 1000 m"),
+        ("millimetres", r"length in row 0 \(from 0\) is 4500, must be 0.001 to 1000 m"),
+        ("degrees", r"yaw in row 1 \(from 0\) is 90, must be within ±12.57 rad, not degrees"),
+        ("no yaw", r"yaw in row 0 \(from 0\) is inf, must be within ±12.57 rad, not degrees"),
+        ("per cent", r"score in row 1 \(from 0\) is 90, must be 0 to 1"),
+        ("a logit", r"score in row 0 \(from 0\) is -0.1, must be 0 to 1"),
+        ("no score", r"score in row 1 \(from 0\) is nan, must be 0 to 1"),
         ("one kind", r"detect returns kind of shape \(1,\), must be \(2,\)"),
         ("kind 3", r"detect returns kind array\(\[0, 3\]\), must be whole numbers from 0 to 2"),
         ("half a kind", "must be whole numbers from 0 to 2"),

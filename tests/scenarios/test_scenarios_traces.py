@@ -61,7 +61,7 @@ def test_the_files_are_what_their_maker_writes(name: str) -> None:
 def test_a_shipped_trace_is_found_by_its_name() -> None:
     path = located(ct.PAPER_120S.relative_to(ct.TRACES) / "links.csv")
     assert path == ct.PAPER_120S / "links.csv"
-    with pytest.raises(TraceError, match="no such trace"):
+    with pytest.raises(TraceError, match="no such file"):
         read_columns(ct.TRACES / "nowhere.csv", {})
 
 
@@ -103,7 +103,7 @@ def test_a_name_that_no_file_can_have_is_no_file(tmp_path: Path) -> None:
     """A scenario that names it ended in OSError."""
     (tmp_path / "a.yaml").write_text(f"name: a\nfleet: {{trace: {'a' * 400}}}\n")
     assert load(tmp_path / "a.yaml").fleet.trace == "a" * 400
-    with pytest.raises(TraceError, match="no such trace"):
+    with pytest.raises(TraceError, match="no such file"):
         read_columns(Path("a" * 400), {})
 
 

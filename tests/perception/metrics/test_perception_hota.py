@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from sortie.perception.classes import CAR, TRUCK
-from sortie.perception.metrics.hota import Followed, hota
+from sortie.perception.metrics.hota import Followed, Hota, hota
 from sortie.perception.metrics.overlap import iou_pairs
 
 Sequence = list[tuple[dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]]]
@@ -32,7 +32,7 @@ def flat(sequences: list[Sequence], which: int) -> Followed:
     return Followed(np.array(boxes), np.array(frame_of), np.array(who), np.full(len(who), CAR, np.int8))
 
 
-def judged(*sequences: Sequence) -> tuple[float, float, float]:
+def judged(*sequences: Sequence) -> Hota:
     value = hota(flat(list(sequences), 0), flat(list(sequences), 1))
     assert value is not None
     return value
@@ -64,6 +64,13 @@ def test_the_pair_that_fits_over_the_whole_sequence_is_matched_though_another_ov
     frames = [*frames, ({0: car(0)}, {5: car(0.2), 6: car(0.0)})]
     # IoU 3.8 / 4.2 = 0.905, right at 18 limits: ten of eleven boxes, and all ten of one track
     assert judged(frames)[1:] == pytest.approx((18 / 19 * 10 / 11, 18 / 19))
+
+
+def test_the_order_of_a_frame_s_boxes_does_not_matter() -> None:
+    """Two tracks lie on one car all the time: one of them is the car's in all frames, in whatever order they are listed."""
+    frames: Sequence = [({0: car(0)}, {6 - k % 2: car(0), 5 + k % 2: car(0)}) for k in range(8)]
+    assert judged(frames) == judged([(there, dict(sorted(told.items()))) for there, told in frames])
+    assert judged(frames).ass_a == pytest.approx(1.0)
 
 
 def test_a_track_of_another_class_on_a_car_is_a_miss_and_a_false_positive() -> None:

@@ -37,6 +37,9 @@ def peaks(agents, takes_part, weight):
 def wrong(agents, takes_part, weight):
     return np.zeros((3, 5))
 
+def degrees(agents, takes_part, weight):
+    return np.array([(0, 0, 4.5, 1.9, 90, 0.5)])
+
 def raises(agents, takes_part, weight):
     raise ValueError("no such layer")
 
@@ -126,7 +129,8 @@ def test_a_users_fusion_gets_warped_features_and_says_what_is_there(tmp_path: Pa
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("wrong", r"the fusion gave shape \[3, 5\], must be finite boxes \[m, 6\]"),
+        ("wrong", r"the fusion gave shape \[3, 5\], must be boxes \[m, 6\]"),
+        ("degrees", r"the fusion gave boxes: yaw in row 0 \(from 0\) is 90, must be within ±12.57 rad, not degrees"),
         ("raises", "the fusion failed, ValueError: no such layer"),
         ("torn", "the fusion failed, RuntimeError: "),
     ],

@@ -114,6 +114,7 @@ def test_no_directive_passes_its_bounds(field: str, value: float) -> None:
         ("roi", Disc(0.0, 0.0, 0.0), "roi.radius_m is 0.0, must be > 0"),
         ("reason", 5, "reason is 5, must be text"),
         ("reason", b"why", "reason is b'why', must be text"),
+        ("reason", "x" * 1001, "reason has 1001 characters, must have at most 1000"),
         ("reason", "\ud800", r"reason is '\ud800', must be text that UTF-8 can write"),
     ],
 )

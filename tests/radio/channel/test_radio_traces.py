@@ -43,9 +43,9 @@ def test_a_goodput_without_a_loss_loses_nothing_or_all(tmp_path: Path) -> None:
 
 
 BROKEN = [
-    (("0,0,0,1,,",), "row 1 links drone 0 to itself"),
-    (("0,0,7,1,,",), "receiver 7, must be below fleet.drones = 5"),
-    (("0,0.5,1,1,,",), "sender in row 1, must be a whole number"),
+    (("0,0,0,1,,",), "sender and receiver in row 1 are both drone 0"),
+    (("0,0,7,1,,",), "receiver in row 1 is 7, must be below fleet.drones = 5"),
+    (("0,0.5,1,1,,",), "sender in row 1 is 0.5, must be a whole number"),
     (("1,0,1,1,,", "1,0,1,2,,"), "t_s in row 2 of link 0 to 1 is 1, must increase"),
     (("0,0,1,,1.2,",), "loss in row 1 is 1.2, must be within 0 … 1"),
     (("0,0,1,,,-3",), "goodput_mbps in row 1 is -3, must be within 0 … 10000"),
@@ -64,8 +64,10 @@ def test_what_is_wrong_is_named(rows: tuple[str, ...], message: str, tmp_path: P
 def test_a_trace_has_ends_and_a_quality(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match="no column receiver, a trace needs t_s, sender, receiver"):
         read_links(trace(tmp_path, "0,0,1", columns="t_s,sender,snr_db"), 5)
-    with pytest.raises(TraceError, match="a link trace needs a column snr_db, loss or goodput_mbps"):
+    with pytest.raises(TraceError, match="no row has a value of snr_db, loss or goodput_mbps"):
         read_links(trace(tmp_path, "0,0,1", columns="t_s,sender,receiver"), 5)
+    with pytest.raises(TraceError, match="no row has a value of snr_db, loss or goodput_mbps"):
+        read_links(trace(tmp_path, "0,0,1,,,"), 5)
 
 
 # --- flown ---------------------------------------------------------------------------------------------

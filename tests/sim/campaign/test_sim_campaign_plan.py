@@ -184,7 +184,7 @@ def test_the_plan_survives_its_json(tmp_path: Path) -> None:
         ),
         (
             "{kind: grid, values: [20, 40]}", "{kind: column, file: odd.csv, column: a}",
-            "6: fleet.formation.spacing_m: 1_0, must be a number",
+            "6: fleet.formation.spacing_m: 1_0, must be a number (odd.csv: a in row 1)",
         ),
         ("base: base.yaml", "base: basse.yaml", "3: base: {here}/basse.yaml: no such file, did you mean base.yaml?"),
         (

@@ -446,7 +446,7 @@ def test_the_best_of_a_condition_is_bold_in_whichever_table_it_stands(
     assert conditions is not None
     cells = [Cell(p, c, ap, 0.0, 0.0, 0.0) for (p, c), ap in LATER.items()]
     tables = list(_by_condition(conditions, ["silence", "boxes"], cells, 20))
-    bold = [[str(cell).startswith("[bold]") for cell in table.columns[2].cells] for table in tables]
+    bold = [[cell.style == "bold" for cell in table.columns[2].cells] for table in tables]
     assert bold == [[False, True], [True, False]]
     (wide,) = _by_condition(conditions, ["silence", "boxes"], cells, 200)
     assert [len(wide.columns), list(wide.columns[1].cells)] == [4, ["0.5", "0.125"]]

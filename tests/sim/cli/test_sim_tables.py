@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 
-from rich.console import Console
 from rich.table import Table
 from sim_examples import example
 
@@ -16,13 +15,14 @@ from sortie.sim.cli.tables import verdict_table
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.summary import transitions_table
+from sortie.sim.terminal import Terminal
 
 REASON = "as in [roi] and [/roi]"
 """Which the terminal's markup would swallow, or stumble over."""
 
 
 def printed(table: Table) -> str:
-    console = Console(file=io.StringIO(), width=200)
+    console = Terminal(file=io.StringIO(), width=200)
     console.print(table)
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 

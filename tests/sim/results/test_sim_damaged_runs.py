@@ -18,7 +18,6 @@ from cli_examples import command, refusal
 from rich.console import Console
 
 import sortie
-from sortie.policies.contract import MAX_REASON
 from sortie.sim.folders import RunError
 from sortie.sim.results.run_checks import MOST_CHARACTERS
 from sortie.sim.studies.compare import Compared, Flown
@@ -185,9 +184,10 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "scenario not UTF-8": (text("scenario.yaml", b"name: \xff\n"), "utf-8"),
     "scenario of more drones": (instead("scenario.yaml", "drones: 3", "drones: 4"), "states.parquet has 60 rows, must have 80"),
     "scenario of more time": (instead("scenario.yaml", "duration_s: 2.0", "duration_s: 9.0"), "states.parquet has 60 rows"),
-    "scenario of other classes": (instead("scenario.yaml", "  classes: [car]", "  classes: [car, truck]"), "no column kind"),
+    "scenario of other classes": (instead("scenario.yaml", "trucks: 0.0", "trucks: 0.5"), "no column kind"),
     "scenario of another name": (instead("scenario.yaml", "track_target", "evil"), "scenario is 'track_target'"),
     "scenario a link": (linked("scenario.yaml", "/dev/zero"), "scenario.yaml is a link"),
+    "recording a link": (lambda run: (run / "sortie.rrd").symlink_to("/dev/zero"), "sortie.rrd is a link"),
     "table missing": (gone("energy.parquet"), "energy.parquet is missing"),
     "table empty": (text("energy.parquet", ""), "energy.parquet: "),
     "table cut": (cut("states.parquet", 0.7), "states.parquet: "),
@@ -222,10 +222,13 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "goodput of too many": (cell("descriptors", "goodput_mbps", [1.0] * 9), "descriptors.parquet: goodput_mbps must have 2 values"),
     "coverage cut": (cell("descriptors", "coverage_grid", b"x"), "descriptors.parquet: coverage_grid must have 64 values"),
     "unknown representation": (cell("directives", "representation", "soul"), "directives.parquet: representation in row 0 is 'soul', must be one of none"),
+    "box missing": (changed("detections", lambda t: t.slice(1)), "detections.parquet: has not the rows that fusions"),
+    "box at another time": (cell("detections", "t_s", 0.5), "detections.parquet: has not the rows that fusions"),
+    "truths missing": (changed("truths", lambda t: t.slice(0, 0)), "truths.parquet: has not the rows that fusions"),
     "unknown cause": (cell("energy", "cause", "x"), "energy.parquet: cause in row 0 is 'x', must be one of rotor"),
     "unknown status": (cell("transmissions", "status", "x"), "transmissions.parquet: status in row 0 is 'x', must be one of delivered"),
     "unknown phase": (cell("mission", "phase", ""), "mission.parquet: phase in row 0 is '', must be one of transit"),
-    "reason too long": (cell("directives", "reason", "x" * (MAX_REASON + 1)), f"must have at most {MAX_REASON} characters"),
+    "reason too long": (cell("directives", "reason", "x" * (MOST_CHARACTERS + 1)), "directives.parquet: reason in row 0 is 'xxx"),
     "text huge": (cell("events", "text", "x" * (MOST_CHARACTERS + 1)), f"must have at most {MOST_CHARACTERS} characters"),
     "belief missing": (gone("beliefs.parquet"), "beliefs.parquet is missing"),
     "view of no descriptor": (cell("views", "descriptors", [10**6]), "views.parquet: descriptors is 1000000, must be 0 to"),

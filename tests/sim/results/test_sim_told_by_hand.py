@@ -29,7 +29,7 @@ def cells(table: Table) -> list[list[str]]:
 
 def test_the_summary_has_every_figure_under_its_own_name() -> None:
     made = told_outcome()
-    assert summary.outcome_table(made).title == "by_hand · worked · seed 1"
+    assert str(summary.outcome_table(made).title) == "by_hand · worked · seed 1"
     assert dict(cells(summary.outcome_table(made))) == {
         "flown": "91.1 % of drone-seconds",
         "AP@0.5": "0.401 full scene, 0.502 mission (scored at 2 Hz, 17 fusions; the surrogate abc, no network)",
@@ -105,9 +105,9 @@ def test_decisions_of_one_frame_are_one_row_and_events_stand_among_them() -> Non
     }  # fmt: skip
     table = summary.transitions_table(made)
     assert cells(table) == [
-        ["0.20", "fleet", "[yellow]jam[/yellow]", "a jammer"],
+        ["0.20", "fleet", "jam", "a jammer"],
         ["0.51", "2→3,4  4→5,6", "nothing → features", "r"],
-        ["0.57", "3", "[yellow]drone_lost[/yellow]", "fell silent"],
+        ["0.57", "3", "drone_lost", "fell silent"],
         ["0.58", "3→4,5", "nothing → features", "other"],
         ["0.59", "1→2,3", "nothing → raw", "r"],
         ["0.60", "1→2,3", "nothing → features", "r"],

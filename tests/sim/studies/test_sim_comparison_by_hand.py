@@ -138,13 +138,16 @@ def test_why_figures_differ_is_told_of_all_sorties_of_a_policy() -> None:
     both.sorties[2].outcome["payload_fates"] = {"in_flight": 2, "lost/retries": 8}
     both.sorties[1].outcome["payload_fates"] = both.sorties[3].outcome["payload_fates"] = {}
     assert list(explanations(both)) == [
-        "[bold]a[/bold]: 20 payloads in all sorties, 45.0 % lost/retries, 30.0 % delivered, 15.0 % expired/deadline_queued, "
-        "10.0 % in_flight; fused data 0.27 s old at the median",
-        "[bold]b[/bold]: sent nothing; every drone saw with its own eyes only",
+        (
+            "a",
+            ": 20 payloads in all sorties, 45.0 % lost/retries, 30.0 % delivered, 15.0 % expired/deadline_queued, "
+            "10.0 % in_flight; fused data 0.27 s old at the median",
+        ),
+        ("b", ": sent nothing; every drone saw with its own eyes only"),
     ]
     for s in both.sorties:
         s.outcome["data_age_s"]["p50"] = None
-    assert next(explanations(both)).endswith("10.0 % in_flight; nothing fused")
+    assert next(explanations(both)).text.endswith("10.0 % in_flight; nothing fused")
 
 
 def test_dots_are_sorties_and_large_ones_their_means() -> None:
@@ -175,9 +178,9 @@ def test_precision_is_told_figure_by_figure() -> None:
         metric="ap50.full_scene", asked=0.06, reached=True, detector="torch", control=True, paired=12, further=34,
         seconds=(15.5, 1.25), cost_ratio=0.375, contrasts=contrasts,
     )  # fmt: skip
-    lines = list(precision_lines(found))
-    assert lines[0].startswith("[bold]half-width[/bold] of ap50.full_scene: 5.00 AP points, 6 asked, reached")
-    assert lines[1].startswith("[bold]flown[/bold]: 12 seeds by torch, and 34 further seeds by the surrogate")
+    lines = [name + text for name, text in precision_lines(found)]
+    assert lines[0].startswith("half-width of ap50.full_scene: 5.00 AP points, 6 asked, reached")
+    assert lines[1].startswith("flown: 12 seeds by torch, and 34 further seeds by the surrogate")
     assert lines[-1].endswith(
         "15.5 s of processor time for a seed by torch, 1.2 s by the surrogate; in all 0.38 of what torch alone is predicted to take"
     )

@@ -118,7 +118,7 @@ def test_a_useless_surrogate_is_named_and_left_out() -> None:
         flown.add(row("surrogate", seed, gain))
     found = precision_of(flown, ["silence"], settings, "torch")
     assert (found.control, found.further, found.contrasts[0].coefficient) == (False, 0, 0.0)
-    told = "\n".join(precision_lines(found))
+    told = "\n".join(name + text for name, text in precision_lines(found))
     assert "the surrogate was not used" in told
     assert found.cost_ratio == pytest.approx((len(flown.torch) * 15 + 12) / (15 * len(flown.torch)), rel=0.15)
 
@@ -129,7 +129,9 @@ def test_a_comparison_stops_when_its_seeds_are_used_up() -> None:
     assert plans[-1].paired == 22
     found = precision_of(flown_to(plans[-1], 0.5, plans), ["silence"], settings, "torch")
     assert not found.reached
-    assert "not reached, as the seeds were used up: --most-seeds" in "\n".join(precision_lines(found))
+    assert "not reached, as the seeds were used up: --most-seeds" in "\n".join(
+        name + text for name, text in precision_lines(found)
+    )
 
 
 def equal(seeds: int, plans: Sequence[Batch]) -> Flown:
@@ -149,7 +151,7 @@ def test_gains_that_are_all_equal_count_as_known_from_thirty_seeds_on() -> None:
     assert 30 <= plans[-1].paired < 36, "policies that decide alike do not fly to the end"
     found = precision_of(equal(plans[-1].paired, plans), ["silence"], Settings(0.01), "torch")
     assert found.reached
-    told = next(iter(precision_lines(found)))
+    told = "".join(next(iter(precision_lines(found))))
     assert f": none, as the gains are all equal in {plans[-1].paired} seeds, 1 asked, reached; " in told
 
 
@@ -157,7 +159,7 @@ def test_gains_that_are_all_equal_in_a_few_seeds_reach_no_half_width() -> None:
     settings = Settings(0.01, most=20)
     found = precision_of(equal(20, [Batch(20, 0, control=False)]), ["silence"], settings, "torch")
     assert not found.reached
-    assert "all equal in 20 seeds, 1 asked, not reached" in next(iter(precision_lines(found)))
+    assert "all equal in 20 seeds, 1 asked, not reached" in next(iter(precision_lines(found))).text
 
 
 def test_seeds_without_a_gain_count_nowhere() -> None:
