@@ -231,13 +231,13 @@ def _placed(path: Path, columns: Mapping[str, Array], origin: Origin | None) -> 
 def _check_near(path: Path, fixes: Array, metres: Array, origin: Origin | None) -> None:
     """Refuse places on the globe beyond the bounds of `POSITION`; `metres` is ENU with the earth's curvature."""
     most_m = BOUNDS[POSITION[0]][1]
-    far = (np.abs(metres) > most_m).any(axis=-1)
+    far = np.asarray((np.abs(metres) > most_m).any(axis=-1))
     if not far.any():
         return
-    unset = (fixes[:, :2] == 0.0).all(axis=-1)  # what receivers report before they have a fix
+    unset = np.asarray((fixes[:, :2] == 0.0).all(axis=-1))  # what receivers report before they have a fix
     if origin is None:
-        off_m = np.linalg.norm(metres - np.nanmedian(metres, axis=0), axis=-1)
-        far = unset if unset.any() else off_m == np.nanmax(off_m)
+        off_m: Array = np.asarray(np.linalg.norm(metres - np.nanmedian(metres, axis=0), axis=-1))
+        far = unset if unset.any() else off_m >= float(np.nanmax(off_m))
     row = first_row(far)
     others = np.zeros(3) if origin is not None else metres
     away_km = np.nanmax(np.linalg.norm(metres[row - 1] - others, axis=-1)) / 1e3

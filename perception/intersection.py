@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 TOLERANCE = 1e-4
 """By which share the largest slope of log det P⁻¹ may be above the mean slope; at the best weights none is above it."""
-MOST_ROUNDS = 400
+MOST_ROUNDS = 2000
 
 
 class Intersection(NamedTuple):

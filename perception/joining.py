@@ -41,7 +41,7 @@ from sortie.perception.lateness import (
     variance_m2,
     within,
 )
-from sortie.perception.metrics.ap import best_first, rivals, standing
+from sortie.perception.metrics.ap import ranks, rivals, standing
 from sortie.perception.metrics.overlap import close_people
 from sortie.perception.tracking.following import boxes_of, motion_of, motion_of_boxes
 from sortie.perception.types import Boxes, Capture, Share
@@ -221,12 +221,13 @@ def _joined_many(
     if rule == "nms":
         score = (boxes.score * (np.minimum(weight, 1.0) * left)).astype(np.float32)
         boxes = replace(boxes, score=score)
-        order = best_first(boxes.table(), score, ego)
+        order = np.lexsort((-score, ego))
     else:
-        order = best_first(boxes.table(), boxes.score * weight * left, ego)
+        score = boxes.score * weight * left
+        order = np.lexsort((-score, ego))
     boxes, source, ego, left, known = boxes.take(order), source[order], ego[order], left[order], known[order]
     covariance = None if covariance is None else covariance[order]
-    i, j = _of_one_thing(boxes, source, ego)
+    i, j = _of_one_thing(boxes, score[order], source, ego)
     kept = standing(len(ego), i, j)
     ends = np.searchsorted(ego, np.arange(len(receivers) + 1))
     if rule == "nms":
@@ -256,16 +257,20 @@ def _joined_many(
     return out
 
 
-def _of_one_thing(boxes: Boxes, source: NDArray[np.intp], ego: NDArray[np.intp]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Pairs (i, j) of one ego's boxes of one class that are taken to be of one thing, i the better one; boxes best first."""
-    i, j, iou = rivals(boxes.table(), ego)
+def _of_one_thing(
+    boxes: Boxes, score: NDArray[np.floating], source: NDArray[np.intp], ego: NDArray[np.intp]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Pairs (i, j) of one ego's boxes of one class that are taken to be of one thing, i the better one by `score`."""
+    table = boxes.table()
+    rank = ranks(table, score, ego)
+    i, j, iou = rivals(table, rank, ego)
     i, j = i[iou > NMS_IOU], j[iou > NMS_IOU]
     kind = boxes.kind
     if not kind.any():
         return i, j
     same = (kind[i] == kind[j]) & (kind[i] != PERSON)
     a, b, _ = close_people(boxes.xy_m, kind, boxes.xy_m, kind, ego, ego)
-    near = (a < b) & (source[a] != source[b])
+    near = (rank[a] < rank[b]) & (source[a] != source[b])
     return np.concatenate([i[same], a[near]]), np.concatenate([j[same], b[near]])
 
 

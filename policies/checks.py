@@ -273,8 +273,9 @@ def _reason_fault(reason: object) -> str | None:
         return f"reason is {text_of(reason)}, must be text"
     if _HALF_PAIR.search(reason):
         return f"reason is {reason!r:.200}, must be text that UTF-8 can write"
-    if len(reason) > MAX_REASON:
-        return f"reason has {len(reason)} characters, must have at most {MAX_REASON}"
+    length = str.__len__(reason)  # `verification.symbols.Text` refuses `len`
+    if length > MAX_REASON:
+        return f"reason has {length} characters, must have at most {MAX_REASON}"
     return None
 
 

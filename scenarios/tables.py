@@ -8,17 +8,19 @@ below the names; empty lines are no rows.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import os
 import re
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.regular import regular
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -61,8 +63,12 @@ def read_table(path: Path, wanted: Collection[str]) -> Table:
     import pyarrow as pa  # here, because most sorties read none
     import pyarrow.parquet
 
-    if not os.path.isfile(path):
+    if not os.path.exists(path):
         raise TableError(f"{path}: no such file")
+    try:
+        regular(path)
+    except OSError as error:
+        raise TableError(f"{path}: {error.strerror}") from None
     try:
         with path.open("rb") as file:
             begin = file.read(len(PARQUET))
@@ -127,13 +133,15 @@ def _text(path: Path, wanted: Collection[str]) -> Table:
         if not chosen or file.seek(0, os.SEEK_END) == begin.end():  # pyarrow refuses that
             return Table({name: pa.chunked_array([], pa.string()) for name in chosen}, names, separator != ",")
         file.seek(begin.end())
+        handler = other_width if _is_utf8(file) else None  # pyarrow decodes the row that it hands over
+        file.seek(begin.end())
         columns = [str(k) for k in range(len(names))]
         its = [str(k) for k in chosen.values()]
         try:
             table = pa.csv.read_csv(
                 file,
                 pa.csv.ReadOptions(column_names=columns, use_threads=False),  # so that an error names the row
-                pa.csv.ParseOptions(delimiter=separator, invalid_row_handler=other_width),
+                pa.csv.ParseOptions(delimiter=separator, invalid_row_handler=handler),
                 pa.csv.ConvertOptions(column_types=dict.fromkeys(its, pa.string()), include_columns=its),
             )
         except pa.ArrowInvalid:
@@ -143,6 +151,18 @@ def _text(path: Path, wanted: Collection[str]) -> Table:
             cells = f"row {row.number} has {row.actual_columns} cells, must have {row.expected_columns}, as the names"
             raise TableError(f"{path}: {cells}") from None
     return Table({name: table[str(k)] for name, k in chosen.items()}, names, separator != ",")
+
+
+def _is_utf8(file: BinaryIO) -> bool:
+    """Whether the rest of a file is UTF-8."""
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        while chunk := file.read(2**20):
+            decoder.decode(chunk)
+        decoder.decode(b"", final=True)
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _numbers(where: str, column: pa.ChunkedArray, table: Table) -> npt.NDArray[np.float64]:
@@ -155,7 +175,10 @@ def _numbers(where: str, column: pa.ChunkedArray, table: Table) -> npt.NDArray[n
             return np.asarray(column.cast(pa.float64()).to_numpy())
         except pa.ArrowException:
             raise TableError(f"{where} holds {column.type}, must hold numbers") from None
-    text = pc.utf8_lower(pc.utf8_trim(column, ' \t\u00a0"'))
+    try:
+        text = pc.utf8_lower(pc.utf8_trim(column, ' \t\u00a0"'))
+    except pa.ArrowException:  # Parquet may hold any bytes
+        raise TableError(f"{where} holds texts that are not UTF-8, must hold numbers") from None
     text = pc.if_else(pc.is_in(text, pa.array(EMPTY)), pa.scalar(None, text.type), text)
     if table.decimal_comma:
         comma = pc.match_substring(text, ",")

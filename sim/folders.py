@@ -21,6 +21,10 @@ _RUN = ("outcome.json", "record.json", "scenario.yaml")
 _NAME_BYTES = 228
 """A name may have so many bytes: file systems allow 255, and `run_folder.beside` and `partial_path` add some."""
 
+GENERATOR = '<meta name="generator" content="Sortie">'
+"""In the head of each page that Sortie writes."""
+_HEAD_BYTES = 1000
+
 
 class RunError(SortieError):
     """A file or folder that cannot be used as the user asked; the message names the path."""
@@ -60,7 +64,7 @@ def ensure_files(*paths: Path | None, replace: bool = True) -> None:
 
     Args:
         paths: the files to be.
-        replace: whether files that exist may be replaced, whoever wrote them.
+        replace: whether files that exist may be replaced, whoever wrote them. A page of Sortie always may.
 
     Raises:
         RunError: one is a folder, a part of a run, named twice, cannot be made, or exists and may not be replaced.
@@ -76,8 +80,14 @@ def ensure_files(*paths: Path | None, replace: bool = True) -> None:
         if path.resolve() in places:
             raise RunError(f"{path}: two outputs have this name, and one would replace the other; name two files")
         places.add(path.resolve())
-        if not replace and os.path.lexists(path):
+        if not replace and os.path.lexists(path) and not _is_own_page(path):
             raise RunError(f"{path}: exists already; choose another file, or replace it with --replace")
+
+
+def _is_own_page(path: Path) -> bool:
+    """Whether a file is an HTML page that Sortie wrote."""
+    with path.open("rb") as file:
+        return GENERATOR.encode() in file.read(_HEAD_BYTES)
 
 
 def _ensure_spared(path: Path) -> None:

@@ -12,13 +12,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import sortie
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plugins.reference import PluginError, describe_error, passes_through_users
 from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version
 
-_HOME = Path(sortie.__file__).parent
+_HOME = Path(__file__).parents[1]
 """Files below it are Sortie's own."""
 _USED_UP = (errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE)
 """The disk, a quota or the number of open files."""
@@ -40,7 +39,7 @@ def of_user(error: Exception) -> SortieError | None:
     """An error as one that the user can put right; None where it is a defect of Sortie.
 
     These are the user's: every `SortieError`, what code of the user raises, a missing extra, and an error of the
-    operating system about a path outside Sortie, about a full disk or about the limit of open files.
+    operating system about a path outside Sortie, about a full disk, used-up memory or the limit of open files.
     """
     if isinstance(error, SortieError):
         return error
@@ -51,6 +50,8 @@ def of_user(error: Exception) -> SortieError | None:
         return found if isinstance(found, SortieError) else None
     if isinstance(error, OSError):
         return _of_system(error)
+    if isinstance(error, MemoryError):
+        return RunError("the memory is used up; free some, or fly a smaller fleet or a shorter flight")
     return None
 
 

@@ -328,6 +328,7 @@ def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = F
         >>> sortie.replay(run, "silence").table.column_names[:5]
         ['t_s', 'drone', 'decision', 'peer', 'fields']
     """
+    from sortie.scenarios.plugins.user_calls import guarded
     from sortie.sim.engine.pilot import NamedPolicy, PolicyPlan, plan_for
     from sortie.sim.identity import name_of, policy_files
     from sortie.sim.studies.replay import replay as decide_again
@@ -337,7 +338,7 @@ def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = F
     if policy is None and run.path is not None and (files := policy_files(run.scenario)):
         raise RunError(f"{run.path}: {files[0]} decided in flight; name it as the policy to run that file again")
     chosen, function = _with_policy(run.scenario, policy)
-    plan = plan_for(chosen) if function is None else PolicyPlan(NamedPolicy(name_of(function), function))
+    plan = plan_for(chosen) if function is None else PolicyPlan(NamedPolicy(name_of(function), guarded(function)))
     return decide_again(run.record, plan, as_flown=policy is None, disagreement=disagreement)
 
 

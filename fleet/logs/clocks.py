@@ -27,6 +27,8 @@ DRIFT_S = 0.25
 _LATEST = 20
 """Rows by which a ground computer's clock is placed: the last ones, since a clock that is set is right afterwards."""
 _WRAP = 2.0**32
+_SLOW = 0.1
+"""What runs at less than this share of the ground's time is no clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +146,7 @@ def sent_when(arrived_us: Numbers, boot_ms: Array, kind: Numbers) -> Arrivals:
     Args:
         arrived_us: the ground computer's stamps.
         boot_ms: the vehicle's clock, 32 bits of ms since it started, or any other clock of its; NaN where a message has none.
-        kind: which message each is. One that always says the same time does not say any.
+        kind: which message each is. One that always says the same time, or nearly so, does not say any.
     """
     boot_ms = boot_ms.copy()
     for each in np.unique(kind):
@@ -156,6 +158,10 @@ def sent_when(arrived_us: Numbers, boot_ms: Array, kind: Numbers) -> Arrivals:
     if len(known) < 3:
         return Arrivals(everything, 0, len(everything), arrived_us, 0, 0, 0)
     boot_s = np.unwrap(boot_ms[known], period=_WRAP) * 1e-3
+    span = min(AROUND, len(known) - 1)
+    own_ms, ground_us = (np.median(np.abs(of[span:] - of[:-span])) for of in (boot_ms[known], arrived_us[known]))
+    if own_ms * 1e3 < _SLOW * ground_us:
+        return Arrivals(everything, 0, len(everything), arrived_us, 0, 0, 0)
     run = longest_stretch(boot_s, kind[known])
     kept = everything
     begin = int(known[run.begin]) if run.begin else 0

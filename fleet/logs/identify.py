@@ -14,25 +14,21 @@ from sortie.scenarios.schema import Battery, Polarisation
 
 Array = npt.NDArray[np.float64]
 
-CAPACITY_PARAMETER = "BATT_CAPACITY"
-"""ArduPilot's, mAh."""
-
 
 def stated_pack(log: FlightLog, cells: int, capacity_ah: float | None = None) -> Battery:
     """The pack as its data say: cells, capacity, and this project's defaults for the rest.
 
     Args:
-        log: its parameters give the capacity where it is not given.
+        log: gives the capacity where it is not given.
         cells: in series.
         capacity_ah: charge of a full pack.
 
     Raises:
         LogError: no capacity, neither given nor in the log.
     """
-    if capacity_ah is None:
-        capacity_ah = log.parameters.get(CAPACITY_PARAMETER, 0.0) / 1000.0
-    if not capacity_ah > 0:
-        raise LogError(f"{log.path}: no parameter {CAPACITY_PARAMETER}: give the pack's capacity")
+    capacity_ah = log.capacity_ah if capacity_ah is None else capacity_ah
+    if capacity_ah is None or not capacity_ah > 0:
+        raise LogError(f"{log.path}: does not say the pack's capacity: give it")
     return Battery(capacity_wh=capacity_ah * cells * MEAN_CELL_V, cells=cells)
 
 

@@ -97,8 +97,8 @@ def _told(sent: Arrivals) -> list[str]:
         (sent.odd, f"{sent.odd} messages have an impossible time of the vehicle's clock and are left out"),
         (
             sent.restarts,
-            f"the vehicle restarted {sent.restarts} times; the longest stretch is taken, messages {sent.begin + 1} to "
-            f"{sent.end} of {len(sent.kept)}",
+            f"the vehicle restarted {sent.restarts} time{'s' if sent.restarts > 1 else ''}; the longest stretch is "
+            f"taken, messages {sent.begin + 1} to {sent.end} of {len(sent.kept)}",
         ),
         (
             sent.moved,

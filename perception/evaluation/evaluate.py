@@ -266,7 +266,7 @@ def match_all(
     world = np.stack(
         [*to_world(boxes[:, 0], boxes[:, 1], pose), boxes[:, 2], boxes[:, 3], boxes[:, 4] + pose[2]], axis=1
     )
-    left = suppressed(world, image, settings.nms_iou)
+    left = suppressed(world, np.arange(len(world)), image, settings.nms_iou)
     world, image = world[left], image[left]
     score = boxes[left, 5].astype(np.float32).astype(np.float64)  # as it is stored
 

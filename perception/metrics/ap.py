@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ from sortie.scenarios.disc import Disc
 
 __all__ = [  # the overlap's two main functions are had from here too
     "CONVENTIONS", "ROTATED", "Convention", "Judged", "Matched", "area", "average_precision", "best_first",
-    "best_pairs", "corners", "hits", "iou_pairs", "judge", "match", "match_many", "paired", "ranked", "suppress", "suppressed",
+    "best_pairs", "corners", "hits", "iou_pairs", "judge", "match", "match_many", "paired", "ranked", "ranks", "suppress", "suppressed",
 ]  # fmt: skip
 
 Bools = NDArray[np.bool_]
@@ -88,7 +88,7 @@ class Matched:
         return Matched(self.score[keep], self.hit[keep], self.truths)
 
 
-def best_first(boxes: Floats, score: Floats, image: Ints) -> Ints:
+def best_first(boxes: Floats, score: NDArray[Any], image: Ints) -> Ints:
     """The order in which boxes [n, 5 or more] of several images are dealt with: image by image, best score first, then by place."""
     order = np.lexsort((-score, image))
     tied = (np.diff(score[order]) == 0) & (np.diff(image[order]) == 0)
@@ -101,10 +101,17 @@ def ranked(boxes: Boxes) -> Boxes:
     return boxes.take(best_first(table, boxes.score, np.zeros(len(boxes), np.int64)))
 
 
-def rivals(boxes: Floats, image: Ints) -> tuple[Ints, Ints, Floats]:
-    """Pairs (i, j) of boxes [n, 5] of one image that may overlap, i the better one, and their IoU; boxes best first."""
+def ranks(boxes: Floats, score: NDArray[Any], image: Ints) -> Ints:
+    """The place of each box [n, 5 or more] in the order of `best_first`."""
+    rank = np.empty(len(boxes), np.int64)
+    rank[best_first(boxes, score, image)] = np.arange(len(boxes))
+    return rank
+
+
+def rivals(boxes: Floats, rank: Ints, image: Ints) -> tuple[Ints, Ints, Floats]:
+    """Pairs (i, j) of boxes [n, 5] of one image that may overlap, i the better one by its `ranks`, and their IoU."""
     i, j = near_pairs(boxes, boxes, image, image)
-    better = i < j
+    better = rank[i] < rank[j]
     i, j = i[better], j[better]
     return i, j, iou_pairs(boxes[i], boxes[j])
 
@@ -126,14 +133,14 @@ def standing(count: int, i: Ints, j: Ints) -> Bools:
     return keep
 
 
-def suppressed(boxes: Floats, image: Ints, iou: float) -> Bools:
+def suppressed(boxes: Floats, rank: Ints, image: Ints, iou: float) -> Bools:
     """Which boxes [n, 5] rotated non-maximum suppression leaves, best first: one that overlaps a kept one by more goes.
 
     Args:
-        boxes, image: in the order of `best_first`.
+        boxes, rank, image: of each box, its place among the `ranks`, and its image.
         iou: the limit.
     """
-    i, j, value = rivals(boxes, image)
+    i, j, value = rivals(boxes, rank, image)
     clash = value > iou
     return standing(len(boxes), i[clash], j[clash])
 
@@ -204,8 +211,10 @@ def alike(
 
 def suppress(boxes: Boxes, iou: float) -> Boxes:
     """Rotated non-maximum suppression of one image: best first, a box that overlaps a kept one by more than `iou` goes."""
-    boxes = ranked(boxes)
-    return boxes.take(suppressed(boxes.table(), np.zeros(len(boxes), np.int64), iou))
+    boxes = boxes.take(np.argsort(-boxes.score, kind="stable"))
+    table, image = boxes.table(), np.zeros(len(boxes), np.int64)
+    rank = ranks(np.column_stack([table, boxes.kind]), boxes.score, image)
+    return boxes.take(suppressed(table, rank, image, iou))
 
 
 def match(

@@ -228,9 +228,10 @@ def checked(path: Path, small: Mapping[str, NDArray[Any]], large: Mapping[str, A
     checks.require("pose", d > 0, "has no drones", "at least one")
     est_pose = checks.numbers("est_pose", (n, d, 3)) if "est_pose" in small else pose
     for name, poses in (("pose", pose), ("est_pose", est_pose)):
-        if len(far := np.argwhere(wrong_yaw(poses[..., 2]))):
-            at = [*far[0].tolist(), 2]
-            checks.require(name, False, f"{at} is {poses[tuple(at)]:g}", f"within ±{YAW_RAD:.2f} rad, not degrees")
+        if len(turned := np.argwhere(wrong_yaw(poses[..., 2]))):
+            frame, drone = turned[0].tolist()
+            what = f"[{frame}, {drone}, 2] is {poses[frame, drone, 2]:g}"
+            checks.require(name, False, what, f"within ±{YAW_RAD:.2f} rad, not degrees")
     parts = []
     for name, width, count in (("boxes", 6, n * d), ("truth", 5, n)):
         table = checks.numbers(name, (None, width))

@@ -11,7 +11,7 @@ import copy
 import itertools
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from time import monotonic  # before a user's file may replace it in its module
+from time import process_time  # before a user's file may replace it in its module
 from typing import Any, NamedTuple
 
 from sortie.policies.contract import Directive, Disc, FleetView, Policy
@@ -44,16 +44,16 @@ class Searched:
 
 
 class Budget:
-    """The time that several searches or tests of a policy may take together, from now on."""
+    """The processor time that several searches or tests of a policy may take together, from now on."""
 
     def __init__(self, budget_s: float) -> None:
         self.budget_s = budget_s
-        self._begin_s = monotonic()
+        self._begin_s = process_time()
 
     @property
     def is_spent(self) -> bool:
         """Whether the time is over."""
-        return monotonic() - self._begin_s >= self.budget_s
+        return process_time() - self._begin_s >= self.budget_s
 
     def shares(self, count: int) -> list[Budget]:
         """An even share for each of several that follow each other. What one leaves, the next may use."""

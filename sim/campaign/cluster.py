@@ -149,14 +149,15 @@ class Dask:
         now_s = time.monotonic()
         self._alone_since_s = now_s if self._alone_since_s is None else self._alone_since_s
         begin = f"; start one: dask worker {self._where}"
-        if (alone_s := now_s - self._alone_since_s) >= self._wait_s:
+        alone_s = now_s - self._alone_since_s
+        if alone_s >= PATIENCE_S - LOOK_S and not self._noticed:
+            self._noticed = True
+            self._notice(f"{self._name}: no workers; waiting for up to {self._wait_s:g} s (--wait-for-workers){begin}")
+        if alone_s >= self._wait_s:
             raise RunError(
                 f"{self._name}: no worker for {self._wait_s:g} s (--wait-for-workers); what is finished is kept, "
                 f"the same command goes on{begin}"
             )
-        if alone_s >= PATIENCE_S - LOOK_S and not self._noticed:
-            self._noticed = True
-            self._notice(f"{self._name}: no workers; waiting for up to {self._wait_s:g} s (--wait-for-workers){begin}")
 
     @property
     def _name(self) -> str:

@@ -103,7 +103,7 @@ def main() -> None:
     """The `sortie` command, once it is imported (sortie.__main__)."""
     own_process()
     own_streams()
-    code: object = 0
+    code: str | int | None = 0
     try:
         try:
             app(prog_name="sortie")  # also in the child process of `_supervised`

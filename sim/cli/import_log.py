@@ -178,7 +178,8 @@ def _zero(flights: Sequence[FlightLog], lifted_m: float) -> Origin | None:
     at_s, moved_m = placed.fix.time_s[0], (0.0, 0.0, 0.0)
     if len(flights) == 1 and placed.position is not None:  # the first fix may come after the first place
         at_s = max(at_s, placed.position.time_s[0])
-        moved_m = tuple(-float(np.interp(at_s, placed.position.time_s, column)) for column in placed.position.values.T)
+        x, y, z = (float(np.interp(at_s, placed.position.time_s, column)) for column in placed.position.values.T)
+        moved_m = (-x, -y, -z)
     latitude, longitude, altitude = (np.interp(at_s, placed.fix.time_s, column) for column in placed.fix.values.T)
     try:
         place = Origin(float(latitude), float(longitude), float(altitude))

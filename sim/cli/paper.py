@@ -122,7 +122,6 @@ def paper(
         _open_frame(
             making.frame_picture(job, work, frame, ego),
             work / "frames" / f"seed{seed}_frame{frame}_ego{ego}.rrd",
-            out,
             show=show,
         )
         return

@@ -22,7 +22,7 @@ def report(
     ] = None,
     replace: ReplaceOption = False,
 ) -> None:
-    """Write a run as one self-contained HTML page: figures, outcome and decisions. A file that exists needs --replace."""
+    """Write a run as one self-contained HTML page: figures, outcome and decisions. Only a page of Sortie is replaced without --replace."""
     path = out_path or run / PAGE
     opened = sortie.open_run(run)
     ensure_files(path, replace=replace)

@@ -2,7 +2,7 @@
 
 answers in time         its directives
 raises, breaks rules    the fallback, for this decision
-is late                 the fallback until it answers; after `HANGS_S` its process is killed
+is late                 the fallback until it answers; when a peer as silent would be detached, its process is killed
 its process ends        the fallback; a new process is started, at most one each `RESTART_S`
 """
 
@@ -20,8 +20,6 @@ from sortie.scenarios.representation import NAME_OF
 from sortie.sim.folders import RunError
 from sortie.sim.live.policy_process import Ask, Begin, Decision, Loaded, PolicyOrders, serve
 
-HANGS_S = 1.0
-"""A policy that has not answered for this long is killed: after as long, a silent peer is detached."""
 RESTART_S = 1.0
 """The shortest time from one start of the process to the next."""
 LOAD_S = 300.0
@@ -80,6 +78,9 @@ class Watchdog:
             deadline_s: the longest time for a decision; the drone waits so long at most once for a policy that hangs.
         """
         self._orders, self._fallback, self._deadline_s = orders, fallback, deadline_s
+        context = orders.scenario.context
+        self._hangs_s = context.detached_after_periods * context.publish_every * orders.scenario.frame_s
+        """A policy that has not answered for this long is killed: after as long, a silent peer is detached."""
         self._begin: Begin | None = None
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
@@ -204,7 +205,7 @@ class Watchdog:
             self._asked_s = None
             return self._ask_now(view)
         waited_s = time.monotonic() - self._asked_s
-        if waited_s > HANGS_S:
+        if waited_s > self._hangs_s:
             self._end(kill=True)
             self._note(f"the policy's process was killed: no answer for {waited_s:.1f} s")
         return f"the policy did not answer within {self._deadline_s:g} s"

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from html import escape
 
 from sortie.scenarios.report_text import visible
+from sortie.sim.folders import GENERATOR
 
 STYLE = """
 :root { color-scheme: light; }
@@ -74,13 +75,14 @@ def html_page(title: str, of: str, body: Html) -> str:
         of: what the page is of, as text; one line below the title.
         body: the rest; it ends with a line's end.
     """
-    return html(_PAGE, title=title, style=Html(STYLE), of=of, body=body)
+    return html(_PAGE, generator=Html(GENERATOR), title=title, style=Html(STYLE), of=of, body=body)
 
 
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
+{generator}
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{title}</title>
 <style>{style}</style>

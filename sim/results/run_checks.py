@@ -21,7 +21,7 @@ from sortie.fleet.energy.battery import CAUSES as ENERGY_CAUSES
 from sortie.fleet.energy.battery import RECORDED
 from sortie.fleet.staleness import LinkHealth
 from sortie.perception.classes import TargetClass
-from sortie.policies.contract import COVERAGE_BYTES, DIRECTIVE_BOUNDS, PHASE_OF, TaskPhase
+from sortie.policies.contract import COVERAGE_BYTES, DIRECTIVE_BOUNDS, PHASE_OF, Representation, TaskPhase
 from sortie.policies.verification.enforced import CAUSES
 from sortie.radio.transmission import Status
 from sortie.scenarios.disc import LISTED_IDS
@@ -188,6 +188,7 @@ class Checks:
             **dict.fromkeys(("soc", "battery_soc", "cpu_headroom", "gpu_headroom", "busy_fraction", "trust"), share),
             **dict.fromkeys(("t_s", "begin_s"), instant),
             **bounds,
+            "representation": (0, max(map(int, Representation))),  # the highest number, not the highest fidelity
             "transmissions.deadline_s": (0.0, scenario.duration_s + bounds["deadline_s"][1]),
             "stamp_ns": (-1e16, 1e16),
             "group": (0, len(scenario.mission.groups)),

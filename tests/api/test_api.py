@@ -259,7 +259,7 @@ def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.Monkey
         "4",
     ]
     for _ in range(2):  # the second reads what the first kept
-        done = CliRunner().invoke(app, [*command, "--out", "c.json"])
+        done = CliRunner().invoke(app, [*command, "--out", "c.json", "--replace"])
         assert done.exit_code == 0, done.output
         written = json.loads((tmp_path / "c.json").read_text())
         assert written["gains"] == [dataclasses.asdict(gain)]
@@ -302,7 +302,8 @@ def test_how_many_seeds_are_flown(detector: str, seed: int | None, seeds: int | 
 @pytest.mark.slow
 def test_the_command_line_flies_the_seeds_of_the_api(tmp_path: Path) -> None:
     settings = [arg for key, value in SURROGATE.items() for arg in ("--set", f"{key}={value}")]
-    command = ["compare", "track_target", "--policies", "worked,silence", *settings, "--out", str(tmp_path / "c.json")]
+    command = ["compare", "track_target", "--policies", "worked,silence", *settings]
+    command += ["--out", str(tmp_path / "c.json"), "--replace"]
     for more, seeds in ((["--seed", "3", "--seeds", "2"], [3, 4]), ([], None)):
         done = CliRunner().invoke(app, [*command, *more])
         assert done.exit_code == 0, done.output

@@ -72,7 +72,7 @@ NEEDY = {
     ("fly", "track_target", *SURROGATE, "--mavlink", "udpout:127.0.0.1:14550", "--out", "b"): MAVLINK,
     ("export", "a", "--tlog"): MAVLINK,
     ("import", "flown.tlog"): MAVLINK,
-    ("export", "a", "--mcap"): ROS,
+    ("export", "a", "--mcap", "--replace"): ROS,
     ("live", "track_target", "--mavlink", "udpin:127.0.0.1:14550"): MAVLINK,
     ("paper",): "error: torch is missing: pip install 'sortie-sim[torch]'\n",
     ("fly", "track_target", "--out", "b"): "error: perception.detector is torch, which is not installed: "

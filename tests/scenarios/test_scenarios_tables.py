@@ -73,6 +73,9 @@ def test_parquet_has_the_same_names(tmp_path: Path) -> None:
     columns, names = read_numbers(path, ["x_m"])
     np.testing.assert_array_equal(columns["x_m"], [1.5, np.nan])
     assert names == [" X_m ", "at"]
+    pq.write_table(pa.table({"x_m": pa.array([b"\xff"]).cast(pa.string(), safe=False)}), tmp_path / "b.parquet")
+    with pytest.raises(TableError, match=r"x_m holds texts that are not UTF-8, must hold numbers$"):
+        read_numbers(tmp_path / "b.parquet", ["x_m"])
     with pytest.raises(TableError, match=r"flight: at holds timestamp\[ms\], must hold numbers$"):
         read_numbers(path, ["at"])
 
@@ -88,3 +91,10 @@ def test_a_campaign_s_table_is_read_alike(tmp_path: Path) -> None:
     (tmp_path / "v.csv").write_text("power,word\n10,a\nmuch,b\n")
     with pytest.raises(ScenarioError, match=r"radio.tx_power_dbm: much, must be a number \(v.csv: power in row 2\)$"):
         load_campaign(tmp_path / "c.yaml")
+
+
+def test_a_row_of_another_width_that_is_no_utf8_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "v.csv"
+    path.write_bytes(b"t_s,x_m\n0,1\n1,\xb2,3\n")
+    with pytest.raises(TableError, match=r"v\.csv: is not a \.csv table: .*Row #2: Expected 2 columns, got 3"):
+        read_numbers(path, ["t_s"])

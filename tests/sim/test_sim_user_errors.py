@@ -51,7 +51,7 @@ def test_an_extra_without_wheels_is_not_recommended(
         (BrokenPipeError(errno.EPIPE, "broken"), None),
         (ValueError("operands could not be broadcast together"), None),
         (KeyError("ap50"), None),
-        (MemoryError(), None),
+        (MemoryError(), "the memory is used up; free some, or fly a smaller fleet or a shorter flight"),
     ],
 )
 def test_whose_error_it_is(error: Exception, line: str | None) -> None:

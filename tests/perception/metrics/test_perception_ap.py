@@ -291,7 +291,7 @@ def test_suppression_of_many_images_is_the_loop_over_boxes(seed: int) -> None:
         rivals = [j for j in keep if image[j] == image[k]]
         if not rivals or iou_pairs(boxes[rivals], np.repeat(boxes[k : k + 1], len(rivals), 0)).max() <= 0.15:
             keep.append(k)
-    assert np.flatnonzero(suppressed(boxes, image, 0.15)).tolist() == keep
+    assert np.flatnonzero(suppressed(boxes, np.arange(len(boxes)), image, 0.15)).tolist() == keep
 
 
 @settings(max_examples=200, deadline=None)

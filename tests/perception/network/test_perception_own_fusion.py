@@ -152,7 +152,7 @@ def fused(reference: str, params: dict[str, object]) -> torch.Tensor:
         ("short", {}, "fusion <lambda>: returns shape (80, 64, 64), must be (1, 80, 64, 64)"),
         ("infinite", {}, "fusion <lambda>: returns torch.float32 with numbers that are not finite, must be finite floats"),
         ("whole", {}, "fusion <lambda>: returns torch.int32, must be finite floats"),
-        ("broken", {}, "fusion broken: TypeError: broken() takes 0 positional arguments but 3 were given"),
+        ("broken", {}, "fusion broken: TypeError: broken() takes 0 positional arguments but 3 were given (mine.py, line 22)"),
         ("fails", {}, "fusion fails: KeyError: 'ego' (mine.py, line 30)"),
     ],
 )  # fmt: skip

@@ -85,7 +85,7 @@ def test_workers_that_come_late_are_used(tmp_path: Path) -> None:
 
     p, noticed = plan(tmp_path), list[str]()
     client = _Client(*[lambda client: 0] * 8, *[fly] * 200)
-    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786", wait_s=60, notice=noticed.append))
+    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786", wait_s=600, notice=noticed.append))
     assert (done.finished, done.failed) == (48, 0)
     assert len(noticed) == 1
 
@@ -136,7 +136,7 @@ def _closes(client: _Client) -> int:
 def test_a_scheduler_that_dies_is_one_line(tmp_path: Path, what: Callable[[_Client], int], before: int) -> None:
     client = _Client(*[lambda client: 0] * before, *[what] * 9)
     with pytest.raises(RunError) as told:
-        run_campaign(plan(tmp_path), tmp_path / "a", Dask(client, "tcp://head:8786", wait_s=60))
+        run_campaign(plan(tmp_path), tmp_path / "a", Dask(client, "tcp://head:8786", wait_s=600))
     assert str(told.value) == GONE
 
 
@@ -277,7 +277,10 @@ def tls_scheduler(certificates: Callable[[str], tuple[Path, Path, Path]]) -> Ite
 @CLUSTER
 @pytest.mark.slow
 def test_a_cluster_with_tls_flies_the_same_rows_and_lets_nobody_else_in(
-    tmp_path: Path, tls_scheduler: str, certificates: Callable[[str], tuple[Path, Path, Path]]
+    tmp_path: Path,
+    tls_scheduler: str,
+    certificates: Callable[[str], tuple[Path, Path, Path]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     p = plan(tmp_path)
     assert tls_scheduler.startswith("tls://")
@@ -286,6 +289,7 @@ def test_a_cluster_with_tls_flies_the_same_rows_and_lets_nobody_else_in(
         run_campaign(p, tmp_path / "joined", engine)
     assert table_bytes(tmp_path / "joined") == table_bytes(tmp_path / "alone")
     address = tls_scheduler.replace("tls://", "tcp://")
+    monkeypatch.setattr(cluster, "CONNECT_S", 2.0)
     for scheduler, security in ((tls_scheduler, certificates("theirs")), (address, None)):
         with (
             pytest.raises(RunError, match=f"--scheduler {scheduler}: no scheduler answers there"),

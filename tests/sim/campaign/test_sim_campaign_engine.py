@@ -27,7 +27,6 @@ from sortie.sim.campaign.work import Task, fly_batch
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
 from sortie.sim.identity import RELEASE, codes_here
-from sortie.sim.user_errors import user_errors
 
 pytest.importorskip("distributed")
 
@@ -360,20 +359,6 @@ def test_a_broken_file_is_one_line_on_the_command_line(tmp_path: Path) -> None:
         result = CliRunner().invoke(app, command)
         assert isinstance(result.exception, RunError)  # sortie.sim.cli.app prints it in one line and exits with 2
         assert str(result.exception).startswith(f"{file}: is broken (")
-
-
-@pytest.mark.parametrize(
-    ("error", "message"),
-    [
-        (OSError("ZSTD decompression failed"), "ZSTD decompression failed"),
-        (OSError(2, "No such file"), "No such file"),
-        (OSError(2, "No such file", "a.yaml"), "a.yaml: No such file"),
-    ],
-)
-def test_an_error_without_a_file_or_a_number_still_says_what_it_is(error: OSError, message: str) -> None:
-    with pytest.raises(RunError) as told, user_errors():
-        raise error
-    assert str(told.value) == message
 
 
 def test_a_drawn_value_that_the_schema_refuses_is_a_failed_run(tmp_path: Path) -> None:

@@ -210,7 +210,7 @@ def test_views_of_a_course_come_frame_by_frame_and_count_in_the_plane_s_periods(
 
 def test_courses_end_with_their_time_and_each_line_gets_a_share(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [0.0]
-    monkeypatch.setattr(search, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(search, "process_time", lambda: now_s[0])
 
     def slow(view: FleetView) -> list[Directive]:
         now_s[0] += 0.3
@@ -225,7 +225,7 @@ def test_courses_end_with_their_time_and_each_line_gets_a_share(monkeypatch: pyt
 
 def test_a_course_of_a_slow_policy_is_made_smaller_as_far_as_the_time_allows(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [0.0]
-    monkeypatch.setattr(search, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(search, "process_time", lambda: now_s[0])
     monkeypatch.setattr(over_time, "shows_in_flight", lambda scenario: True)
 
     def silent(view: FleetView) -> list[Directive]:
@@ -298,7 +298,7 @@ def test_a_policy_that_fails_in_a_flight_of_the_scenario_is_refuted_by_it(tmp_pa
 
 def test_a_flight_of_the_scenario_ends_with_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [0.0]
-    monkeypatch.setattr(search, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(search, "process_time", lambda: now_s[0])
     flown_s: list[float] = []
 
     def fly(scenario: Scenario, *, progress: Callable[[float], None]) -> SortieRecord:

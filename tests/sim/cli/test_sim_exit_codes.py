@@ -106,7 +106,7 @@ def test_output_that_cannot_be_written_is_one_line(out: Callable[[], int], befor
         (read_key, "is a device, a pipe or a socket, must be a file"),
         (file_digest, "is a device, a pipe or a socket, must be a file"),
         (open_recording, "is a device, a pipe or a socket, must be a file"),
-        (lambda path: read_columns(path, {}), "no such trace"),
+        (lambda path: read_columns(path, {}), "is a device, a pipe or a socket, must be a file"),
         (lambda path: resolve(f"{path}:mine"), "not found"),
     ],
 )

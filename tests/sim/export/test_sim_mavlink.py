@@ -111,7 +111,7 @@ def test_values_are_the_record_s_in_mavlink_s_frames(log: Path, record: SortieRe
 def test_the_log_of_one_drone(log: Path, record: SortieRecord, tmp_path: Path) -> None:
     """The same messages as in the log of all, and its own numbering."""
     run_folder.save(record, tmp_path / "run")
-    command = ["export", str(tmp_path / "run"), "--tlog", "--drone"]
+    command = ["export", str(tmp_path / "run"), "--tlog", "--replace", "--drone"]
     assert CliRunner().invoke(app, [*command, "1"]).exit_code == 0
     own = read(tmp_path / "run" / "sortie.tlog")
     assert [str(m) for m in own] == [str(m) for m in read(log) if m.get_srcSystem() == 2]
@@ -240,7 +240,8 @@ def test_a_log_lies_where_the_scenario_says(tmp_path: Path) -> None:
         assert last[1] == pytest.approx((52.1 + 0.0002 * 0.95, 13.2 + 0.0004 * 0.95, 89.0), abs=2e-6)
         assert last[2] == pytest.approx((52.1, 13.203, 60.0), abs=2e-6)
     trace.unlink()
-    assert CliRunner().invoke(app, ["export", str(run), "--tlog"]).exit_code == 0  # fleet.origin is in the record
+    again = CliRunner().invoke(app, ["export", str(run), "--tlog", "--replace"])
+    assert again.exit_code == 0  # fleet.origin is in the record
 
 
 def test_a_log_is_signed_from_2015_on(record: SortieRecord, tmp_path: Path) -> None:

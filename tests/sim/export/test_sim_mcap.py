@@ -371,8 +371,8 @@ def test_the_messages_build_as_a_ros_2_package() -> None:
 def test_the_command_writes_the_bag_into_the_run(record: SortieRecord, tmp_path: Path) -> None:
     run = tmp_path / "run"
     run_folder.save(record, run)
-    for _ in range(2):  # a second one replaces the first
-        said = CliRunner().invoke(app, ["export", str(run), "--mcap", "--begin", "2026-11-21T09:00:00+01:00"])
+    for more in ([], ["--replace"]):  # a second one replaces the first
+        said = CliRunner().invoke(app, ["export", str(run), "--mcap", "--begin", "2026-11-21T09:00:00+01:00", *more])
         assert said.exit_code == 0, said.output
     assert sorted(p.name for p in (run / "bag").iterdir()) == ["bag.mcap", "foxglove_layout.json", "metadata.yaml"]
     with (run / "bag" / "bag.mcap").open("rb") as file:

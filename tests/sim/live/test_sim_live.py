@@ -232,6 +232,7 @@ def flown() -> Flown:
                 noticed,
                 "fleet.drones=3",
                 "context.authentication=false",
+                "context.detached_after_periods=60",  # a policy that does not answer as long is killed: its first answer may take seconds
                 "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}",
                 kill=(2, 8.0),
                 domain=domain(__name__),
@@ -360,7 +361,9 @@ def test_ctrl_c_ends_the_flight_and_tells_what_was_measured_and_all_context_lost
 
     # in place of asking the processes to stop, as the helper does
     monkeypatch.setattr(live_flights, "stop", lambda _: signal.raise_signal(signal.SIGINT))
-    result = fly_until(changed, "fleet.drones=2", changing, loss=1.0, domain=domain(__name__), begun=pids.update)
+    result = fly_until(
+        changed, "fleet.drones=2", PATIENT, changing, loss=1.0, domain=domain(__name__), begun=pids.update
+    )
     assert result.interrupted
     assert result.flown_s < LONGEST_S
     assert result.lost == []

@@ -163,7 +163,7 @@ def test_a_policy_that_dies_between_loading_and_the_flight_gets_a_new_process(tm
 def test_a_policy_that_hangs_delays_its_drone_once_and_is_killed(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(watchdog, "HANGS_S", 0.3)
+    watched.watchdog._hangs_s = 0.3
     watched.watchdog._deadline_s = 0.1
     before = watched.watchdog.pid
     waits: list[float] = []
@@ -180,17 +180,15 @@ def test_a_policy_that_hangs_delays_its_drone_once_and_is_killed(
     assert before is not None
     with pytest.raises(ProcessLookupError):
         os.kill(before, 0)
-    monkeypatch.setattr(watchdog, "HANGS_S", 600.0)
+    watched.watchdog._hangs_s = 600.0
     watched.watchdog._deadline_s = 600.0
     watched.mode.write_text("")
     watched.until(lambda: len(watched.notes) == 3)
     assert "decides again" in watched.notes[2]
 
 
-def test_a_late_answer_is_dropped_and_the_policy_is_asked_again(
-    watched: Watched, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(watchdog, "HANGS_S", 600.0)
+def test_a_late_answer_is_dropped_and_the_policy_is_asked_again(watched: Watched) -> None:
+    watched.watchdog._hangs_s = 600.0
     watched.mode.write_text("slow")
     before = watched.watchdog.pid
     watched.watchdog._deadline_s = 0.1

@@ -372,7 +372,7 @@ def test_no_text_of_a_run_is_obeyed_by_commands(
         ("export", evil, "--tlog"),
     ):
         assert command(*arguments) == 0
-    assert command("report", evil) == 2
+    assert command("export", evil, "--pcap") == 2
     printed = capsys.readouterr()
     assert (printed.out + printed.err).replace("\n", "").isprintable()
     assert r"[red]\x1b[2J" in printed.out.replace("\n", "")
@@ -404,3 +404,9 @@ def test_files_that_exist_need_replace(run: Path, tmp_path: Path, capsys: pytest
             assert command(*arguments, "--replace") == 0
         assert mine.encode() not in (tmp_path / file).read_bytes()
         capsys.readouterr()
+
+
+def test_a_page_of_sortie_is_written_again_without_replace(run: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    assert command("report", str(run), "--out", str(page)) == 0
+    assert command("report", str(run), "--out", str(page)) == 0
