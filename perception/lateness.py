@@ -2,7 +2,7 @@
 
 A box of age a is off by a normal error along each axis. Its variance is σ0² where the car stands, and σ0² + (v · a)² where
 it moves; a share m of the cars moves. The parameters were fitted on the calibration's towns by
-`tests/validation/joining_age.py`, which holds the plan and prints the fit. People have parameters of their own, which are assumptions.
+`research/validation/joining_age.py`, which holds the plan and prints the fit. People have parameters of their own, which are assumptions.
 
 Two figures follow. A box's score is multiplied by the chance that it still covers its car (`still_right`). Its place, and a
 map's weight, count by the inverse of their variance (`precision`). Both are relative to the freshest look at hand.

@@ -13,7 +13,7 @@ be served was held up by its own sender's queue, and the rate at which that queu
 A measurement counts for `MEASURED_FOR_S`. A link without one reports 0. A measured link reports at least `SILENT_MBPS`,
 which says that nothing got through (`sortie.scenarios.link_state`).
 
-**Bias and lag** were measured (`tests/validation/link.py`, see the README): about one per cent on a still link; 5 to 7 % low under
+**Bias and lag** were measured (`research/validation/link.py`, see the README): about one per cent on a still link; 5 to 7 % low under
 shadowing, because falling is quicker than rising; a drop shows in the next frame, a recovery in eight.
 """
 

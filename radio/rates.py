@@ -2,7 +2,7 @@
 
 One spatial stream. Over white noise a frame of L bytes fails with the packet error rate (PER)
 1 − (1 + e^{−a (SNR − s)})^{−w L / 1458}: a, s and w were fitted for each MCS to the error tables of ns-3 3.44, which come
-from link simulations (`tests/validation/ns3/per_fit.py`; largest error 0.022, SNR in dB). On a fading link the *mean* PER
+from link simulations (`research/validation/ns3/per_fit.py`; largest error 0.022, SNR in dB). On a fading link the *mean* PER
 is the average of that over the Rician power gain. The fits were made for 802.11ax (LDPC); n and ac use the same modulations
 and codes, and are given the same curves. Group-addressed frames go at the rates of 802.11a, whose convolutional code has
 curves of its own.

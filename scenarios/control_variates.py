@@ -128,7 +128,7 @@ def widened(found: Estimate) -> Estimate:
 
     Such a stop comes too early where the spread happens to be small, so that plain intervals cover less than they say, by an
     amount that falls as 1 / units. The factor was chosen by simulation; `make figures FIGURE=half_width` measures the cover with
-    it, by other random numbers (`docs/results/price.md`).
+    it, by other random numbers (`research/pages/price.md`).
 
     Example:
         >>> widened(Estimate(0.0, -1.0, 1.0, 12)).half_width

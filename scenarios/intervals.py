@@ -4,7 +4,7 @@ An interval covers what was drawn independently, its units: sorties, draws of a 
 single sortie (`sim/studies/compare.py`) are nearly independent only; an interval over them describes that sortie. Two cases:
 
 - **The mean of independent units** (`mean_interval`): Student's interval. Sortie's samples are small, eight sorties for
-  one, where a percentile bootstrap covers well below 95 % (`docs/results/coverage.md`). A metric with a smallest or
+  one, where a percentile bootstrap covers well below 95 % (`research/pages/coverage.md`). A metric with a smallest or
   largest possible value gets Student's interval on a scale without ends, so that no rate leaves 0 … 1 and no number of
   bytes is negative. A yes or no has the exact binomial interval.
 - **A figure that pools its units**, such as an average precision over many frames, is no mean. Its units are resampled

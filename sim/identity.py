@@ -1,4 +1,4 @@
-"""Which code made a record: the release, and a digest of everything that the package holds and stands on."""
+"""Which code made a record (the release, a digest of everything that the package holds and stands on), and on what machine."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 import hashlib
 import inspect
 import numbers
+import platform
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import requires, version
@@ -75,6 +76,16 @@ def _argument(value: object) -> str:
     """An argument as text that is the same in every process: the repr of most objects holds an address."""
     plain = value is None or isinstance(value, str | int | float)
     return repr(value) if plain else name_of(value)
+
+
+def machine() -> str:
+    """The processor's model, where the system reports it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    except OSError:
+        models = []
+    return models[0] if models else platform.processor() or platform.machine()
 
 
 def name_of(thing: object) -> str:

@@ -28,13 +28,13 @@ settings.load_profile("same")  # the same examples in each run; `make nightly` e
 
 
 NIGHTLY = (
-    "api/test_install.py", "api/test_without_extras.py", "benchmarks", "fuzz", "perception/benchmark",
+    "api/test_install.py", "api/test_without_extras.py", "benchmarks", "fuzz", "research/benchmark",
     "perception/network/test_perception_codebook.py", "perception/network/test_perception_fine.py",
     "perception/network/test_perception_fused_grids.py", "perception/recordings/test_perception_uav3d.py",
-    "perception/recordings/test_perception_unpickle.py", "perception/study",
+    "perception/recordings/test_perception_unpickle.py", "research/flip",
     "perception/surrogate/test_perception_surrogate_calibrate.py",
     "perception/surrogate/test_perception_surrogate_correlation.py",
-    "perception/surrogate/test_perception_surrogate_shared_false_positives.py", "perception/training",
+    "perception/surrogate/test_perception_surrogate_shared_false_positives.py", "research/train",
     "policies/verification/test_policies_corpus.py", "policies/verification/test_policies_generated.py",
     "policies/verification/test_policies_hidden.py", "policies/verification/test_policies_large_views.py",
     "policies/verification/test_policies_solver.py", "policies/verification/test_policies_time_of_drawn_views.py",

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class FleetFrames(Protocol):
-    """n fleet-frames of d drones: their poses and the cars. `sortie.perception.benchmark.dataset.Frames` is one."""
+    """n fleet-frames of d drones: their poses and the cars. `research.benchmark.dataset.Frames` is one."""
 
     @property
     def true_pose(self) -> Floats:

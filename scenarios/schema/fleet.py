@@ -42,7 +42,7 @@ class Airframe(PresetSection):
         },
     }
     """`zeng_2019`: the rotary-wing machine of Zeng, Xu & Zhang 2019. `solo`: a 3DR Solo with gimbal and camera, as in
-    `tests/validation/energy.py`, which names its sources and compares it with a recorded flight."""
+    `research/validation/energy.py`, which names its sources and compares it with a recorded flight."""
 
     mass_kg: float = Field(2.04, gt=0, le=100, description="All-up mass without payload, battery included.")
     payload_kg: float = Field(0.0, ge=0, le=100, description="What is carried besides.")

@@ -17,26 +17,19 @@ from sortie._supervised import report as report_code
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.exit_codes import DEFECT, INTERRUPTED, USER
 from sortie.sim.cli import (
-    bench,
-    calibrate,
     campaign,
     check,
     compare,
-    conditions,
     export,
-    fit,
     fly,
     import_log,
     listing,
     live,
     new,
-    paper,
     rank,
     recording,
     replay,
     report,
-    study,
-    train,
     verify,
     view,
     worst,
@@ -47,7 +40,7 @@ from sortie.sim.process import own_process
 from sortie.sim.user_errors import defect, user_errors
 
 
-class _Commands(TyperGroup):
+class Commands(TyperGroup):
     """Prints that a command was interrupted, which typer alone ends silently; the user's errors become `SortieError`."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -77,23 +70,19 @@ def _notes_once() -> Iterator[None]:
 
 
 app = typer.Typer(
-    cls=_Commands,
+    cls=Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     help="Fly drone fleets that share what they see. Print what they saw and what sharing cost.",
 )
-app.add_typer(bench.app, name="bench")
 app.add_typer(recording.app, name="recording")
 campaign.app.command("worst")(worst.worst)
 app.add_typer(campaign.app, name="campaign")
-app.add_typer(study.study, name="study")
-app.add_typer(fit.app, name="fit")
 COMMANDS: dict[str, Callable[..., None]] = {
     "fly": fly.fly, "compare": compare.compare, "check": check.check, "view": view.view, "list": listing.list_, "new": new.new,
-    "train": train.train, "calibrate": calibrate.calibrate, "paper": paper.paper, "learn": conditions.learn,
-    "verify": verify.verify, "overhead": verify.overhead, "export": export.export, "report": report.report,
-    "rank": rank.rank, "replay": replay.replay, "import": import_log.import_log, "live": live.live,
+    "verify": verify.verify, "export": export.export, "report": report.report, "rank": rank.rank,
+    "replay": replay.replay, "import": import_log.import_log, "live": live.live,
 }  # fmt: skip
 for name, command in COMMANDS.items():
     app.command(name)(command)
@@ -101,12 +90,17 @@ for name, command in COMMANDS.items():
 
 def main() -> None:
     """The `sortie` command, once it is imported (sortie.__main__)."""
+    run(app, "sortie")
+
+
+def run(commands: typer.Typer, name: str) -> None:
+    """Run commands as a program of that name: an error of the user's is one line, a defect keeps its traceback."""
     own_process()
     own_streams()
     code: str | int | None = 0
     try:
         try:
-            app(prog_name="sortie")  # also in the child process of `_supervised`
+            commands(prog_name=name)  # also in the child process of `_supervised`
         except SystemExit as ended:
             code = ended.code
         if sys.stdout is not None:

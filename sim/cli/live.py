@@ -150,9 +150,7 @@ def _show(result: LiveResult) -> None:
 
     where = f"{result.begin_s:g}–{result.begin_s + result.flown_s:.0f} s"
     losses = f", {result.loss:.0%} of descriptors lost" if result.loss else ""
-    table = Table(
-        "overhead of the plane", "paper, 4 agents", "here", title=f"{result.scenario}, {where}, {result.policy}{losses}"
-    )
+    table = Table("overhead of the plane", "", title=f"{result.scenario}, {where}, {result.policy}{losses}")
     for row in overhead_rows(result):
         table.add_row(*row)
     out.print(table)

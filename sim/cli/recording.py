@@ -1,4 +1,4 @@
-"""`sortie recording`: show a recording of another model, evaluate it, or make one from UAV3D's files."""
+"""`sortie recording`: show a recording of another model, or evaluate it."""
 
 from __future__ import annotations
 
@@ -66,16 +66,3 @@ def evaluate(
     if save is not None:
         found.save(save)
         print_written("kept in", save)
-
-
-@app.command("from-uav3d")
-def from_uav3d(
-    root: Annotated[Path, typer.Argument(help="The folder with uav3d_infos_val.pkl and the tables' folder.")],
-    out_path: Annotated[Path, typer.Option("--out", help="An npz file, or a new Zarr folder.")],
-    split: Annotated[str, typer.Option(help="train or val.")] = "val",
-) -> None:
-    """Make a recording from a UAV3D split: scenes, times, poses and cars. Add detections yourself."""
-    from sortie.perception.recordings.uav3d import convert
-
-    convert(root, split, out_path)
-    print_written("kept in", out_path)

@@ -1,4 +1,4 @@
-"""Tables of `sortie check`, `sortie train` and `sortie fly --profile` for the terminal."""
+"""Tables of `sortie check` and `sortie fly --profile` for the terminal."""
 
 from __future__ import annotations
 
@@ -25,14 +25,6 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
         because = Text(v.because).append(f"\nthe record: {v.explanation}" if v.explanation else "", "dim")
         verdict = Text("ok", "green") if v.holds else Text("FAILED", "red")
         table.add_row(verdict, v.expected, v.got, because)
-    return table
-
-
-def training_table(result: Any) -> Table:
-    """The result of a training run."""
-    table = Table(title="training", show_header=False)
-    for name in result.__slots__ if hasattr(result, "__slots__") else vars(result):
-        table.add_row(name, str(getattr(result, name)))
     return table
 
 

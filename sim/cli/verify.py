@@ -1,7 +1,4 @@
-"""`sortie verify`: test a policy against the plane's contract, prove its invariants, save counterexamples.
-
-`sortie overhead`: what the plane costs, in bytes and in time, by the size of the fleet.
-"""
+"""`sortie verify`: test a policy against the plane's contract, prove its invariants, save counterexamples."""
 
 from __future__ import annotations
 
@@ -37,12 +34,10 @@ from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_
 from sortie.sim.check.kits import KITS
 from sortie.sim.check.kits import verify as verify_model
 from sortie.sim.check.over_time import COURSES, Subject, TimeVerdict, judge_over_time
-from sortie.sim.cli.console import bars, out, print_failure, print_written
-from sortie.sim.cli.options import refuse, split_policies
+from sortie.sim.cli.console import out, print_failure, print_written
+from sortie.sim.cli.options import refuse
 from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.policy_text import name_and_params
-from sortie.sim.studies.overhead import SCENARIO, SECONDS, host_s, measure
-from sortie.sim.studies.plane_cost import machine
 
 Kept = tuple[str, FleetView | None, Scenario]
 """What failed, a view that shows it if one alone does, and a scenario that flies it."""
@@ -154,44 +149,6 @@ def _verify_model(kind: str, reference: str) -> None:
     if broken:
         print_failure(f"{broken} {'do' if broken > 1 else 'does'} not hold")
         raise typer.Exit(FAILED)
-
-
-def overhead(
-    policies: Annotated[
-        str, typer.Option(help="Policies, separated by commas: worked,best-2(received_budget=0.1).")
-    ] = "worked",
-    drones: Annotated[str, typer.Option(help="Fleet sizes, separated by commas.")] = "5,25,100",
-    seconds: Annotated[
-        float, typer.Option(help="Length of each flight, s, without a detector.", min=1, max=7200)
-    ] = SECONDS,
-) -> None:
-    """Measure the cost of the context plane by fleet size: context and data bytes, and CPU time of a decision."""
-    try:
-        sizes = [int(n) for n in drones.split(",")]
-    except ValueError as error:
-        raise RunError(f"--drones {drones!r}, must be whole numbers with commas, as in 5,25,100") from error
-    columns = (
-        "policy",
-        "drones",
-        "context KB/s",
-        "data MB/s",
-        "context share",
-        "decides in ms, median",
-        "99th percentile",
-    )
-    table = Table(*columns, title=f"{SCENARIO}, {seconds:g} s")
-    for name in split_policies(policies):
-        for n in sizes:
-            with bars() as bar:
-                row = measure(name, n, seconds, progress=bar(f"{name}, {n} drones", seconds))
-            table.add_row(
-                row.policy, f"{n}", f"{row.context_bytes_per_s / 1e3:.1f}", f"{row.data_bytes_per_s / 1e6:.1f}",
-                f"{row.context_share:.2%}", f"{row.p50_ms:.4f}", f"{row.p99_ms:.4f}",
-            )  # fmt: skip
-    out.print(table)
-    out.print(
-        f"{machine()}; a million additions in a plain loop take {host_s():.3f} s of CPU time here", soft_wrap=True
-    )
 
 
 def _try(

@@ -1,4 +1,4 @@
-"""What a live flight came to: bytes, decision time and processor time as the paper measures them, and who was lost."""
+"""What a live flight came to: bytes, decision time and processor time, and who was lost."""
 
 from __future__ import annotations
 
@@ -10,16 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sortie.fleet.staleness import LinkHealth
-from sortie.perception.evaluation.claims import OVERHEAD
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.pilot import named_policy
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
+from sortie.sim.identity import machine
 from sortie.sim.live.bench import Bench, FleetReports
 from sortie.sim.live.reports import HealthChange, NewDirective, Notice, Report
-from sortie.sim.studies.plane_cost import machine
-
-PAPER = {claim.id: claim.paper.value for claim in OVERHEAD}
-"""The paper's figures, by the claim that states them."""
 
 
 class Lost(NamedTuple):
@@ -176,26 +172,20 @@ def summarise(
     )
 
 
-def overhead_rows(result: LiveResult) -> Iterator[tuple[str, str, str]]:
-    """Rows of the paper's overhead table: quantity, the paper's figure, the measured figure."""
-    n, hz = result.drones, result.topics[0].samples_per_s
-    yield "descriptor, serialised", f"{PAPER['plane.descriptor']:.0f} B", _figure(result.descriptor_bytes, "{:.0f} B")
-    yield "descriptors a second", "4 × 10", f"{hz:.1f} of {n} drones"
-    yield "directives a second", "80", f"{result.directives_per_s:.0f}"
-    yield "context plane", f"{PAPER['plane.rate']:.1f} kB/s", f"{result.context_bytes_per_s / 1e3:.1f} kB/s"
-    paper_data = f"{PAPER['plane.data']:.0f} MB/s; {PAPER['plane.x86.data']:.0f} on x86"
-    yield "data plane", paper_data, f"{result.data_bytes_per_s / 1e6:.1f} MB/s"
+def overhead_rows(result: LiveResult) -> Iterator[tuple[str, str]]:
+    """What the plane cost: quantity and figure, in the order of the paper's paragraph on overhead."""
+    descriptors = f"{result.topics[0].samples_per_s:.1f} of {result.drones} drones"
     share = None if result.context_share is None else 100 * result.context_share
-    yield "context over data", f"{PAPER['plane.share']:.2f} %", _figure(share, "{:.2f} %")
-    median = f"{PAPER['plane.median']:.2f} ms; {PAPER['plane.x86.median']:.2f} on x86"
-    yield "a decision, median", median, _figure(result.decide_ms_p50, "{:.3f} ms")
-    yield (
-        "a decision, 99th %",
-        f"{PAPER['plane.p99']:.2f} ms",
-        _figure(result.decide_ms_p99, "{:.3f} ms"),
-    )
-    cpu = f"{result.drones_cpu_percent:.0f} % by {n} drones, {result.bench_cpu_percent:.0f} % by the bench"
-    yield "of one core", f"{PAPER['plane.core']:.0f} %", cpu
+    cpu = f"{result.drones_cpu_percent:.0f} % by {result.drones} drones, {result.bench_cpu_percent:.0f} % by the bench"
+    yield "descriptor, serialised", _figure(result.descriptor_bytes, "{:.0f} B")
+    yield "descriptors a second", descriptors
+    yield "directives a second", f"{result.directives_per_s:.0f}"
+    yield "context plane", f"{result.context_bytes_per_s / 1e3:.1f} kB/s"
+    yield "data plane", f"{result.data_bytes_per_s / 1e6:.1f} MB/s"
+    yield "context over data", _figure(share, "{:.2f} %")
+    yield "a decision, median", _figure(result.decide_ms_p50, "{:.3f} ms")
+    yield "a decision, 99th %", _figure(result.decide_ms_p99, "{:.3f} ms")
+    yield "of one core", cpu
 
 
 def _figure(value: float | None, text: str) -> str:

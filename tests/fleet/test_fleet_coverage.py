@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from research.benchmark.visibility import in_a_camera, past_houses, past_trees
 from sortie.fleet import coverage_loops
 from sortie.fleet.chart import Chart
 from sortie.fleet.coverage import (
@@ -24,7 +25,6 @@ from sortie.fleet.coverage import (
     unpack_grid,
     views,
 )
-from sortie.perception.benchmark.visibility import in_a_camera, past_houses, past_trees
 from sortie.perception.geometry import FOCAL_PX, FULL, USUAL, Cameras
 from sortie.perception.scene import height_field, sight_loops
 from sortie.perception.scene.height_field import CAR_TOP_M

@@ -243,7 +243,7 @@ def _recording(path: Path) -> None:
 
 
 def _pickles() -> list[bytes]:
-    from sortie.perception.recordings.uav3d import CAMERAS
+    from research.uav3d.uav3d import CAMERAS
 
     camera = {"data_path": "a.png", "sensor2ego_translation": [1.0, 2.0, 3.0], "sensor2ego_rotation": [1.0, 0, 0, 0],
               "cam_intrinsic": np.eye(3)}  # fmt: skip
@@ -255,15 +255,15 @@ def _pickles() -> list[bytes]:
 
 def _pickle(path: Path) -> None:
     """As the reader does it, but that the process of its own is a fork: starting Python would take nearly all the time."""
-    from sortie.perception.recordings import unpickle
-    from sortie.perception.recordings.uav3d import read_infos
+    from research.uav3d import unpickle
+    from research.uav3d.uav3d import read_infos
 
     with mock.patch.object(unpickle.subprocess, "run", _forked):
         read_infos(path)
 
 
 def _forked(command: list[str], *, input: bytes, **_: object) -> subprocess.CompletedProcess[bytes]:
-    from sortie.perception.recordings import unpickle
+    from research.uav3d import unpickle
 
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         child = os.fork()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sortie.perception.surrogate.collect import DetectorRuns
+from research.calibrate.collect import DetectorRuns
+from research.calibrate.plan import DetectorJob, moment, scene_model
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.model import Parameters
-from sortie.perception.surrogate.plan import DetectorJob, moment, scene_model
 from sortie.scenarios.schema import Perception
 
 

@@ -13,17 +13,17 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from sortie.perception.benchmark.dataset import Benchmark, Frames, load_frames, make_scene_file
+from research.benchmark.dataset import Benchmark, Frames, load_frames, make_scene_file
+from research.flip.dose_run import frame_of
+from research.flip.doses import read_plan
+from research.paper.instrument import CarNetInstrument
+from research.train import train as training
+from research.train.devices import gpu_name, measuring_device
+from research.train.recipe import Recipe
+from research.train.train import train
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.evaluate import Settings, evaluate, exchanges
-from sortie.perception.evaluation.instrument import CarNetInstrument
 from sortie.perception.network.checkpoint import load_weights, read_facts
-from sortie.perception.network.devices import gpu_name, measuring_device
-from sortie.perception.study.dose_run import frame_of
-from sortie.perception.study.doses import read_plan
-from sortie.perception.training import train as training
-from sortie.perception.training.recipe import Recipe
-from sortie.perception.training.train import train
 from sortie.scenarios.shipped import NETWORKS
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU with CUDA")
@@ -106,7 +106,7 @@ def test_a_run_that_was_cut_off_goes_on_there(
 ) -> None:
     """A GPU adds up in another order each time, so the losses are near each other rather than equal."""
     monkeypatch.setattr(training, "make_split", lambda *_, **__: [scene_file])
-    monkeypatch.setattr("sortie.perception.training.validation.LEVELS", ((1.0, 1.0),))
+    monkeypatch.setattr("research.train.validation.LEVELS", ((1.0, 1.0),))
     recipe = Recipe(steps=6, precision="bfloat16")
 
     def run(name: str, minutes: float | None = None) -> training.TrainResult:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from perception_examples import cross
 
+from research.train.box_errors import Errors, calibration, common, errors_of, fit
 from sortie.perception.budget import content_bytes
 from sortie.perception.errors import InputError
 from sortie.perception.intersection import intersect, inverse
@@ -16,7 +17,6 @@ from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, sour
 from sortie.perception.lateness import MOVING, SIGMA0_M, SPEED_MPS
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
-from sortie.perception.training.box_errors import Errors, calibration, common, errors_of, fit
 from sortie.perception.types import Boxes, Share
 from sortie.perception.uncertainty import BoxErrors, errors_text, load_errors, terms
 from sortie.scenarios.schema import Perception, Scene

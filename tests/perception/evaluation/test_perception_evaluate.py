@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from harness_examples import MadeFrames, MadeInstrument, made_frames
 
+from research.paper.scores import Bootstrap
 from sortie.perception.evaluation import selection
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.contract import Exchange
@@ -23,7 +24,6 @@ from sortie.perception.evaluation.evaluate import (
     mission_target,
     truth,
 )
-from sortie.perception.evaluation.scores import Bootstrap
 from sortie.perception.metrics.ap import CONVENTIONS, average_precision, match, suppress
 from sortie.perception.types import Boxes
 

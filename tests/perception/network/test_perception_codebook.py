@@ -10,10 +10,11 @@ import torch
 from perception_examples import cross
 from safetensors.torch import save_file
 
+from research.paper.instrument import CarNetView
+from research.train.codebook import CodebookRecipe, card, fit
 from sortie.perception.budget import cells_in, content_bytes
 from sortie.perception.errors import InputError
 from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.instrument import CarNetView
 from sortie.perception.files import codebook_digest
 from sortie.perception.network.checkpoint import load_weights, save_weights
 from sortie.perception.network.codebook import (
@@ -26,7 +27,6 @@ from sortie.perception.network.codebook import (
 from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector
 from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.training.codebook import CodebookRecipe, card, fit
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.schema import Perception, Scene
 from sortie.scenarios.shipped import CODEBOOK, beside

@@ -16,9 +16,11 @@ from hypothesis import strategies as st
 from perception_examples import cross
 from torch import Tensor
 
-from sortie.perception.benchmark.dataset import Frames
+from research.benchmark.dataset import Frames
+from research.paper.instrument import CarNetInstrument, CarNetView
+from research.train.learn import _fit, draw_batch, gradients, loss_of, step_loss, targets
+from research.train.recipe import Recipe
 from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.instrument import CarNetInstrument, CarNetView
 from sortie.perception.network import warp
 from sortie.perception.network.checkpoint import load_weights, read_config, save_weights
 from sortie.perception.network.decode import decode
@@ -28,8 +30,6 @@ from sortie.perception.network.inference import folded
 from sortie.perception.network.model import Align, CarNet, ModelConfig
 from sortie.perception.network.warp import arriving, moved, support
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.training.learn import _fit, draw_batch, gradients, loss_of, step_loss, targets
-from sortie.perception.training.recipe import Recipe
 from sortie.perception.types import Share
 from sortie.scenarios.schema import Perception, Scene, Target
 

@@ -8,13 +8,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from research.train.learn import loss_of, targets
 from sortie.perception.geometry import CELLS, CHANNELS, FULL
 from sortie.perception.network.checkpoint import load_weights, save_weights
 from sortie.perception.network.decode import decode
 from sortie.perception.network.fusion.base import UnsentCells, takes_part
 from sortie.perception.network.model import CarNet
 from sortie.perception.network.warp import warp as warp_by
-from sortie.perception.training.learn import loss_of, targets
 
 CELL_M = FULL.cell_m
 

@@ -12,8 +12,11 @@ import torch
 from perception_examples import capture
 from safetensors.torch import save_file
 
-from sortie.perception.benchmark.dataset import Benchmark, load_frames, make_scene_file
-from sortie.perception.benchmark.scenes import draw_captures, draw_scene, model_of, scene_id
+from research.benchmark.dataset import Benchmark, load_frames, make_scene_file
+from research.benchmark.scenes import draw_captures, draw_scene, model_of, scene_id
+from research.train import train as training
+from research.train.recipe import Recipe
+from research.train.train import train
 from sortie.perception.errors import InputError
 from sortie.perception.geometry import FULL, USUAL, Cameras, Geometry
 from sortie.perception.network.bev import lift
@@ -21,9 +24,6 @@ from sortie.perception.network.checkpoint import load_weights, read_config, save
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.perception.scene.render import Renderer, camera_axes
-from sortie.perception.training import train as training
-from sortie.perception.training.recipe import Recipe
-from sortie.perception.training.train import train
 from sortie.scenarios.reading.load import load
 from sortie.sim.cli.options import ImagePx
 from sortie.sim.engine.sortie import run_sortie
@@ -149,7 +149,7 @@ def test_a_sharp_network_is_trained_and_flies(
         return [scene_file]
 
     monkeypatch.setattr(training, "make_split", make_split)
-    monkeypatch.setattr("sortie.perception.training.validation.LEVELS", ((1.0, 1.0),))
+    monkeypatch.setattr("research.train.validation.LEVELS", ((1.0, 1.0),))
     path = tmp_path / "sharp.safetensors"
     train(path, Recipe(steps=2, batch=2), NETWORK, device="cpu")
     assert {bench.geometry for bench in asked} == {SHARP}

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from sortie.perception.benchmark.difficulty import Difficulty
-from sortie.perception.benchmark.scenes import draw_captures, draw_scene
+from research.benchmark.difficulty import Difficulty
+from research.benchmark.scenes import draw_captures, draw_scene
+from research.flip.plan import read_plan
+from research.flip.run import SHIPPED
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import Matched, match
 from sortie.perception.metrics.bootstrap import compare
 from sortie.perception.network.checkpoint import read_facts
 from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.study.plan import read_plan
-from sortie.perception.study.run import SHIPPED
 from sortie.perception.types import Share
 from sortie.scenarios.schema import Perception
 from sortie.scenarios.shipped import NETWORKS

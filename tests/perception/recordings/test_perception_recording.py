@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from recording_examples import score_map, small
 
-from sortie.perception.benchmark.manifest import BenchmarkError, read_arrays
+from research.benchmark.manifest import BenchmarkError, read_arrays
 from sortie.perception.recordings.exchange import moved
 from sortie.perception.recordings.recording import RecordingError, cells_of, open_recording
 from sortie.perception.recordings.writing import write_recording

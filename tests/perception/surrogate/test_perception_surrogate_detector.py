@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from perception_examples import EMPTY, capture, cross
 
+from research.calibrate.rows import assign_boxes
 from sortie.perception.detectors import DetectsMany
 from sortie.perception.geometry import in_square
 from sortie.perception.ground_truth import ground_truth
@@ -26,7 +27,6 @@ from sortie.perception.surrogate.exchange import (
 )
 from sortie.perception.surrogate.features import CaptureColumns, Eyes
 from sortie.perception.surrogate.hashing import uniform
-from sortie.perception.surrogate.rows import assign_boxes
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception, Scene, Target

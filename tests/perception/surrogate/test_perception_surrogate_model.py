@@ -15,13 +15,13 @@ from perception_examples import EMPTY, cross
 from safetensors.numpy import load_file, save_file
 from scipy.special import expit
 
+from research.calibrate.fit import BANDS as QUANTILES
+from research.calibrate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
 from sortie.perception.scene.height_field import CAR_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.draws import BANDS
 from sortie.perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES, FeatureShares, covariates, pair
 from sortie.perception.surrogate.features import LOOK_COVARIATES, CaptureColumns, Eyes
-from sortie.perception.surrogate.fit import BANDS as QUANTILES
-from sortie.perception.surrogate.fit import _below, _count_loss, _find_loss, _in_common, _iou, _pairs, _train
 from sortie.perception.surrogate.model import (
     BAND,
     FORMAT,
@@ -370,7 +370,7 @@ def test_scores_are_found_as_they_are_spread_above_the_floor_below_which_they_ar
 
 def test_a_fit_returns_the_network_that_it_fitted() -> None:
     """Inputs of another scale are folded into the first layer, and the mean and spread are learned."""
-    from sortie.perception.surrogate.fit import _normal_loss
+    from research.calibrate.fit import _normal_loss
 
     x = RNG.normal(size=(4000, NETS["rank"][0])) * 3 + 1
     net, out = _train("rank", x, {"y": 0.5 * x[:, 0] + 0.2 * RNG.normal(size=4000)}, _normal_loss, 0, 400)

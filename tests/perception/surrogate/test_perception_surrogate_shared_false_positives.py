@@ -7,12 +7,12 @@ import pytest
 from perception_examples import capture, cross
 from surrogate_examples import detector_runs
 
-from sortie.perception.benchmark.scenes import model_of
-from sortie.perception.surrogate.correlation import fit_shared_false_positives
+from research.benchmark.scenes import model_of
+from research.calibrate.correlation import fit_shared_false_positives
+from research.calibrate.plan import scene_model
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import CaptureColumns
 from sortie.perception.surrogate.model import SHIPPED, load
-from sortie.perception.surrogate.plan import scene_model
 from sortie.perception.surrogate.shared_false_positives import TILE_M, SharedFalsePositives, estimate_shared
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Perception, Scene

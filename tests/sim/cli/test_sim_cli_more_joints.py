@@ -21,6 +21,8 @@ from cli_examples import command
 from sim_examples import BASE
 
 import sortie
+from research.learn.learn import Lesson
+from research.paper import command as paper_command
 from sortie.perception.evaluation.condition import Sharing
 from sortie.perception.geometry import Geometry
 from sortie.perception.uncertainty import BoxErrors
@@ -29,11 +31,9 @@ from sortie.policies.verification.invariants import Invariant
 from sortie.scenarios.intervals import Estimate
 from sortie.scenarios.reading.load import ScenarioError
 from sortie.sim.cli import console
-from sortie.sim.cli import paper as paper_command
 from sortie.sim.cli import verify as verify_command
 from sortie.sim.cli.options import loaded, split_policies
 from sortie.sim.studies.conditions import Cell
-from sortie.sim.studies.learn import Lesson
 
 
 @pytest.fixture(autouse=True)
@@ -93,14 +93,14 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_train(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = Seen()
-    stand_in(monkeypatch, "sortie.perception.benchmark.dataset", Benchmark=tuple_of)
+    stand_in(monkeypatch, "research.benchmark.dataset", Benchmark=tuple_of)
     names = {"shipped": lambda fusion: here / f"{fusion}.own", "named_weights": lambda path: here / path}
     stand_in(monkeypatch, "sortie.perception.network.detector", **names)
     stand_in(monkeypatch, "sortie.perception.network.fusion.registry", FUSIONS={"none": 1, "late": 2, "disconet": 3})
     stand_in(monkeypatch, "sortie.perception.network.model", ModelConfig=tuple_of)
-    stand_in(monkeypatch, "sortie.perception.training.recipe", Recipe=dict)
-    stand_in(monkeypatch, "sortie.perception.training.train", train=seen)
-    monkeypatch.setitem(sys.modules, "sortie.sim.playback.training", None)  # type: ignore[arg-type]  # Rerun is missing
+    stand_in(monkeypatch, "research.train.recipe", Recipe=dict)
+    stand_in(monkeypatch, "research.train.train", train=seen)
+    monkeypatch.setitem(sys.modules, "research.train.playback", None)  # type: ignore[arg-type]  # Rerun is missing
     for name in ("late.own", "w"):
         (here / name).touch()
     options = {
@@ -138,9 +138,9 @@ def test_calibrate(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
         for b, sure, kept in (("k", True, True), ("l", True, False), ("m", False, True))
     ]
     made, flown = Seen((None, SimpleNamespace(levels=levels, orders=orders))), Seen()
-    stand_in(monkeypatch, "sortie.perception.surrogate.calibrate", calibrate=made)
-    stand_in(monkeypatch, "sortie.perception.surrogate.judge", WITHIN=0.02)
-    monkeypatch.setattr("sortie.sim.cli.calibrate.flights", flown)
+    stand_in(monkeypatch, "research.calibrate.calibrate", calibrate=made)
+    stand_in(monkeypatch, "research.calibrate.judge", WITHIN=0.02)
+    monkeypatch.setattr("research.calibrate.command.flights", flown)
     options = ("--out", "o", "--weights", "w", "--scenes", "5", "--held-out", "6", "--seed", "7", "--work", "k")
     assert command("calibrate", *options) == 0
     assert (made.args, made.kwargs) == (
@@ -175,9 +175,9 @@ def test_an_error_of_the_surrogate_is_as_bad_below_as_above(
 ) -> None:
     from rich.console import Console
 
-    from sortie.sim.cli import calibrate
+    from research.calibrate import command as calibrate
 
-    stand_in(monkeypatch, "sortie.perception.surrogate.judge", WITHIN=0.02)
+    stand_in(monkeypatch, "research.calibrate.judge", WITHIN=0.02)
     monkeypatch.setattr(
         calibrate, "out", Console(force_terminal=True, width=100, color_system="standard", no_color=False)
     )
@@ -191,13 +191,13 @@ def test_an_error_of_the_surrogate_is_as_bad_below_as_above(
 def test_fit(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     net = SimpleNamespace(config=SimpleNamespace(geometry="its grid"))
     made, moments, split = Seen({"cells": 77, "unexplained": {1: 0.5, 20: 0.0625}}), Seen(), Seen()
-    stand_in(monkeypatch, "sortie.perception.benchmark.dataset", Benchmark=tuple_of, load_frames=None, make_split=split)
+    stand_in(monkeypatch, "research.benchmark.dataset", Benchmark=tuple_of, load_frames=None, make_split=split)
     stand_in(monkeypatch, "sortie.perception.network.checkpoint", load_weights=lambda path: net)
     stand_in(monkeypatch, "sortie.perception.network.detector", named_weights=lambda path: path or Path("shipped/net"))
-    stand_in(monkeypatch, "sortie.perception.training.codebook", CodebookRecipe=tuple_of, make_codebook=made)
-    stand_in(monkeypatch, "sortie.perception.training.boxes_alone", boxes_alone=None, moments_of=None)
+    stand_in(monkeypatch, "research.train.codebook", CodebookRecipe=tuple_of, make_codebook=made)
+    stand_in(monkeypatch, "research.train.boxes_alone", boxes_alone=None, moments_of=None)
     stand_in(monkeypatch, "sortie.perception.training", box_errors=None)
-    stand_in(monkeypatch, "sortie.perception.surrogate.errors", moments=moments)
+    stand_in(monkeypatch, "research.calibrate.errors", moments=moments)
     options = (
         "--stages",
         "3",
@@ -244,14 +244,12 @@ def test_a_file_of_box_errors_names_the_command_that_repeats_it(
     model = BoxErrors((0.0,) * 5, (0.0,) * 5, 0.25)
     box_errors = SimpleNamespace(fit=lambda found: model, calibration=lambda model, found: fitted)
     found = Seen(["boxes"])
-    stand_in(
-        monkeypatch, "sortie.perception.benchmark.dataset", Benchmark=tuple_of, load_frames=found, make_split=found
-    )
+    stand_in(monkeypatch, "research.benchmark.dataset", Benchmark=tuple_of, load_frames=found, make_split=found)
     stand_in(monkeypatch, "sortie.perception.network.checkpoint", load_weights=lambda path: net)
     stand_in(monkeypatch, "sortie.perception.network.detector", named_weights=lambda path: path or Path("shipped/net"))
-    stand_in(monkeypatch, "sortie.perception.training.boxes_alone", boxes_alone=found, moments_of=found)
+    stand_in(monkeypatch, "research.train.boxes_alone", boxes_alone=found, moments_of=found)
     stand_in(monkeypatch, "sortie.perception.training", box_errors=box_errors)
-    stand_in(monkeypatch, "sortie.perception.surrogate.errors", moments=found)
+    stand_in(monkeypatch, "research.calibrate.errors", moments=found)
     assert command("fit", "errors", *given) == 0
     assert json.loads((here / kept).read_text())["made"]["command"] == f"sortie fit errors {told}"
 
@@ -262,17 +260,17 @@ def test_bench(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     bench = Seen(SimpleNamespace(folder=lambda out: out / "made"))
     stand_in(
         monkeypatch,
-        "sortie.perception.benchmark.dataset",
+        "research.benchmark.dataset",
         MOST={"train": 300, "validation": 30, "tau": 4, "test": 80},
         SIZES=sizes,
         Benchmark=bench,
         make_split=split,
     )
-    stand_in(monkeypatch, "sortie.perception.benchmark.survey", by_style=None, survey=counted)
+    stand_in(monkeypatch, "research.benchmark.survey", by_style=None, survey=counted)
     stand_in(monkeypatch, "sortie.perception.network.detector", named_weights=lambda path: path or Path("shipped/net"))
-    stand_in(monkeypatch, "sortie.perception.evaluation.difficulty_effects", measure=effects)
+    stand_in(monkeypatch, "research.paper.difficulty_effects", measure=effects)
     files = {"splits": {"tau": {"a": {"frames": 5}, "b": {"frames": 7}}}}
-    monkeypatch.setattr("sortie.sim.cli.bench.read", lambda folder: files)
+    monkeypatch.setattr("research.benchmark.command.read", lambda folder: files)
     common = ("--seed", "3", "--density", "dense", "--range", "51.2")
     assert command("bench", "make", *common, "--image-px", "512", "--split", "tau", "--split", "test", "--split", "tau", "--scenes", "9",
                    "--workers", "2", "--out", "o") == 0  # fmt: skip
@@ -303,10 +301,10 @@ def test_study(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     gain = SimpleNamespace(validation=SimpleNamespace(ap_a=0.25, ap_b=0.5))
     trained, measured, tabled = Seen(gain), Seen([("a", [1, 2]), ("b", [3])]), Seen("table")
     written: list[Any] = []
-    stand_in(monkeypatch, "sortie.perception.study.plan", read_plan=lambda: plan)
-    stand_in(monkeypatch, "sortie.perception.study.run", SHIPPED=Path("shipped"), train_job=trained, measure=measured)
-    stand_in(monkeypatch, "sortie.perception.study.measure", StudyRow=int, to_table=tabled)
-    monkeypatch.setattr("sortie.sim.cli.study._write_table", lambda table, path: written.append((table, path)))
+    stand_in(monkeypatch, "research.flip.plan", read_plan=lambda: plan)
+    stand_in(monkeypatch, "research.flip.run", SHIPPED=Path("shipped"), train_job=trained, measure=measured)
+    stand_in(monkeypatch, "research.flip.measure", StudyRow=int, to_table=tabled)
+    monkeypatch.setattr("research.flip.command._write_table", lambda table, path: written.append((table, path)))
     assert command("study", "train", "dropout-1", "--work", "w", "--bench", "b") == 0
     assert command("study", "train") == 0
     assert [(args[1:], given["shipped"]) for args, given in trained.calls] == [
@@ -328,8 +326,8 @@ def test_study(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
 def test_the_doses_of_the_study(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stand_in(monkeypatch, "sortie.perception.study.dose_figure", draw=None)
-    from sortie.perception.study import doses
+    stand_in(monkeypatch, "research.flip.dose_figure", draw=None)
+    from research.flip import doses
 
     def effect(value: float) -> Any:
         return SimpleNamespace(value=value, low=value - 0.5, high=value + 0.5)
@@ -340,10 +338,10 @@ def test_the_doses_of_the_study(
         contrasts=(effect(3.0),), frames=40,
     )  # fmt: skip
     measured = Seen([row])
-    stand_in(monkeypatch, "sortie.perception.study.dose_run", measure=measured)
+    stand_in(monkeypatch, "research.flip.dose_run", measure=measured)
     monkeypatch.setattr(doses, "read_plan", lambda: plan)
     monkeypatch.setattr(doses, "verdicts", lambda rows: {"net": (True, False), "other": (True, True)})
-    monkeypatch.setattr("sortie.perception.evaluation.figures.available", lambda: False)
+    monkeypatch.setattr("research.paper.figures.available", lambda: False)
     assert (
         command(
             "study", "doses", "--work", "w", "--bench", "b", "--frames", "7:0-239", "--workers", "2", "--device", "cpu"
@@ -372,7 +370,7 @@ def test_recording(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     at, kept = Seen(shown), Seen(True)
     evaluated, converted = Seen(SimpleNamespace(at=at, save=kept)), Seen(Path("o"))
     monkeypatch.setattr("sortie.perception.recordings.instrument.evaluate_recording", evaluated)
-    monkeypatch.setattr("sortie.perception.recordings.uav3d.convert", converted)
+    monkeypatch.setattr("research.uav3d.uav3d.convert", converted)
     options = ("--fusion", "own.py:fuse", "--conditions", "single best-2@0.02", "--tau", "0.25", "--out", "m.parquet")
     assert command("recording", "evaluate", "r.npz", *options) == 0
     (path, ways), given = evaluated.args, evaluated.kwargs
@@ -458,10 +456,10 @@ def test_learn(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     found = {
         ("search", 0.01): Estimate(0.01, 0.005, 0.015, 9), ("track", 0.6): Estimate(-0.02, -0.03, -0.01, 9),
     }  # fmt: skip
-    monkeypatch.setattr("sortie.sim.studies.learn.fly_lessons", flown)
-    monkeypatch.setattr("sortie.sim.studies.learn.save", saved)
-    monkeypatch.setattr("sortie.sim.studies.learn.gains", lambda lessons, arm: found if arm == 1 else {})
-    monkeypatch.setattr("sortie.sim.studies.learn.thresholds", lambda lessons: {"search": 0.125})
+    monkeypatch.setattr("research.learn.learn.fly_lessons", flown)
+    monkeypatch.setattr("research.learn.learn.save", saved)
+    monkeypatch.setattr("research.learn.learn.gains", lambda lessons, arm: found if arm == 1 else {})
+    monkeypatch.setattr("research.learn.learn.thresholds", lambda lessons: {"search": 0.125})
     options = (
         "--conditions",
         "9",
@@ -599,12 +597,12 @@ def claim(id_: str, instrument: str, verdict: str, **more: Any) -> Any:
 def paper_modules(monkeypatch: pytest.MonkeyPatch) -> dict[str, Seen]:
     seen = {"make": Seen(), "frame_picture": Seen()}
     stand_in(
-        monkeypatch, "sortie.sim.studies.paper", PaperSettings=tuple_of, ensure_writable=lambda out: None,
+        monkeypatch, "research.paper.making", PaperSettings=tuple_of, ensure_writable=lambda out: None,
         TABLE="claims.parquet", **seen,
     )  # fmt: skip
     import sortie.sim.studies as studies
 
-    monkeypatch.setattr(studies, "paper", sys.modules["sortie.sim.studies.paper"], raising=False)
+    monkeypatch.setattr(studies, "paper", sys.modules["research.paper.making"], raising=False)
     stand_in(monkeypatch, "sortie.perception.network.detector", named_weights=lambda path: path or Path("shipped/net"))
     return seen
 

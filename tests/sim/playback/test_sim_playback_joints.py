@@ -16,12 +16,13 @@ import pytest
 from record_by_hand import record, tables_of
 from sim_examples import example
 
-from sortie.perception.evaluation.picture import Picture
+from research.paper import playback as frame
+from research.paper.picture import Picture
 from sortie.perception.geometry import Geometry
 from sortie.perception.types import Boxes
 from sortie.policies.contract import Disc
 from sortie.scenarios.link_state import SILENT_MBPS
-from sortie.sim.playback import frame, layout
+from sortie.sim.playback import layout
 from sortie.sim.playback.canvas import packed
 from sortie.sim.playback.comparison import SHARED, comparison, roots
 from sortie.sim.playback.ground_map import GroundMap

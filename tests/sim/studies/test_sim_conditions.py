@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from research.learn import learn
+from research.learn.learn import Lesson, draw_condition, fit, save
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Boxes, Capture
@@ -23,10 +25,8 @@ from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli import conditions as commands
 from sortie.sim.cli.app import main
 from sortie.sim.folders import RunError
-from sortie.sim.studies import learn
+from sortie.sim.studies.both_detectors import torch_answers
 from sortie.sim.studies.conditions import Cell, best_fixed, fly_all, scenario_of, summarise
-from sortie.sim.studies.in_flight import torch_answers
-from sortie.sim.studies.learn import Lesson, draw_condition, fit, save
 
 SMALL = """
 base: track_target

@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 from policies_examples import fleet_of
 
+from research.learn import learn
+from research.learn.learn import Lesson, fit
+from research.overhead import overhead
 from sortie.perception.metrics.ap import Matched
 from sortie.policies.catalogue.adaptive import ARMS, features, spend
 from sortie.policies.contract import FleetView, TaskPhase
 from sortie.scenarios.reading.load import loads
 from sortie.sim.folders import RunError
-from sortie.sim.studies import learn, multifidelity, overhead
+from sortie.sim.studies import multifidelity
 from sortie.sim.studies.compare import Compared, Contender, _over_sorties
-from sortie.sim.studies.learn import Lesson, fit
 from sortie.sim.studies.multifidelity import METRICS, Batch, Row
 from sortie.sim.studies.surrogate_draws import KeepsMoments
 

@@ -1,1 +1,0 @@
-"""The benchmark: seeded splits of procedural scenes that anyone can reproduce."""

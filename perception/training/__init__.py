@@ -1,1 +1,0 @@
-"""Training: batches and losses, the run, and validation of the weights."""

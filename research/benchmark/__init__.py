@@ -1,0 +1,1 @@
+"""Benchmark: seeded splits of procedural scenes, their difficulty and contents."""

@@ -1,0 +1,1 @@
+"""Fitting the surrogate to the torch detector."""

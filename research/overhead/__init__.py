@@ -1,0 +1,1 @@
+"""The cost of the context plane by fleet size."""

@@ -1,0 +1,1 @@
+"""The paper's Evaluation, measured again: claims, instruments and verdicts."""

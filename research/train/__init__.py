@@ -1,0 +1,1 @@
+"""Training of the detector, and fitting of what representations need."""

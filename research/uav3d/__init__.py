@@ -1,0 +1,1 @@
+"""UAV3D's files as a recording."""

@@ -1,0 +1,1 @@
+"""The radio beside ns-3."""
