@@ -154,9 +154,8 @@ def measured(
     gradys: str | None = None, told: Callable[[str], None] = lambda what: None
 ) -> tuple[Table, dict[str, Any]]:
     """Measure all; returns the page and what `--release` writes."""
-    from research.overhead.overhead import host_s
-
     import sortie
+    from research.overhead.overhead import host_s
 
     if gradys is None and importlib.util.find_spec("gradysim"):
         gradys = sys.executable
