@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+LIGHT := $(VENV)/.flies
 STAMP := $(VENV)/.installed
 SCENARIO ?= scenarios/library/track_target.yaml
 SECONDS_EACH ?= 600
@@ -14,19 +15,28 @@ export PYTHONDONTWRITEBYTECODE :=
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
-$(STAMP): pyproject.toml constraints.txt
+# what the main job needs: torch, by its CPU build where that can be had, and the viewer. uv is quicker than pip where it is there.
+$(LIGHT): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@# torch first and alone: its pin picks the CPU build, and nothing later may widen it
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch
 	@# an older clone's metadata would name entry points that are no more
 	@rm -rf *.egg-info
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@echo 'installing what the main job needs into $(VENV)'
+	@{ command -v uv >/dev/null && uv pip install --quiet --python $(BIN)/python --torch-backend cpu -c constraints.txt -e '.[torch,view]'; } \
+		|| { $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt torch \
+		&& $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[torch,view]'; }
+	@echo 'compiling loops, which later runs reuse: a minute on slow cores'
+	@$(BIN)/sortie fly track_target --set duration_s=2 --out $(VENV)/compiled --replace >/dev/null
 	@touch $@
 
-sortie: $(STAMP) ## fly the main scenario and print its outcome (SCENARIO=... for another)
+# what tests, lint and research need besides
+$(STAMP): $(LIGHT)
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[dev]'
+	@touch $@
+
+sortie: $(LIGHT) ## fly the main scenario and print its outcome (SCENARIO=... for another)
 	$(BIN)/sortie fly $(SCENARIO)
 
-screenshot: $(STAMP) ## fly the paper's replay and take docs/sortie.png from the real viewer (needs mesa-vulkan-drivers)
+screenshot: $(LIGHT) ## fly the paper's replay and take docs/sortie.png from the real viewer (needs mesa-vulkan-drivers)
 	$(BIN)/sortie fly paper_replay --set perception.detector=surrogate --out runs/screenshot --replace
 	$(BIN)/sortie view runs/screenshot --picture docs/sortie.png --at 64.2
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from numba import njit
+from numba.core import event
 
 
 def compiled(loop: Callable[..., Any], *, allocates: bool = True) -> Any:
@@ -29,3 +31,20 @@ def part(loop: Callable[..., Any]) -> Any:
     """A loop that only compiled code of its own file calls, and that makes no arrays: compiled into its caller."""
     without_wrappers: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
     return njit(nogil=True, error_model="numpy", forceinline=True, **without_wrappers)(loop)
+
+
+@contextmanager
+def when_compiling(tell: Callable[[], object]) -> Iterator[None]:
+    """Call `tell` once, before the first loop that is compiled within this context. A loop that was kept is only loaded."""
+    told: list[object] = []
+
+    class First(event.Listener):
+        def on_start(self, event: object) -> None:
+            if not told:
+                told.append(tell())
+
+        def on_end(self, event: object) -> None:
+            pass
+
+    with event.install_listener("numba:compile", First()):
+        yield

@@ -12,6 +12,7 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from sortie.scenarios.compiled import when_compiling
 from sortie.sim.folders import RunError
 from sortie.sim.terminal import Terminal
 
@@ -89,7 +90,9 @@ def bars() -> Iterator[Callable[[str, float], Callable[[float], None]]]:
             task = progress.add_task(label, total=round(total))
             return lambda done: progress.update(task, completed=round(done))
 
-        yield add
+        note = "compiling loops, which later runs reuse: a minute or so"
+        with when_compiling(lambda: err.is_terminal and progress.console.print(note)):
+            yield add
 
 
 @contextmanager
