@@ -16,7 +16,6 @@ def end_at_once() -> None:
     for number, usual in _USUAL.items():
         if signal.getsignal(number) == usual:
             signal.signal(number, _end)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _USUAL)  # `_supervised` starts its child with both blocked
 
 
 def as_usual() -> None:

@@ -123,7 +123,7 @@ def _judged(prop: Property, policy: Policy, view: RepeatableView) -> str | None:
         return complaint_of(prop, policy, view)
     try:
         with watched(LARGE_S):
-            found: str | None = Guarded(complaint_of, shares_lateness=False)(prop, policy, view)
+            found: str | None = Guarded(complaint_of)(prop, policy, view)
             return found
     except TookTooLongError:
         raise Stopped(f"; a view of {drones:,} drones takes more than {LARGE_S:g} s") from None

@@ -48,14 +48,14 @@ def with_notes(policy: Policy) -> Policy:
         if function.source is None:
             return function
         loaded = getattr(load_with_notes(function.source.file), function.source.name)
-        return Guarded(loaded, function.source, shares_lateness=False)
+        return Guarded(loaded, function.source)
 
     return with_function(policy, noted)
 
 
 def apart(policy: Policy) -> Policy:
     """The policy with a limit of time of its own: where it is late, the policy itself does not count as late."""
-    return Guarded(with_function(policy, lambda function: function.__wrapped__), shares_lateness=False)
+    return Guarded(with_function(policy, lambda function: function.__wrapped__))
 
 
 def with_function(policy: Policy, change: Callable[[Guarded], Policy]) -> Policy:
@@ -74,7 +74,7 @@ def with_function(policy: Policy, change: Callable[[Guarded], Policy]) -> Policy
 
 
 def _with_checks(source: Source) -> Policy:
-    found: Policy = Guarded(instrumented(source.file, source.name), source, shares_lateness=False)
+    found: Policy = Guarded(instrumented(source.file, source.name), source)
     return found
 
 

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 
-from sortie.scenarios.exit_codes import FAILED, STUCK
+from sortie.scenarios.exit_codes import FAILED
 from sortie.sim.campaign.signals import undisturbed
 from sortie.sim.campaign.work import RunResult, Task, flies_user_code, fly_in_worker, killed, stuck
 
@@ -91,7 +91,7 @@ class OneProcess:
                 raise answer
             if isinstance(answer, RunResult):
                 return answer
-            if answer in (STUCK, -signal.SIGXCPU):
+            if answer == -signal.SIGVTALRM:
                 return stuck(task, code)
         return killed(task, code)
 

@@ -13,7 +13,6 @@ import typer
 from typer.core import TyperGroup
 
 from sortie._signals import as_usual
-from sortie._supervised import report as report_code
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.exit_codes import DEFECT, INTERRUPTED, USER
 from sortie.sim.cli import (
@@ -100,7 +99,7 @@ def run(commands: typer.Typer, name: str) -> None:
     code: str | int | None = 0
     try:
         try:
-            commands(prog_name=name)  # also in the child process of `_supervised`
+            commands(prog_name=name)
         except SystemExit as ended:
             code = ended.code
         if sys.stdout is not None:
@@ -112,7 +111,6 @@ def run(commands: typer.Typer, name: str) -> None:
         traceback.print_exception(error)
         err.print(defect(), soft_wrap=True)
         code = DEFECT
-    report_code(code)
     sys.exit(code)
 
 

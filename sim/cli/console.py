@@ -90,8 +90,11 @@ def bars() -> Iterator[Callable[[str, float], Callable[[float], None]]]:
             task = progress.add_task(label, total=round(total))
             return lambda done: progress.update(task, completed=round(done))
 
-        note = "compiling loops, which later runs reuse: a minute or so"
-        with when_compiling(lambda: err.is_terminal and progress.console.print(note)):
+        def compiling() -> None:
+            if err.is_terminal:
+                progress.console.print("compiling loops, which later runs reuse: a minute or so")
+
+        with when_compiling(compiling):
             yield add
 
 

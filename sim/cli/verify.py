@@ -95,7 +95,7 @@ def verify(
     The options are for policies. A policy is tested on random views, and the command tries to prove its properties
     (*invariants*). Each verdict says what it covers: *proved* for all views of fleets up to a size, *proved over the
     reals* (as if nothing were rounded), *searched* (some of all views), or *drawn* (random views alone). The exit code is
-    also 1 if a property is refuted, and 152 if the policy's code does not return and cannot be interrupted.
+    also 1 if a property is refuted, and 154 if the policy's code does not return and cannot be interrupted.
 
     Invariants about time (`within 0.5 s: …`, `climbs_in(dwell) <= 1`) are tested on sequences of views. What counts is
     what the gates enforce, after staleness rules and damping.

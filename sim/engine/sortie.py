@@ -150,7 +150,8 @@ def decisions_limited(scenario: Scenario, policies: PolicyPlan) -> AbstractConte
     if not (policies.of_users or runs_user_code(scenario)):
         return nullcontext()
     limit_s = scenario.limits.decision_s
-    return watched(limit_s, f"{limit_s:g} s (limits.decision_s)")
+    asked = "decision_s" in scenario.limits.model_fields_set
+    return watched(limit_s, f"{limit_s:g} s (limits.decision_s)", always=asked)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -27,7 +26,7 @@ from sortie.scenarios.control_variates import Controlled, controlled_mean, plan_
 from sortie.scenarios.intervals import AMOUNT, SHARE, Estimate, Range, mean_interval, paired
 from sortie.scenarios.plugins import reference
 from sortie.scenarios.plugins.reference import Guard, PluginError, checked_array, resolve
-from sortie.scenarios.plugins.user_calls import Guarded, TookTooLongError, watched
+from sortie.scenarios.plugins.user_calls import Guarded
 from sortie.scenarios.plugins.user_code import imported_files, imported_packages
 from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Expectation, Mission, Perception, PolicySection, Scenario, Steering, Viewpoints
@@ -496,30 +495,6 @@ def test_an_error_is_told_at_the_last_line_of_a_user_s_own_files(tmp_path: Path)
     (tmp_path / "own.py").write_text("from helper import divide\n\n\ndef model(x):\n    return divide(x)\n")
     with pytest.raises(PluginError, match=r"ZeroDivisionError: .* \(helper\.py, line 3\)"):
         checked_array("power", resolve("power", f"{tmp_path / 'own.py'}:model"), (1,), 0)
-
-
-def test_a_late_function_is_not_called_again_within_a_watch_of_the_same_thread(tmp_path: Path) -> None:
-    """An inner watch knows what an outer one learned; loading the file again does not make it young."""
-    (tmp_path / "own.py").write_text("import time\ndef model():\n    time.sleep(0.01)\n    while True: pass\n")
-    name = f"{tmp_path / 'own.py'}:model"
-    with watched(0.25, "a while"):
-        with pytest.raises(TookTooLongError):
-            resolve("power", name)()
-        with watched(600.0), pytest.raises(TookTooLongError, match="a while"):
-            resolve("power", name)()
-
-
-def test_a_call_within_a_call_is_one_call() -> None:
-    """The working folder is restored where the outer one returns, not before."""
-    here, inner = Path.cwd(), Guarded(lambda: os.chdir("/"))
-
-    def outer() -> Path:
-        inner()
-        return Path.cwd()
-
-    with watched(600.0):
-        assert Guarded(outer)() == Path("/")
-        assert Path.cwd() == here
 
 
 def test_a_guard_counts_no_time_where_it_is_told_not_to() -> None:

@@ -12,7 +12,7 @@ from campaign_examples import BASE, CAMPAIGN, CLUSTER, table_bytes, write
 import sortie
 
 POLICY = """
-import os, re, sys, time
+import hashlib, os, sys, time
 from sortie.policies.contract import Directive
 
 def silent(view):
@@ -30,9 +30,8 @@ LATE = "TookTooLongError: no answer within 2 s (limits.decision_s)"
     ("what", "error"),
     [
         ("sys.exit(0)", "raises ProgramExitError: exit code 0, must return (mine.py, line 10)"),
-        ("os._exit(0)", "raises ProgramExitError: exit code 0, must return (mine.py, line 10)"),
         ("while True: pass", f"raises {LATE} (mine.py, line 10)"),
-        ("re.match('(a+)+$', 'a' * 60 + 'b')", f"{LATE}, and no interruption either"),
+        ("hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)", f"{LATE}, and no interruption either"),
         ("os.kill(os.getpid(), 9)", "WorkerDied: on every attempt"),
     ],
 )
@@ -64,7 +63,7 @@ def test_what_a_policy_does_is_one_failed_run(
 def test_a_cluster_gives_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(POLICY.format(what="re.match('(a+)+$', 'a' * 60 + 'b')"))
+    (tmp_path / "mine.py").write_text(POLICY.format(what="hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"))
     text = CAMPAIGN.replace('[worked, "best-2(received_budget=0.1)"]', "['mine.py:decide']").replace(
         "{count: 6}", "{count: 2}"
     )

@@ -198,10 +198,6 @@ def rung(view):
 
 def leaves(view):
     raise SystemExit(0)
-
-def quits(view):
-    import os
-    os._exit(0)
 """
 
 
@@ -217,7 +213,6 @@ def quits(view):
         ("texts_when_old", "rate_hz is '10', must be in [0, 30], a number"),
         ("rung", "representation is 'features', must be a Representation, such as sortie.Representation.DETECTIONS"),
         ("leaves", "raises ProgramExitError: exit code 0, must return"),
-        ("quits", "raises ProgramExitError: exit code 0, must return"),
     ],
 )
 def test_a_policy_that_gives_no_directives_is_a_broken_one(

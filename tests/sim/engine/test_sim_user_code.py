@@ -26,9 +26,6 @@ def silent(view):
 def leaves(view):
     sys.exit(0)
 
-def quits(view):
-    os._exit(0)
-
 def spins(view):
     while True:
         pass
@@ -40,7 +37,6 @@ def moves(view):
 """
 NAMES = {
     "leaves": "raises ProgramExitError: exit code 0, must return (mine.py, line 9)",
-    "quits": "raises ProgramExitError: exit code 0, must return (mine.py, line 12)",
     "spins": "raises TookTooLongError: no answer within 2 s (limits.decision_s) (mine.py, line 1",
 }
 
