@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import fcntl
+import errno
 import glob
 import os
 import secrets
 import shutil
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import BinaryIO
+
+import psutil
 
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.report_text import replace_section
@@ -19,7 +21,7 @@ _PARTIAL, _ASIDE = ".partial", ".old"
 _RUN = ("outcome.json", "record.json", "scenario.yaml")
 """Every run's folder has these, and its tables as Parquet."""
 _NAME_BYTES = 228
-"""A name may have so many bytes: file systems allow 255, and `run_folder.beside` and `partial_path` add some."""
+"""A name may have so many bytes: file systems allow 255, and `partial_path` adds some."""
 
 GENERATOR = '<meta name="generator" content="Sortie">'
 """In the head of each page that Sortie writes."""
@@ -47,16 +49,19 @@ def ensure_folder(path: Path, holds: str, what: str, written: Collection[str] = 
     if not path.resolve().name:
         raise RunError(f"{path}: is the root of the file system, a {what} needs a folder below it")
     _ensure_place(path)
-    with settled(path):
-        if path.exists() and not path.is_dir():
-            raise RunError(f"{path}: is a file, a {what} needs a folder")
-        if path.is_dir() and any(path.iterdir()) and not (path / holds).is_file():
-            raise RunError(f"{path}: holds files but no {holds}; a {what} would replace them, name another folder")
-        if written and path.is_dir() and (others := _others(path, written)):
-            more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-            raise RunError(f"{path}: holds {others[0]}{more}, which no {what} wrote; choose another folder or move it")
-        if not replace and path.is_dir() and any(path.iterdir()):
-            raise RunError(f"{path}: holds a {what} already; choose another folder, or replace it with --replace")
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise RunError(f"{path}: is a file, a {what} needs a folder")
+    names = sorted(entry.name for entry in path.iterdir())
+    if names and not (path / holds).is_file():
+        raise RunError(f"{path}: holds files but no {holds}; a {what} would replace them, name another folder")
+    known = {*(Path(name).parts[0] for name in written), ".DS_Store"}  # a desktop that looked in
+    if written and (others := [name for name in names if name not in known]):
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        raise RunError(f"{path}: holds {others[0]}{more}, which no {what} wrote; choose another folder or move it")
+    if names and not replace:
+        raise RunError(f"{path}: holds a {what} already; choose another folder, or replace it with --replace")
 
 
 def ensure_files(*paths: Path | None, replace: bool = True) -> None:
@@ -113,12 +118,12 @@ def ensure_between(path: Path | None, begin: str, end: str) -> None:
 
 
 @contextmanager
-def replacing(path: Path, check: Callable[[], None] = lambda: None) -> Iterator[Path]:
+def replacing(path: Path, *, replace: bool = True) -> Iterator[Path]:
     """A new temporary folder beside `path` that takes its place at the end; where the block fails, nothing changes.
 
     Args:
         path: the folder to be.
-        check: called at the end, while no other process can replace the folder; what it raises leaves the folder as it was.
+        replace: whether it takes the place of a folder with files; otherwise that one stays, and the new one goes.
 
     Raises:
         RunError: the disk refuses.
@@ -128,25 +133,24 @@ def replacing(path: Path, check: Callable[[], None] = lambda: None) -> Iterator[
         place.parent.mkdir(parents=True, exist_ok=True)
         with partial_path(place, Path.mkdir) as partial:
             yield partial
-            with _alone(place):
-                check()
-                _replace(partial, place)
+            aside = partial.with_suffix(_ASIDE)
+            if replace and place.exists():  # a folder cannot be renamed over a full one
+                place.rename(aside)
+            with suppress(FileExistsError) if not replace else nullcontext():
+                _rename(partial, place)
+            _remove(aside)
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-@contextmanager
-def settled(path: Path) -> Iterator[None]:
-    """A block in which nobody replaces a folder, so that what is read of it belongs together.
-
-    Not within `replacing` of the same folder, which would wait for itself.
-    """
-    place = path.resolve()
-    if not (place.parent.is_dir() and os.access(place.parent, os.W_OK)):  # nobody can replace it
-        yield
-        return
-    with _alone(place):
-        yield
+def _rename(folder: Path, place: Path) -> None:
+    """Raises FileExistsError: a folder with files is there."""
+    try:
+        folder.rename(place)
+    except OSError as error:
+        if error.errno == errno.ENOTEMPTY:
+            raise FileExistsError(error.errno, error.strerror) from None
+        raise
 
 
 def write_text(path: Path, text: str) -> None:
@@ -211,8 +215,7 @@ def partial_file(path: Path) -> Iterator[Path]:
 def partial_path(path: Path, make: Callable[[Path], None]) -> Iterator[Path]:
     """A file or folder beside `path` under a name that nobody else has, to be written and then renamed.
 
-    What is still there at the end is removed. So is what a process left that was killed: the operating system locks each
-    of them for as long as its process lives.
+    What is still there at the end is removed, and so is what a process left that was killed.
 
     Args:
         path: what it will be.
@@ -221,17 +224,13 @@ def partial_path(path: Path, make: Callable[[Path], None]) -> Iterator[Path]:
     Raises:
         OSError: the disk refuses.
     """
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PARTIAL}")
-    with _alone(path):
-        _tidy(path)
-        make(partial)
-        handle = os.open(partial, os.O_RDONLY)
-        fcntl.flock(handle, fcntl.LOCK_SH)  # a network disk has no other lock for a folder
+    _tidy(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{_PARTIAL}")
+    make(partial)
     try:
         yield partial
     finally:
         _remove(partial)
-        os.close(handle)
 
 
 def sync_folder(folder: Path) -> None:
@@ -278,45 +277,15 @@ def _ensure_place(path: Path) -> None:
         raise RunError(f"{path}: its folder {there} is not writable")
 
 
-def _others(folder: Path, written: Collection[str], within: str = "") -> list[str]:
-    """What a folder holds and `written` does not name, by its path in it; a folder of such things by its name alone."""
-    names = []
-    for entry in sorted(folder.iterdir()):
-        name = within + entry.name
-        if entry.is_dir() and any(w.startswith(f"{name}/") for w in written):
-            names += _others(entry, written, f"{name}/")
-        elif entry.is_dir() or (name not in written and entry.name != ".DS_Store"):  # a desktop that looked in
-            names.append(name)
-    return names
-
-
-def _replace(new: Path, path: Path) -> None:
-    """Rename `new` to `path`; an older one steps aside first, since a folder cannot be renamed over a full one."""
-    if not path.exists():
-        new.rename(path)
-        return
-    aside = new.with_suffix(_ASIDE)
-    path.rename(aside)
-    new.rename(path)
-    shutil.rmtree(aside)
-
-
 def _tidy(path: Path) -> None:
     """Remove what killed processes left beside a path. An older folder that had stepped aside comes back."""
-    own = f".{glob.escape(path.name)}.????????"
-    for aside in path.parent.glob(own + _ASIDE):
-        if path.exists():
-            shutil.rmtree(aside)
-        else:
-            aside.rename(path)
-    for left in path.parent.glob(own + _PARTIAL):
-        with suppress(OSError):  # its process lives, or has just removed it
-            handle = os.open(left, os.O_RDONLY)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                _remove(left)
-            finally:
-                os.close(handle)
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*-????????.*"):
+        writer = left.name[len(path.name) + 2 :].partition("-")[0]
+        if left.suffix not in (_PARTIAL, _ASIDE) or not writer.isdigit() or psutil.pid_exists(int(writer)):
+            continue
+        if left.suffix == _ASIDE and not path.exists():
+            left.rename(path)
+        _remove(left)
 
 
 def _remove(path: Path) -> None:
@@ -325,20 +294,3 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
-
-
-@contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Only one block at a time runs for a path, in all threads and processes. A process that is killed leaves no lock."""
-    lock = path.with_name(f".{path.name}.lock")
-    while True:
-        handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        if os.fstat(handle).st_nlink:
-            break
-        os.close(handle)  # the one who had the lock has removed its file
-    try:
-        yield
-    finally:
-        lock.unlink()
-        os.close(handle)

@@ -151,12 +151,13 @@ class Run:
 
         return Summary(transitions_table(self.outcome))
 
-    def save(self, path: str | Path, *, recording: bool | None = None, replace: bool = False) -> Path:
+    def save(self, path: str | Path | None = None, *, recording: bool | None = None, replace: bool = False) -> Path:
         """Write the run's folder: outcome, tables as Parquet, scenario, and the recording for Rerun (`sortie.rrd`).
 
-        `recording` says whether the recording is written. None writes it if Rerun is installed (extra `view`).
+        Without a path the folder is `runs/SCENARIO-sSEED-POLICY-FINGERPRINT`. `recording` says whether the recording is
+        written. None writes it if Rerun is installed (extra `view`).
 
-        The folder is written completely or not at all. It may already have the same run, with the same fingerprint.
+        The folder is written completely or not at all. If the same run is there already, its folder stays as it is.
         Another run is replaced only if `replace` is True.
 
         Raises:
@@ -173,9 +174,8 @@ class Run:
                 return
             save_rrd(self.record, folder / run_folder.RECORDING)
 
-        place = as_path("path", path)
-        run_folder.save(self.record, place, None if recording is False else add_recording, replace=replace)
-        return place
+        place = None if path is None else as_path("path", path)
+        return run_folder.save(self.record, place, None if recording is False else add_recording, replace=replace)
 
     def report(self, path: str | Path) -> Path:
         """Write the run as one HTML page that loads no other files.

@@ -11,8 +11,6 @@ from typing import Annotated, Any
 import typer
 
 import sortie
-from sortie.scenarios.reading.load import ScenarioError, library, load
-from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
 from sortie.sim.cli.console import bars, line_printer, out, print_written
@@ -20,9 +18,7 @@ from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded, 
 from sortie.sim.cli.view import view
 from sortie.sim.engine.needs import Forecast, ensure_room, needs
 from sortie.sim.engine.watchers import Watcher, Watchers
-from sortie.sim.folders import RunError, settled
-from sortie.sim.identity import own_files
-from sortie.sim.policy_text import policy_overrides
+from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
 
 
@@ -88,33 +84,26 @@ def fly(
         refuse(context, ("pace", "mavlink_key"), "--mavlink")
     if campaign is not None or run is not None:
         flown, seed, number, expected = again(campaign, run, (scenario, policy, seed, set_, replication))
-        own = None
     else:
         flown, number, expected = loaded(_named(scenario), set_, policy), replication or 0, None
-        own = _as_filed(_named(scenario), flown.policy.name)
-    drawn, files = flown.seed if seed is None else seed, _own_files(flown)
-    path = out_dir or run_folder.default_path(flown, drawn, number, own, files)
-    run_folder.ensure_writable(path)
-    if not replace:
-        run_folder.ensure_same(path, flown, drawn, number, files)
+    if out_dir is not None:
+        run_folder.ensure_writable(out_dir)
+        if not replace:
+            run_folder.ensure_same(out_dir, flown, flown.seed if seed is None else seed, number)
     need = needs(flown)
-    if words := ensure_room(flown, need, path, force=force):
+    if words := ensure_room(flown, need, out_dir or Path("runs/run"), force=force):
         line_printer(flown.name)(words)
     if view_ or recording:
         import_module("sortie.sim.playback.recording")  # a missing Rerun is reported before the flight
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = Forecast(flown, line_printer(flown.name), bar(flown.name, flown.duration_s), memory=need.memory)
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
-    with settled(path):
-        other, note = run_folder.in_place_of(path, flight.fingerprint), ""
+    there = "" if out_dir is None else run_folder.in_place_of(out_dir, flight.fingerprint)
+    note = f", in place of {there}" if there else ""
     try:
-        flight.save(path, recording=recording, replace=replace)
-        if other:
-            note = f", in place of {other}"
-    except run_folder.OtherRunError:  # it came meanwhile, or other code flew it: what was flown now is kept too
-        note = f", as {path} holds {other or 'another run'}"
-        path = run_folder.beside(path, flight.fingerprint)
-        flight.save(path, recording=recording)
+        path = flight.save(out_dir, recording=recording, replace=replace)
+    except run_folder.OtherRunError:  # other code flew it, or it came meanwhile: what was flown now is kept too
+        path, note = flight.save(recording=recording), f", as {out_dir} holds {there or 'another run'}"
     out.print(flight.summary())
     out.print(flight.decisions())
     report(flight.outcome)
@@ -149,27 +138,6 @@ def _named(scenario: str | None) -> str:
     if scenario is None:
         raise RunError("no scenario named, as in: sortie fly track_target")
     return scenario
-
-
-def _as_filed(scenario: str, policy: str) -> Scenario | None:
-    """A scenario of the library without `--set`, under a policy. None for a file of the user's, which may change, or
-    share its name with another one."""
-    given, shipped = Path(scenario), library().get(Path(scenario).stem)
-    if shipped is None or (given.exists() and not given.samefile(shipped)):
-        return None
-    try:
-        own = load(scenario)
-        return own if policy == own.policy.name else load(scenario, policy_overrides(policy, own.policy.name))
-    except ScenarioError:
-        return None
-
-
-def _own_files(scenario: Scenario) -> dict[str, str]:
-    """Digests of the scenario's own files; none where one cannot be read, as the flight then says which."""
-    try:
-        return own_files(scenario)
-    except (OSError, ScenarioError):
-        return {}
 
 
 @contextmanager

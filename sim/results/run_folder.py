@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -16,7 +15,7 @@ import pyarrow.parquet as pq
 from sortie.scenarios.reading.load import dump, loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import models_of_the_past
-from sortie.sim.folders import RunError, ensure_folder, replacing, settled
+from sortie.sim.folders import RunError, ensure_folder, replacing
 from sortie.sim.results import beliefs, disagreement, rosters, views
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import CLASS_COLUMN, OF_CLASSES, TABLES, SortieRecord
@@ -54,6 +53,8 @@ WRITTEN = frozenset(
 )
 """All that a run's folder may hold for another run to take its place: what can be made again."""
 _ROW_GROUP_BYTES = 4 << 20
+_POLICY_LETTERS = 60
+"""Of a policy's name in the name of a folder."""
 _INSTEAD = "choose another folder, or replace it with --replace (replace=True)"
 
 
@@ -61,33 +62,16 @@ class OtherRunError(RunError):
     """A folder that holds another run, which would be lost."""
 
 
-def default_path(
-    scenario: Scenario, seed: int, replication: int, own: Scenario | None, files: Mapping[str, str] | None = None
-) -> Path:
-    """The run's folder, named after what flies: `runs/SCENARIO-sSEED-POLICY`, then `-rN` for a replication.
+def default_path(record: SortieRecord) -> Path:
+    """The run's folder: `runs/SCENARIO-sSEED-POLICY`, `-rN` for a replication, and the fingerprint's first eight digits.
 
-    Six hex digits follow where the scenario is not one of the library as it is shipped. They are a digest of all that
-    flies but the seed, so that other settings, other parameters of the policy, other files with the same `name`, and
-    an edited policy have folders of their own. The same sortie flown again has the same folder.
-
-    Args:
-        scenario: what flies.
-        seed, replication: of the random draws.
-        own: the library's scenario as it is shipped, under the same policy; None for a file of the user's.
-        files: digests of the files that fly with it (`sortie.sim.identity.own_files`).
+    So different runs lie in different folders, and equal ones in one.
     """
-    policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", scenario.policy.name).strip("_")
-    parts = [scenario.name, f"s{seed}", policy, *([f"r{replication}"] if replication else [])]
-    flown, filed = (None if s is None else _sorted_json(s) for s in (scenario, own))
-    if flown != filed or policy != scenario.policy.name:  # p/a.py and p_a.py read alike here
-        with_files = f"{flown}{json.dumps(dict(files), sort_keys=True)}" if files else str(flown)
-        parts.append(hashlib.sha256(with_files.encode()).hexdigest()[:6])
-    return Path("runs") / "-".join(parts)
-
-
-def _sorted_json(scenario: Scenario) -> str:
-    """A scenario without its seed, the same text in whatever order parameters were given."""
-    return json.dumps(scenario.model_dump(mode="json", exclude={"seed"}), sort_keys=True)
+    policy = re.sub(r"[^A-Za-z0-9_.-]+", "_", record.policy).strip("_")
+    number = [f"r{record.replication}"] if record.replication else []
+    return Path("runs") / "-".join(
+        [record.scenario.name, f"s{record.seed}", policy[:_POLICY_LETTERS], *number, record.fingerprint[:8]]
+    )
 
 
 def ensure_writable(path: Path) -> None:
@@ -100,41 +84,40 @@ def ensure_writable(path: Path) -> None:
     if Path.cwd().is_relative_to(path.resolve()):
         raise RunError(f"{path}: is the working folder or holds it, a run would replace it; name another folder")
     ensure_folder(path, OUTCOME, "run", WRITTEN)
-    with settled(path):
-        if (path / PAGE).is_file() and not _is_of_the_run(path / PAGE):
-            raise RunError(f"{path}: holds {PAGE}, which is not of the run there; choose another folder or move it")
 
 
-def ensure_same(path: Path, scenario: Scenario, seed: int, replication: int, files: Mapping[str, str]) -> None:
-    """Refuse a folder with a run that was flown from something else, before the sortie is flown; no folder is fine.
+def ensure_same(path: Path, scenario: Scenario, seed: int, replication: int) -> None:
+    """Refuse a folder with a run of something else, before the sortie is flown; no folder is fine.
 
     Raises:
         OtherRunError: naming the first field that differs.
     """
-    new: dict[str, Any] = {"seed": seed, "replication": replication, "own_files": dict(files)}
-    with settled(path):
-        if not (path / OUTCOME).is_file():
-            return
-        try:
-            about = read_json(path / RECORD)
-            old = {name: about[name] for name in new}
-            there = _scenario_of(path).model_dump(mode="json")
-        except (OSError, ValueError, TypeError, LookupError) as error:
-            raise OtherRunError(f"{path}: holds a run that cannot be read, {_INSTEAD}") from error
+    if not (path / OUTCOME).is_file():
+        return
+    new: dict[str, Any] = {"seed": seed, "replication": replication}
+    try:
+        about = read_json(path / RECORD)
+        old = {name: about[name] for name in new}
+        there = _scenario_of(path).model_dump(mode="json")
+    except (OSError, ValueError, TypeError, LookupError) as error:
+        raise OtherRunError(f"{path}: holds a run that cannot be read, {_INSTEAD}") from error
     found = _difference(old, new) or _difference(there, scenario.model_dump(mode="json"))
     if found is not None:
         raise OtherRunError(f"{path}: holds another run: {found}; {_INSTEAD}")
 
 
 def save(
-    record: SortieRecord, path: Path, also: Callable[[Path], None] | None = None, *, replace: bool = False
-) -> dict[str, Any]:
-    """Write a run to a temporary folder beside `path`, then rename it; returns the outcome.
+    record: SortieRecord,
+    path: Path | None = None,
+    also: Callable[[Path], None] | None = None,
+    *,
+    replace: bool = False,
+) -> Path:
+    """Write a run to a temporary folder, then rename it; returns the folder.
 
     Args:
         record: what to write.
-        path: the run's folder. The same record may be there already: it is written anew, and the page and the exports
-            made of it go.
+        path: the run's folder; None takes `default_path`. If the same run is there already, its folder stays as it is.
         also: writes further files into the temporary folder (the recording).
         replace: whether a run with another record may be replaced.
 
@@ -142,16 +125,17 @@ def save(
         OtherRunError: a run with another record is there.
         RunError: as `ensure_writable`, or the disk refuses.
     """
-
-    def check() -> None:
-        if not replace and (other := in_place_of(path, record.fingerprint)):
-            raise OtherRunError(f"{path}: holds {other}; {_INSTEAD}")
-
-    ensure_writable(path)
-    with settled(path):
-        check()
+    place = default_path(record) if path is None else path
+    ensure_writable(place)
+    there = in_place_of(place, record.fingerprint)
+    if there is None:
+        if also is not None and not (place / RECORDING).exists():
+            also(place)
+        return place
+    if there and not replace:
+        raise OtherRunError(f"{place}: holds {there}; {_INSTEAD}")
     result = outcome(record)
-    with replacing(path, check) as partial:
+    with replacing(place, replace=replace) as partial:
         (partial / OUTCOME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", "utf-8")
         (partial / SCENARIO).write_text(dump(record.scenario), "utf-8")
         about = {
@@ -171,7 +155,9 @@ def save(
             _write_table(record.tables, name, partial / f"{name}.parquet")
         if also is not None:
             also(partial)
-    return result
+    if there := in_place_of(place, record.fingerprint):  # it came meanwhile
+        raise OtherRunError(f"{place}: holds {there}; {_INSTEAD}")
+    return place
 
 
 def _write_table(tables: Mapping[str, pa.Table], name: str, path: Path) -> None:
@@ -189,20 +175,14 @@ def _write_table(tables: Mapping[str, pa.Table], name: str, path: Path) -> None:
             writer.write_table(pa.Table.from_batches(held, schema))
 
 
-def beside(path: Path, fingerprint: str) -> Path:
-    """The folder for a run that found another one in its place."""
-    place = path if path.name.strip(".") else path.resolve()  # `.` has no name of its own
-    return place.with_name(f"{place.name}-{fingerprint[:8]}")
-
-
-def in_place_of(path: Path, fingerprint: str) -> str:
-    """The run in a folder, in words, where its fingerprint is another; empty where there is none."""
+def in_place_of(path: Path, fingerprint: str) -> str | None:
+    """The run in a folder, in words; empty where there is none, None where it is the one with this fingerprint."""
     if not (path / OUTCOME).is_file():
         return ""
     try:
         old = read_json(path / OUTCOME)
         there = f"a run of {old['scenario']} under {old['policy']}, seed {old['seed']}"
-        return "" if old["fingerprint"] == fingerprint else there
+        return None if old["fingerprint"] == fingerprint else there
     except (OSError, ValueError, TypeError, LookupError):
         return "a run that cannot be read"
 
@@ -217,15 +197,6 @@ def _difference(old: Mapping[str, Any], new: Mapping[str, Any], within: str = ""
         elif there != here:
             return f"{within}{name} is {there!r} there and {here!r} here"
     return None
-
-
-def _is_of_the_run(page: Path) -> bool:
-    """Whether a page belongs to the run in its folder, by that run's fingerprint."""
-    try:
-        fingerprint = read_json(page.parent / OUTCOME)["fingerprint"]
-        return str(fingerprint) in page.read_text(encoding="utf-8")
-    except (OSError, ValueError, TypeError, LookupError):
-        return False
 
 
 def _scenario_of(path: Path) -> Scenario:

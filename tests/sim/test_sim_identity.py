@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
-import re
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from sortie.perception.types import Boxes
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.registry import resolve
 from sortie.scenarios import code_digest
-from sortie.scenarios.reading.load import load
 from sortie.sim import identity
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results import run_folder
@@ -297,18 +296,8 @@ def test_a_bound_object_is_named_by_its_class_and_not_by_its_address() -> None:
     assert "0x" not in one
 
 
-def test_a_folder_tells_policies_apart_and_not_the_order_of_their_parameters() -> None:
-    def folder(name: str, params: str) -> str:
-        flown = example(f"policy.name={name}", f"policy.params={params}")
-        return run_folder.default_path(flown, 1, 0, own=flown if params == "{}" else example()).name
-
-    assert folder("best-2", "{k: 2, received_budget: 0.2}") == folder("best-2", "{received_budget: 0.2, k: 2}")
-    assert folder("p1/a.py:f", "{}") != folder("p1_a.py:f", "{}")
-
-
-def test_what_flies_as_the_library_ships_it_has_a_folder_without_a_digest() -> None:
-    shipped = load("track_target")
-    assert run_folder.default_path(shipped, 1, 0, own=shipped).name == "track_target-s1-worked"
-    assert run_folder.default_path(shipped, 4, 2, own=shipped).name == "track_target-s4-worked-r2"
-    other = load("track_target", ["policy.params={rho: 0.5}"])
-    assert re.fullmatch(r"track_target-s1-worked-[0-9a-f]{6}", run_folder.default_path(other, 1, 0, own=shipped).name)
+def test_a_run_s_folder_says_what_flew_and_ends_in_its_fingerprint() -> None:
+    record = run_sortie(example("duration_s=0.1", "policy.name=best-2"), seed=4, replication=2)
+    assert str(run_folder.default_path(record)) == f"runs/example-s4-best-2-r2-{record.fingerprint[:8]}"
+    own = dataclasses.replace(record, policy="p/a.py:f", replication=0)
+    assert str(run_folder.default_path(own)) == f"runs/example-s4-p_a.py_f-{own.fingerprint[:8]}"

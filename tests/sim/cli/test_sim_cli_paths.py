@@ -47,14 +47,6 @@ def test_a_working_folder_that_was_deleted_is_one_line(
     assert capsys.readouterr().err == "error: the working folder was deleted; change to another folder\n"
 
 
-def test_a_run_beside_a_folder_without_a_name_has_the_folder_s_name(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run_folder.beside(Path(), "0123456789") == tmp_path.with_name(f"{tmp_path.name}-01234567")
-    assert run_folder.beside(Path("runs/a"), "0123456789") == Path("runs/a-01234567")
-
-
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -45,7 +45,8 @@ def test_a_watched_sortie_is_the_same_and_is_scored_as_it_flies() -> None:
 
 def test_the_outcome_says_what_scored_it_and_a_run_keeps_it(tmp_path: Path) -> None:
     record = run_sortie(short())
-    result = run_folder.save(record, tmp_path / "run")
+    result = outcome(record)
+    run_folder.save(record, tmp_path / "run")
     assert result["ap50"]["detector"] == "surrogate"
     assert result["ap50"]["calibration"].startswith("disconet-")
     assert 0.05 < result["ap50"]["full_scene"] < 0.9
