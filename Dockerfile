@@ -1,5 +1,5 @@
-# Everything installed, and the main scenario flown once:   docker build -t sortie .
-# The tests:                                                docker run --rm sortie
+# What flights need, and the main scenario flown once:      docker build -t sortie .
+# The tests, after an installation of what they need:       docker run --rm sortie
 # A shell, with the runs kept here:                         docker run --rm -it -v "$PWD/runs:/sortie/runs" sortie bash
 FROM python:3.12-slim
 RUN apt-get update \

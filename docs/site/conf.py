@@ -22,8 +22,9 @@ language = "en"
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "site_extension"]
 root_doc = "README"
-rooms = ("fleet", "perception", "policies", "radio", "ros2", "scenarios", "sim")
-include_patterns = ["*.md", "docs/**.md", *(f"{room}/**.md" for room in rooms), "notebooks/*.ipynb"]
+folders = ("docs", "fleet", "perception", "policies", "radio", "research", "ros2", "scenarios", "sim")
+notebooks = ("notebooks/*.ipynb", "research/pages/*.ipynb")
+include_patterns = ["*.md", *(f"{folder}/**.md" for folder in folders), *notebooks]
 
 nb_execution_mode = "off"  # notebooks are shown with the outputs that they were committed with
 myst_heading_anchors = 4  # `page.md#heading`, as code hosts have it

@@ -10,7 +10,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-FOLDER = Path(__file__).parents[2] / "notebooks"
+ROOT = Path(__file__).parents[2]
+NOTEBOOKS = sorted(path for folder in ("notebooks", "research/pages") for path in (ROOT / folder).glob("*.ipynb"))
+"""The tutorials, and the laboratory's."""
 
 
 def code_hash(cells: list[dict[str, Any]]) -> str:
@@ -35,5 +37,6 @@ def run(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:] or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
-        run(FOLDER / f"{name}.ipynb")
+    for path in NOTEBOOKS:
+        if path.stem in sys.argv[1:] or not sys.argv[1:]:
+            run(path)

@@ -29,6 +29,7 @@ docs/site/how_to
 docs/site/reference
 docs/site/explanation
 docs/site/results
+docs/site/laboratory
 docs/site/gallery
 docs/glossary
 docs/site/project

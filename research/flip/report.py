@@ -189,7 +189,7 @@ def _of(names: Sequence[str], networks: Sequence[object]) -> str:
 
 _BY_INTERVENTION = (
     "What comparing trained networks cannot show, an intervention can: in the "
-    "[dose–response study](../results/doses.md) three of these networks stay as they are, and silent peers draw more weight "
+    "[dose–response study](../doses.md) three of these networks stay as they are, and silent peers draw more weight "
     "when they fuse."
 )
 _LEGEND = (

@@ -868,9 +868,7 @@ def _between(text: str, name: str) -> str:
 def _paper_section() -> str:
     from research.paper import report, rows
 
-    return _between(
-        report.short(*rows.read(ROOT / "research/pages/paper/paper.parquet"), "../paper/README.md"), "paper"
-    )
+    return _between(report.short(*rows.read(ROOT / "research/pages/paper/paper.parquet"), "paper/README.md"), "paper")
 
 
 def _study_section() -> str:
@@ -881,7 +879,7 @@ def _study_section() -> str:
     from research.flip.plan import read_plan
 
     table = from_table(pq.read_table(ROOT / "research/pages/study/study.parquet"))
-    return _between(report.short(read_plan(), table, "../study/README.md"), "study")
+    return _between(report.short(read_plan(), table, "study/README.md"), "study")
 
 
 def _fields_section() -> str:

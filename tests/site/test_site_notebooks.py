@@ -14,9 +14,8 @@ from PIL import Image
 from places import ROOT
 
 sys.path.insert(0, str(ROOT / "docs" / "site"))
-from run_notebooks import FOLDER, code_hash
+from run_notebooks import NOTEBOOKS, code_hash
 
-NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 AGAIN = "run `make outputs`"
 
 

@@ -44,7 +44,7 @@ NOT_MEASURED = {
         "| `perception.fusion` | what it does in a cell | reads | bytes per link and frame |": DEFINED,
     },
     "research/flip/README.md": {"| quantity | AP of … | minus AP of … |": DEFINED},
-    "perception/surrogate/README.md": {"| step | what it scales | until |": DEFINED},
+    "research/pages/surrogate.md": {"| step | what it scales | until |": DEFINED},
     "research/pages/fine_network.md": {"| expected of the fine network | found |": DEFINED},
     "research/pages/flip.md": {"| word | meaning |": DEFINED},
     "research/pages/doses.md": {"| word | meaning |": DEFINED},

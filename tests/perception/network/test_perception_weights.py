@@ -49,7 +49,7 @@ def test_cooperation_beats_a_single_drone_on_held_out_towns() -> None:
 def test_the_weights_are_small_and_have_a_card() -> None:
     assert SHIPPED_WEIGHTS.stat().st_size < 5_000_000
     card = SHIPPED_WEIGHTS.with_suffix(".md").read_text()
-    assert "sortie train" in card
+    assert "python -m research train" in card
     assert "95 % interval" in card
 
 
