@@ -98,10 +98,10 @@ bench-all: $(STAMP) ## run every benchmark, ten minutes
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only
 
 figures: $(STAMP) ## measure the pages' figures again, hours in all (FIGURE=name for one; FIGURE=--list, FIGURE=--render)
-	$(BIN)/python research/validation/figures.py $(FIGURE)
+	$(BIN)/python -m research.validation.figures $(FIGURE)
 
-validate-ns3: ns3 ## run the same plans through ns-3 and through the radio, and write the table of radio/README.md (needs g++)
-	$(BIN)/python research/validation/figures.py ns3
+validate-ns3: ns3 ## run the same plans through ns-3 and through the radio, and write the table of research/pages/radio.md (needs g++)
+	$(BIN)/python -m research.validation.figures ns3
 
 ns3: $(STAMP) ## install ns-3's wheel (Linux on x86-64; 450 MB)
 	$(BIN)/python -m pip install --quiet --retries 1 -c constraints.txt -e '.[ns3]'
@@ -112,7 +112,7 @@ mavproxy: ## install the ground station MAVProxy in .venv-mavproxy, for its test
 
 mutate: $(STAMP) ## change the code that decides figures in small ways, and count what no test notices (hours; MUTATE="--room fleet --sample 5")
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[mutate]'
-	$(BIN)/python research/validation/mutate.py $(MUTATE)
+	$(BIN)/python -m research.validation.mutate $(MUTATE)
 
 clean: ## remove runs and caches, keep .venv
 	rm -rf runs .pytest_cache .mypy_cache .ruff_cache build *.egg-info

@@ -132,6 +132,7 @@ def test_a_call_that_is_late_is_interrupted_and_not_made_again(file: Path, name:
 def test_a_call_has_the_limit_that_its_block_says(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each call the whole of it, a call within a call none of its own, and after a call there is none."""
     asked: list[float] = []
+    monkeypatch.setattr(user_calls, "_own_process", False)
     monkeypatch.setattr(user_calls.signal, "setitimer", lambda which, seconds: asked.append(seconds))
     inner = guarded(lambda: 1)
     outer = guarded(lambda: inner())
@@ -159,6 +160,7 @@ def test_an_alarm_of_somebody_else_is_left_alone(somebodys_alarm: None, monkeypa
 
 def test_without_a_wish_only_a_process_of_sorties_own_has_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, float]] = []
+    monkeypatch.setattr(user_calls, "_own_process", False)
     monkeypatch.setattr(user_calls.signal, "setitimer", lambda which, seconds: asked.append((which, seconds)))
     with watched(2.0):
         guarded(lambda: 1)()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -49,19 +48,6 @@ def started(name: str, before: str = "") -> subprocess.CompletedProcess[str]:
 )
 def test_while_the_command_is_still_imported(name: str) -> None:
     ended = started(name)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "interrupted; nothing was written\n")
-
-
-def test_while_the_child_of_check_starts(tmp_path: Path) -> None:
-    """Before any code of Sortie runs in the child, as its Python starts."""
-    (tmp_path / "sitecustomize.py").write_text(
-        "import os, signal\nif 'SORTIE_REPORTS_TO' in os.environ: signal.raise_signal(signal.SIGINT)\n"
-    )
-    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    ended = subprocess.run(
-        [sys.executable, "-m", "sortie", "check", "track_target"], capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": path},
-    )  # fmt: skip
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "interrupted; nothing was written\n")
 
 

@@ -100,13 +100,6 @@ def test_a_run_is_kept_where_the_command_was_begun(scenario: Path, tmp_path: Pat
     assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
-def test_a_policy_that_moves_to_another_folder_is_found_again_by_the_kit(scenario: Path, tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    assert command("verify", "mine.py:moves", "--views", "20") == 1
-    assert (tmp_path / "runs" / "verify").is_dir()
-    assert list((tmp_path / "elsewhere").iterdir()) == []
-
-
 @pytest.mark.parametrize("views", ["false", "true"])
 def test_a_policy_cannot_change_what_it_reads(views: str) -> None:
     """An age set to zero would defeat the staleness rules, and be the record's."""
