@@ -1,6 +1,6 @@
 """The cell budget: which feature cells a drone sends, and the size of every payload in bytes. Free of torch.
 
-A sender ranks the cells whose centres lie in its region of interest, by its own confidence or by feature norm, and sends
+A sender ranks the cells whose centres lie in its region of interest, by its own confidence, and sends
 the best ⌊ρ · 4096⌋ of them. Pose and directive alone decide *how many* cells that is. So traffic is exact without
 running the detector. The evaluation (`evaluation/selection.py`) ranks cells by the same rule.
 """
@@ -188,7 +188,6 @@ def select(
     y_m: float,
     yaw_rad: float,
     missing: Sequence[int] = (),
-    first: Disc | None = None,
 ) -> Bools:
     """[64, 64] bool: the cells that arrive: the `cells_sent` best ones, without those that went missing.
 
@@ -196,13 +195,11 @@ def select(
         rank: [64, 64] confidence or norm, as for `ranking`.
         rho, roi, x_m, y_m, yaw_rad: as for `cells_sent`.
         missing: ranks among the cells sent (0 the best) that did not arrive.
-        first: without a region of interest, cells in this disc are sent before all others.
     """
     count = cells_sent(rho, roi, x_m, y_m, yaw_rad)
     out = np.zeros(CELLS, bool)
     if count:
-        disc = first if roi is None else roi
-        order = ranking(rank[None], None if disc is None else roi_mask(disc, x_m, y_m, yaw_rad)[None])[0]
+        order = ranking(rank[None], None if roi is None else roi_mask(roi, x_m, y_m, yaw_rad)[None])[0]
         out[order[:count]] = True
         out[order[list(missing)]] = False
     return out.reshape(GRID, GRID)

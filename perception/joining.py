@@ -170,7 +170,7 @@ def joined(pose: Pose, own: Boxes, fused: bool, others: Sequence[SourceBoxes], r
     return joined_many([EgoSources(pose, own, fused, others)], rule)[0]
 
 
-def joined_many(egos: Sequence[EgoSources], rule: Rule, common: float | None = None) -> list[Boxes]:
+def joined_many(egos: Sequence[EgoSources], rule: Rule) -> list[Boxes]:
     """Each ego's boxes joined with its peers', in the world, best first; boxes outside the ego's square are dropped.
 
     Args:
@@ -178,8 +178,6 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule, common: float | None = N
         rule: `nms`: of boxes that overlap by more than `NMS_IOU` the best stays, after scores are multiplied by weight and
             by what their age leaves of them. `average`: the mean place, size and heading of those boxes, by weight, score
             and precision. The score is the mean over all drones that looked there, and no more than weight and age leave.
-        common: the share of a variance that several drones' errors may have in common, in covariance intersection. None:
-            as fitted to the ego's detector.
     """
     exact = [any(s.covariance_m2 is not None for s in ego.others) for ego in egos]
     if not any(exact):
@@ -187,15 +185,13 @@ def joined_many(egos: Sequence[EgoSources], rule: Rule, common: float | None = N
     out = [Boxes.empty()] * len(egos)
     for which, its_rule in ((False, rule), (True, "average")):
         at = [k for k, is_exact in enumerate(exact) if is_exact == which]
-        several = _joined_many([egos[k] for k in at], its_rule, common, exact=which)
+        several = _joined_many([egos[k] for k in at], its_rule, exact=which)
         for k, boxes in zip(at, several, strict=True):
             out[k] = boxes
     return out
 
 
-def _joined_many(
-    egos: Sequence[EgoSources], rule: Rule, common: float | None = None, *, exact: bool = False
-) -> list[Boxes]:
+def _joined_many(egos: Sequence[EgoSources], rule: Rule, *, exact: bool = False) -> list[Boxes]:
     """`joined_many` of egos all of which join by covariances (`exact`), or none."""
     out = [ego.own for ego in egos]
     receivers = [k for k, ego in enumerate(egos) if ego.others]
@@ -247,7 +243,7 @@ def _joined_many(
             if covariance is not None:
                 information = weight[order][some, None] * inverse(covariance[some])
                 fitted = egos[k].errors
-                shared = common if common is not None else 1.0 if fitted is None else fitted.common
+                shared = 1.0 if fitted is None else fitted.common
             members = _Members(
                 group[some] - group[a], source[some] - first[n], left[some], known[some], information, shared
             )

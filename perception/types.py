@@ -76,8 +76,6 @@ class Share(NamedTuple):
     """People that the sender's thermal camera found; None where the payload has none to give."""
     errors: BoxErrors | None = None
     """How uncertain the places of `boxes` are, where they are sent with covariances."""
-    first: Disc | None = None
-    """Cells in this disc are sent before all others (`perception.serve`); None: all by their rank."""
     cut: bool = False
     """Of a payload of tracks: it was full before the people in it were set aside, so weaker tracks may have been left out."""
 

@@ -30,7 +30,7 @@ settings.load_profile("same")  # the same examples in each run; `make nightly` e
 NIGHTLY = (
     "api/test_install.py", "api/test_without_extras.py", "benchmarks", "fuzz", "research/benchmark",
     "perception/network/test_perception_codebook.py", "perception/network/test_perception_fine.py",
-    "perception/network/test_perception_fused_grids.py", "perception/recordings/test_perception_uav3d.py",
+    "perception/recordings/test_perception_uav3d.py",
     "perception/recordings/test_perception_unpickle.py", "research/flip",
     "perception/surrogate/test_perception_surrogate_calibrate.py",
     "perception/surrogate/test_perception_surrogate_correlation.py",

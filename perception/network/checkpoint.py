@@ -29,6 +29,10 @@ def save_weights(net: CarNet, path: Path, facts: dict[str, Any] | None = None) -
         part.chmod(0o644)  # the library makes it private
 
 
+EARLIER = {"exchange": "rectified", "decoder": "shallow"}
+"""Fields that earlier files have, with the only values that they may have."""
+
+
 def load_weights(path: Path, own: Fusion | None = None) -> CarNet:
     """A network in evaluation mode from a safetensors file.
 
@@ -43,9 +47,13 @@ def load_weights(path: Path, own: Fusion | None = None) -> CarNet:
     config = read_config(path)
     if own is None and config.fusion not in FUSIONS:
         raise InputError(f"{path}: made for fusion {config.fusion!r}, which perception.fusion does not name")
-    net = CarNet(config, own)
+    return filled(CarNet(config, own), path, own)
+
+
+def filled(net: CarNet, path: Path, own: Fusion | None = None) -> CarNet:
+    """The network in evaluation mode with the tensors of a file; arguments and errors as for `load_weights`."""
     found = load_file(path)
-    if own is not None and config.fusion in FUSIONS:
+    if own is not None and net.config.fusion in FUSIONS:
         found = {k: v for k, v in found.items() if not k.startswith("fusion.")}
         found |= {f"fusion.{k}": v for k, v in own.state_dict().items() if v.dtype.is_floating_point}
     wanted = {k: v for k, v in net.state_dict().items() if v.dtype.is_floating_point}
@@ -65,7 +73,21 @@ def load_weights(path: Path, own: Fusion | None = None) -> CarNet:
 
 def read_config(path: Path) -> ModelConfig:
     """The configuration of the network that a weights file holds; the default's where the file says nothing of it."""
-    given = _metadata(path).get("model", {})
+    return checked(path, {name: value for name, value in read_model(path).items() if EARLIER.get(name) != value})
+
+
+def read_model(path: Path) -> dict[str, Any]:
+    """The configuration as a weights file has it, unchecked."""
+    model: dict[str, Any] = _metadata(path).get("model", {})
+    return model
+
+
+def checked(path: Path, given: dict[str, Any]) -> ModelConfig:
+    """The configuration from its fields.
+
+    Raises:
+        InputError: an unknown field, or a value that it cannot have, naming the file.
+    """
     known = {f.name: f for f in fields(ModelConfig)}
     for name in given:
         if name not in known:
@@ -77,8 +99,6 @@ def read_config(path: Path) -> ModelConfig:
             config.fusion,
             (*FUSIONS, *installed("fusion"), *([config.fusion] if is_file(config.fusion) else [])),
         ),
-        ("exchange", config.exchange, ("rectified", "signed")),
-        ("decoder", config.decoder, ("shallow", "deep")),
         ("grid", config.grid, ("coarse", "fine")),
         ("half_extent_m", config.half_extent_m, (102.4, 51.2)),
         ("image_px", config.image_px, (IMAGE_PX, SHARP_PX)),

@@ -39,8 +39,6 @@ class Codebook:
     """[stages, 256, 80] float32."""
     encoder: str
     """Digest of the encoder whose features it was fitted to (`encoder_digest`)."""
-    rectified: bool
-    """Whether those features are ≥ 0, so that what is read is raised to 0."""
 
     @property
     def longest(self) -> int:
@@ -69,7 +67,7 @@ class Codebook:
         cells = torch.zeros(len(codes), CHANNELS)
         for entries, code in zip(self.stages, codes.T, strict=False):
             cells += entries[code.long()]
-        return (cells.clamp_min(0.0) if self.rectified else cells).half().float()
+        return cells.clamp_min(0.0).half().float()
 
     def read(self, features: Tensor, length: int, sent: Tensor | None = None) -> Tensor:
         """Features [80, h, w] as a receiver reads them from codes of `length` bytes; zeros where `sent` [h, w] is false."""
@@ -84,7 +82,7 @@ class Codebook:
 
 def encoder_digest(net: CarNet) -> str:
     """A hash of everything that a network's features depend on; of the network as it was loaded, not folded."""
-    digest = hashlib.blake2b(net.config.exchange.encode(), digest_size=8)
+    digest = hashlib.blake2b(b"rectified", digest_size=8)
     for name, tensor in sorted(net.encoder.state_dict().items()):
         if tensor.dtype.is_floating_point:
             digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
@@ -93,9 +91,8 @@ def encoder_digest(net: CarNet) -> str:
 
 def save_codebook(codebook: Codebook, path: Path, facts: dict[str, Any]) -> None:
     """Write a codebook, under a temporary name first; `facts` is JSON about its making."""
-    about = {"encoder": codebook.encoder, "rectified": codebook.rectified}
     with replacing(path) as part:
-        metadata = {"codebook": json.dumps(about), "sortie": json.dumps(facts)}
+        metadata = {"codebook": json.dumps({"encoder": codebook.encoder}), "sortie": json.dumps(facts)}
         save_file({"stages": codebook.stages.half().contiguous()}, part, metadata=metadata)
         part.chmod(0o644)  # the library makes it private
 
@@ -115,7 +112,7 @@ def load_codebook(path: Path, net: CarNet) -> Codebook:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {})["codebook"])
             stages = file.get_tensor("stages").float()
-            found = Codebook(stages, str(about["encoder"]), bool(about["rectified"]))
+            found = Codebook(stages, str(about["encoder"]))
     except (SafetensorError, OSError, KeyError, TypeError, json.JSONDecodeError) as error:
         raise InputError(f"{path}: not a codebook of this project ({error!r})") from None
     if stages.ndim != 3 or stages.shape[1:] != (ENTRIES, CHANNELS) or not 1 <= len(stages) <= budget.MAX_CODE_BYTES:

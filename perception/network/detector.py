@@ -10,7 +10,7 @@ The same calls in the same order give the same boxes.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -73,8 +73,8 @@ def named_weights(weights: Path | None) -> Path:
     return SHIPPED_WEIGHTS if weights is None else located(weights)
 
 
-Part = tuple[float, Disc | None, tuple[int, ...], bool, Disc | None]
-"""Which cells a share holds: ρ, region and ranks that are missing, whether they are codes, and which region is served first."""
+Part = tuple[float, Disc | None, tuple[int, ...], bool]
+"""Which cells a share holds: ρ, region and ranks that are missing, and whether they are codes."""
 
 
 @dataclass(slots=True)
@@ -124,8 +124,6 @@ class TorchDetector:
         self._shares: Shares = "features" if own else FUSIONS[config.fusion].shares
         path = shipped(config.fusion) if weights is None else named_weights(weights)
         net = load_weights(path, own)
-        if own is None:
-            net.fusion.tune(**config.fusion_params)
         if own is None and self._shares == "features" and net.config.fusion != config.fusion:
             raise InputError(
                 f"{path}: made for fusion {net.config.fusion!r}, perception.fusion is {config.fusion!r}, must be the same"
@@ -167,7 +165,7 @@ class TorchDetector:
         look = {s.capture for s in shared if s.is_detected or (match and self._is_fused(s))}
         alone = [e for e, shares in jobs if match or not any(self._is_fused(s) and s.weight > 0.0 for s in shares)]
         look |= {ego for ego in alone if ego.looked}
-        for capture in dict.fromkeys([*look, *(s.capture for s in shared if self._must_rank(s))]):
+        for capture in dict.fromkeys([*look, *(s.capture for s in shared if _must_rank(s))]):
             if capture in look:
                 self._look_alone(capture)
             else:
@@ -253,12 +251,6 @@ class TorchDetector:
 
         return self._task(spread)
 
-    def _must_rank(self, share: Share) -> bool:
-        """Whether the sender's own head is needed to choose the cells it sent."""
-        if share.representation not in CELL_NAMES or self._config.cells_by != "confidence":
-            return False
-        return _is_ranked(share)
-
     def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", torch.bfloat16, enabled=self._config.precision == "bfloat16")
 
@@ -295,14 +287,10 @@ class TorchDetector:
         kept = known[share.capture]
         if not _is_ranked(share):
             rank = np.zeros((CELLS, CELLS))
-        elif self._config.cells_by == "norm":
-            rank = kept.features.result().norm(dim=0).numpy()
         else:
             assert kept.out is not None  # noqa: S101 (`_must_rank`)
             rank = F.max_pool2d(kept.out.result()[:1], 2)[0].numpy()
-        return torch.from_numpy(
-            budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing, share.first)
-        )[None]
+        return torch.from_numpy(budget.select(rank, share.rho, share.roi, *share.capture.est_pose, share.missing))[None]
 
     def _is_fused(self, share: Share) -> bool:
         return self._shares == "features" and share.is_map
@@ -311,12 +299,11 @@ class TorchDetector:
         """One ego's boxes: its own after fusion, and its peers' where boxes came or late fusion is flown."""
         maps = [s for s in shares if self._is_fused(s) and s.weight > 0.0]
         boxed = [s for s in shares if not self._is_fused(s) and s.weight > 0.0]
-        silent = self._silent(ego, maps, now) if maps or ego.looked else []
         late = [self._source(s, self._map_pose(s, now), known) for s in boxed]
         place, places = ego.est_pose, [self._map_pose(s, now) for s in maps]
         if self._config.match_poses:
             place, places, late = self._matched(ego, maps, places, late, known)
-        peers = [*map(partial(self._peer, known), maps, places), *(Peer(c.est_pose, 1.0) for c in silent)]
+        peers = [*map(partial(self._peer, known), maps, places)]
         out = self._fuse(ego, place, peers, known) if peers else None
         if out is not None:
             own = self._place(out, place)
@@ -326,13 +313,10 @@ class TorchDetector:
             own = alone.result().moved(ego.est_pose, place)
         else:
             own = self._place(self._head(known[ego].maps.result()[None]), place)
-        if self._config.fused_grids == "all" and maps:
-            mine = [Peer(place, 1.0, known[ego].maps.result(), ALL_CELLS)] if ego.looked else []
-            late += self._on_their_grids(maps, peers, mine)
         sources = EgoSources.of(ego, shares, own, bool(maps) and out is not None, late)
         if any(s.covariance_m2 is not None for s in late):
             sources = sources._replace(errors=self._own_errors)
-        return joined_many([sources], self._config.join, self._config.common_share)[0]
+        return joined_many([sources], self._config.join)[0]
 
     def _matched(
         self, ego: Capture, maps: Sequence[Share], places: Sequence[Pose], late: Sequence[SourceBoxes], known: Known
@@ -361,17 +345,6 @@ class TorchDetector:
         ]
         return fitted[-1], fitted[: len(maps)], moved
 
-    def _silent(self, ego: Capture, maps: Sequence[Share], now: Mapping[int, Capture]) -> list[Capture]:
-        """The other drones of the moment that count as zeros because no map of theirs came."""
-        if (
-            self._config.absent_peers == "excluded"
-            or self._config.unsent_cells == "masked"
-            or self._shares != "features"
-        ):
-            return []
-        heard = {ego.drone, *(s.capture.drone for s in maps)}
-        return [capture for drone, capture in now.items() if drone not in heard]
-
     def _peer(self, known: Known, share: Share, pose: Pose) -> Peer:
         """A share's map, placed by a pose."""
         whole = known[share.capture].maps.result()
@@ -382,23 +355,6 @@ class TorchDetector:
         own = known[ego].maps.result() if ego.looked else None
         fused = fused_map(self._net, pose, own, peers, self._config.unsent_cells)
         return None if fused is None else self._head(fused)
-
-    def _on_their_grids(
-        self, maps: Sequence[Share], peers: Sequence[Peer], mine: Sequence[Peer]
-    ) -> Iterator[SourceBoxes]:
-        """The boxes of the same maps, fused once more on the grid of each drone that sent one; they weigh and are as old as its map.
-
-        Args:
-            maps: the shares that are fused; peers: theirs in the same order, and the silent ones; mine: the ego's own map.
-        """
-        for k, share in enumerate(maps):
-            first = peers[k]  # of maps that count most, the first takes the place of an ego's own
-            fused = fused_map(
-                self._net, first.pose, None, [first, *mine, *peers[:k], *peers[k + 1 :]], self._config.unsent_cells
-            )
-            if fused is not None:
-                found = self._place(self._head(fused), first.pose)
-                yield SourceBoxes(found, share.weight, first.pose, age_s=share.age_s)
 
     def _map(self, share: Share, known: Known) -> Future[Tensor]:
         """The map of a share as it is fused."""
@@ -495,8 +451,13 @@ class TorchDetector:
 
 def _part(share: Share) -> Part:
     if share.representation == "raw":
-        return 1.0, None, (), False, None
-    return share.rho, share.roi, share.missing, share.representation == "codes", share.first
+        return 1.0, None, (), False
+    return share.rho, share.roi, share.missing, share.representation == "codes"
+
+
+def _must_rank(share: Share) -> bool:
+    """Whether the sender's own head is needed to choose the cells it sent."""
+    return share.representation in CELL_NAMES and _is_ranked(share)
 
 
 def _is_ranked(share: Share) -> bool:

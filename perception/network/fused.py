@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from sortie.perception.geometry import CELLS
 from sortie.perception.joining import Pose
 from sortie.perception.network.fusion.base import UnsentCells, takes_part
 from sortie.perception.network.model import CarNet
@@ -23,10 +22,10 @@ class Peer(NamedTuple):
     """x, y, yaw that place its map in the world."""
     weight: float
     """Of the link, 0 … 1."""
-    map: Tensor | None = None
-    """[channels, n, n] on its own grid, as it is fused; None of a peer that sent none: zeros."""
-    sent: Tensor | None = None
-    """[64, 64] bool: the cells that came; None with a `map` of None."""
+    map: Tensor
+    """[channels, n, n] on its own grid, as it is fused."""
+    sent: Tensor
+    """[64, 64] bool: the cells that came."""
     whole: Tensor | None = None
     """Its own map, by which it answers a handshake, where `map` is what was read from the codes of some cells."""
 
@@ -43,17 +42,15 @@ def fused_map(net: CarNet, pose: Pose, own: Tensor | None, peers: Sequence[Peer]
     # relative to the ego, so that float32 keeps millimetres kilometres from the origin
     x, y, yaw = pose
     there = torch.tensor([(px - x, py - y, pyaw) for (px, py, pyaw), *_ in peers])
-    config, nothing = net.config, torch.zeros(CELLS**2, dtype=torch.bool)
+    config = net.config
     under = support(torch.tensor((0.0, 0.0, yaw)), there, config.fused_cell_m, config.fused_cells)
-    sent = net.sent(torch.stack([nothing if p.sent is None else p.sent.flatten() for p in peers]))
+    sent = net.sent(torch.stack([p.sent.flatten() for p in peers]))
     weights, arrived = arriving(under, sent)
     weight = torch.tensor([[p.weight for p in peers]])
     part = takes_part(arrived[None], under.inside[None], weight, unsent)
     if not bool(part[:, 1:].any()):
         return None
-    zeros = torch.zeros(config.fused_channels, config.fused_cells, config.fused_cells)
-    theirs = [zeros if p.map is None else p.map for p in peers]
-    tables = [each.permute(1, 2, 0).flatten(0, 1) for each in theirs]
+    tables = [p.map.permute(1, 2, 0).flatten(0, 1) for p in peers]
     offset = under.offset.flatten(1, 2)
     taps = list(zip(tables, under.cells.flatten(1, 2), weights.flatten(1, 2), offset, under.turn[:, None], strict=True))
 
@@ -67,7 +64,7 @@ def fused_map(net: CarNet, pose: Pose, own: Tensor | None, peers: Sequence[Peer]
     if own is None:
         return _without_own(net, said, part[0, 1:], arrived, weight[0])
     if net.fusion.weighs:
-        whole = [each if p.whole is None else p.whole for p, each in zip(peers, theirs, strict=True)]
+        whole = [p.map if p.whole is None else p.whole for p in peers]
         weight = net.fusion.weigh(own[None], torch.stack(whole)[None], weight)
     return _with_ego(net, own, said, part[0], weight[0])
 

@@ -39,13 +39,9 @@ class ModelConfig:
     half_extent_m: float = 102.4
     fusion: str = "disconet"
     """A name of `fusion.registry.FUSIONS`, or what names one of one's own."""
-    exchange: Literal["rectified", "signed"] = "rectified"
-    """Whether features are ≥ 0 where they are exchanged, or go there before the last non-linearity."""
-    decoder: Literal["shallow", "deep"] = "shallow"
-    """The head's trunk: at the exchange's resolution, or strided down to 16 × 16 and back with skips."""
     grid: Literal["coarse", "fine"] = "coarse"
     """Where maps are fused: in the cells that are exchanged, or in the head's. A fine network's head also tells how well
-    each box fits; its trunk has no choice."""
+    each box fits."""
     image_px: int = IMAGE_PX
     """Pixels along a side of the image: 256 of 0.8 m, learned from pictures of 160 × 90, or 512 of 0.4 m, from 320 × 180."""
 
@@ -86,7 +82,8 @@ class Residual(nn.Sequential):
         return out
 
 
-def _up(c_in: int, c_out: int) -> nn.Sequential:
+def upsampling(c_in: int, c_out: int) -> nn.Sequential:
+    """Transposed convolution that doubles the resolution, batch norm, ReLU."""
     return nn.Sequential(
         nn.ConvTranspose2d(c_in, c_out, 2, 2, bias=False), nn.BatchNorm2d(c_out), nn.ReLU(inplace=True)
     )
@@ -126,9 +123,7 @@ class Encoder(nn.Module):
         self.stem = Stem(config)
         sharp = [] if config.image_px == IMAGE_PX else [conv(16, 24, 5, 2)]
         self.down = nn.Sequential(*sharp, conv(24, 40), conv(40, CHANNELS, 3, 2))
-        # signed: without its ReLU what is added may be negative, and so may the sum
-        last = list(conv(CHANNELS, CHANNELS))[: 2 if config.exchange == "signed" else 3]
-        self.body = nn.Sequential(Residual(*conv(CHANNELS, CHANNELS, dilation=2)), Residual(*last))
+        self.body = nn.Sequential(Residual(*conv(CHANNELS, CHANNELS, dilation=2)), Residual(*conv(CHANNELS, CHANNELS)))
 
     def forward(self, image: Tensor) -> Tensor:
         x = self.body(self.down(self.stem(image)))
@@ -139,10 +134,10 @@ class Encoder(nn.Module):
 class Head(nn.Module):
     """Fused features → [n, 7, 128, 128]: heat logit, offset (x, y) in cells, log size (length, width), sin 2ψ, cos 2ψ."""
 
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.trunk = DeepTrunk() if config.decoder == "deep" else ShallowTrunk()
-        self.up = _up(CHANNELS, 40)
+        self.trunk: nn.Module = ShallowTrunk()
+        self.up = upsampling(CHANNELS, 40)
         self.fine = Residual(*conv(40, 40))
         self.out = nn.Conv2d(40, 7, 1)
         with torch.no_grad():
@@ -161,7 +156,7 @@ class FineHead(nn.Module):
         super().__init__()
         self.down = conv(FINE_CHANNELS, CHANNELS, stride=2)
         self.wide = Residual(*conv(CHANNELS, CHANNELS))
-        self.up = _up(CHANNELS, FINE_CHANNELS)
+        self.up = upsampling(CHANNELS, FINE_CHANNELS)
         self.fine = Residual(*conv(FINE_CHANNELS, FINE_CHANNELS))
         self.out = nn.Conv2d(FINE_CHANNELS, 8, 1)
         with torch.no_grad():
@@ -218,26 +213,6 @@ class ShallowTrunk(nn.Module):
         return self.join(fused)  # type: ignore[no-any-return]
 
 
-class DeepTrunk(nn.Module):
-    """Strided down to 16 × 16 and back up with skips, batch norm on every layer, as DiscoNet's decoder is built."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.down_32 = nn.Sequential(conv(CHANNELS, 96, stride=2), conv(96, 96))
-        self.down_16 = nn.Sequential(conv(96, 128, stride=2), conv(128, 128))
-        self.up_32 = _up(128, 96)
-        self.join_32 = conv(192, 96)
-        self.up_64 = _up(96, CHANNELS)
-        self.join_64 = conv(2 * CHANNELS, CHANNELS)
-
-    def forward(self, fused: Tensor) -> Tensor:
-        half = self.down_32(fused)
-        x = self.up_32(self.down_16(half))
-        x = self.up_64(self.join_32(torch.cat([x, half], dim=1)))
-        out: Tensor = self.join_64(torch.cat([x, fused], dim=1))
-        return out
-
-
 class CarNet(nn.Module):
     """Encoder, fusion and head; about 0.27 M parameters as shipped.
 
@@ -259,10 +234,10 @@ class CarNet(nn.Module):
         self.encoder = Encoder(config)
         self.fusion = _fusion(config) if fusion is None else fusion
         fine = config.grid == "fine"
-        self.spread: nn.Module = _up(CHANNELS, FINE_CHANNELS) if fine else nn.Identity()
+        self.spread: nn.Module = upsampling(CHANNELS, FINE_CHANNELS) if fine else nn.Identity()
         """Features [n, 80, 64, 64] as they are fused: [n, `fused_channels`, `fused_cells`, `fused_cells`]."""
         self.align = Align() if fine else None
-        self.head: nn.Module = FineHead() if fine else Head(config)
+        self.head: nn.Module = FineHead() if fine else Head()
         nn.Module.to(self, memory_format=torch.channels_last)  # type: ignore[call-overload]  # a third faster on a CPU
 
     def sent(self, cells: Tensor) -> Tensor:

@@ -45,12 +45,6 @@ class RecordedDetector:
     """As `perception.detector` names it."""
 
     def __init__(self, config: Perception) -> None:
-        for option, usual in (("absent_peers", "excluded"), ("fused_grids", "own")):
-            if (value := getattr(config, option)) != usual:
-                raise InputError(f"perception.{option} is {value!r}, must be {usual} for a recording")
-        for option in ("match_poses", "maps_bring_boxes"):
-            if getattr(config, option):
-                raise InputError(f"perception.{option} is true, must be false for a recording")
         self._recording = rec = open_recording(Path(config.recording or ""))
         self._config = config
         self._fuse = None if config.recorded_fusion is None else resolve("recorded_fusion", config.recorded_fusion)
@@ -120,8 +114,8 @@ class RecordedDetector:
             est = capture.est_pose
             rank = np.zeros((CELLS, CELLS))
             if share.missing or budget.must_choose(share.rho, share.roi, *est):
-                rank = self._recording.rank(frame, capture.drone, config.cells_by)
-            cells = budget.select(rank, share.rho, share.roi, *est, share.missing, share.first)
+                rank = self._recording.rank(frame, capture.drone, "confidence")
+            cells = budget.select(rank, share.rho, share.roi, *est, share.missing)
         lies = capture if config.motion_compensation else now.get(capture.drone, capture)
         return Sent(frame, capture.drone, cells, self._pose(lies), share.weight, share.age_s)
 

@@ -102,26 +102,11 @@ class SurrogateDetector:
         path: Path,
         eyes: Eyes | None = None,
     ) -> None:
-        name = str(path)
         fitted = str(parameters.card["fusion"])
         if config.fusion not in (fitted, "none"):
             raise InputError(
-                f"{name}: calibrated for fusion {fitted!r}, perception.fusion is {config.fusion!r}, must be that or 'none'"
+                f"{path}: calibrated for fusion {fitted!r}, perception.fusion is {config.fusion!r}, must be that or 'none'"
             )
-        if config.fusion_params:
-            raise InputError(
-                f"perception.fusion_params: {name} was calibrated without them, must be empty for the surrogate"
-            )
-        if config.absent_peers != "excluded":
-            raise InputError(
-                f"perception.absent_peers is {config.absent_peers!r}: {name} was calibrated without them, must be excluded"
-            )
-        for option in ("match_poses", "maps_bring_boxes"):
-            if getattr(config, option):
-                raise InputError(f"perception.{option} is true: {name} was calibrated without it, must be false")
-        for option, usual in (("fused_grids", "own"), ("serve", "grid")):
-            if (value := getattr(config, option)) != usual:
-                raise InputError(f"perception.{option} is {value!r}: {name} was calibrated without it, must be {usual}")
         self.parameters, self.calibration, self._path = parameters, parameters.id, path
         self._scene, self._config = scene, config
         self._eyes = eyes or Eyes(scene)
@@ -257,7 +242,7 @@ class SurrogateDetector:
             of = EgoSources.of(ego, shares, own, f or m in leads, others)
             exact = any(s.covariance_m2 is not None for s in others)
             sources.append(of._replace(errors=self._own_errors) if exact else of)
-        out = joined_many(sources, self._config.join, self._config.common_share)
+        out = joined_many(sources, self._config.join)
         return BoxColumns(np.cumsum([0, *(len(b) for b in out)]), Boxes.join(out))
 
     def _fuse(
@@ -273,7 +258,7 @@ class SurrogateDetector:
         pairs = pair(exchange, looks, fleet)
         zeros = np.full(len(exchange.ego), config.unsent_cells == "zero")
         cars = np.diff(looks.first)[looks.capture]
-        ranks = p.rank(rank_covariates(looks.covariates, confidence, cars), draws.rank, config.cells_by)
+        ranks = p.rank(rank_covariates(looks.covariates, confidence, cars), draws.rank)
         rank = ranks[pairs.peer]
         sent = exchange.sent(pairs, rank)
         own = confidence[pairs.look]

@@ -39,7 +39,6 @@ ALARM_COLUMNS = ("ahead_m", "left_m", "length_m", "width_m", "yaw_rad", "score")
 NETS: dict[str, tuple[int, int]] = {
     "look": (len(LOOK_COVARIATES), 5),
     "rank": (len(RANK_COVARIATES), 2),
-    "rank_norm": (len(RANK_COVARIATES), 2),
     "find": (len(FUSED_COVARIATES), 6),
     "place": (len(PLACE_COVARIATES), 11),
     "alarms": (len(ALARM_COVARIATES), BANDS),
@@ -150,9 +149,9 @@ class Parameters:
         """
         return _of_two(self.nets["look"](covariates), draw)
 
-    def rank(self, covariates: Singles, draw: Singles, by: str = "confidence") -> Singles:
+    def rank(self, covariates: Singles, draw: Singles) -> Singles:
         """The fraction [n] of the drone's cells that rank above the car's cell; `draw` [n] standard normal."""
-        out = self.nets["rank" if by == "confidence" else "rank_norm"](covariates)
+        out = self.nets["rank"](covariates)
         return np.asarray(np.minimum(np.exp(out[:, 0] + _spread(out[:, 1]) * draw), 1.0), np.float32)
 
     def find(self, covariates: Singles, draw: Singles) -> Singles:

@@ -46,23 +46,22 @@ class Probe(TorchDetector):
         if least != self._config.score_threshold:
             for known in self._kept.values():
                 known.boxes = None
-        self._config = Perception(score_threshold=least, unsent_cells=job.unsent, cells_by=job.cells_by, join=job.join)
+        self._config = Perception(score_threshold=least, unsent_cells=job.unsent, join=job.join)
         return self.detect([(job.ego, job.shares)])[0]
 
     def ranks(self, capture: Capture) -> NDArray[np.float32]:
-        """What ranks its cells, [2, 64, 64]: the logit of their confidence, and their features' norm."""
+        """What ranks its cells, [64, 64]: the logit of their confidence."""
         self._encode([capture])
         with torch.inference_mode():
-            confidence = F.max_pool2d(self._head_alone(capture).result()[:1], 2)[0]
-            norm = self._kept[capture].features.result().norm(dim=0)
-        return torch.stack([confidence, norm]).numpy()
+            confidence: NDArray[np.float32] = F.max_pool2d(self._head_alone(capture).result()[:1], 2)[0].numpy()
+        return confidence
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorRuns:
     """One moment's runs.
 
-    `jobs` and the `boxes` of each; `ranks` of every capture in them, [2, 64, 64].
+    `jobs` and the `boxes` of each; `ranks` of every capture in them, [64, 64].
     """
 
     split: Split

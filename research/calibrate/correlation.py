@@ -25,7 +25,6 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import CaptureColumns, Eyes
 from sortie.perception.surrogate.model import Parameters
-from sortie.perception.surrogate.shared_false_positives import estimate_shared
 from sortie.perception.types import Boxes
 from sortie.scenarios.schema import Perception
 
@@ -151,3 +150,19 @@ def fit_shared_false_positives(recorded: Sequence[DetectorRuns], floor: float, s
     spread_m = np.median(apart) / np.sqrt(4 * np.log(2)) if apart else 0.0
     spread_rad = np.median(np.abs(turned)) / (np.sqrt(2) * ndtri(0.75)) if turned else 0.0
     return np.array([part, chance, spread_m, spread_rad], np.float32)
+
+
+def estimate_shared(seen: Sequence[int], others: int) -> tuple[float, float]:
+    """The share of false positives that are of shared things, and the chance that a drone has one of those.
+
+    Chosen so that as many others have them, and as many pairs of others, as was counted on average.
+
+    Args:
+        seen: for each false positive, how many of the `others` that could have had it as well had it.
+    """
+    n = np.asarray(seen, dtype=np.float64)
+    if not n.sum():
+        return 0.0, 1.0
+    pairs = float((n * (n - 1)).mean() / ((others - 1) * n.mean()))
+    chance = min(1.0, max(pairs, float(n.mean()) / others))
+    return float(n.mean()) / (others * chance), chance

@@ -92,9 +92,9 @@ def judge(parameters: Parameters, held_out: Sequence[DetectorRuns], seed: int = 
     for recorded in held_out:
         scene = scene_model(seed, recorded.split, recorded.scene)
         truths = None
-        for rules in dict.fromkeys((j.unsent, j.cells_by, j.join) for j in recorded.jobs):
-            config = Perception(unsent_cells=rules[0], cells_by=rules[1], join=rules[2], score_threshold=THRESHOLD)
-            mine = [i for i, j in enumerate(recorded.jobs) if (j.unsent, j.cells_by, j.join) == rules]
+        for rules in dict.fromkeys((j.unsent, j.join) for j in recorded.jobs):
+            config = Perception(unsent_cells=rules[0], join=rules[1], score_threshold=THRESHOLD)
+            mine = [i for i, j in enumerate(recorded.jobs) if (j.unsent, j.join) == rules]
             for repeat in range(REPEATS):
                 detector = SurrogateDetector.of(scene, config, parameters, repeat)
                 if truths is None:

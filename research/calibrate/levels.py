@@ -85,7 +85,7 @@ def group_of(job: DetectorJob) -> int | None:
     along = int(square(np.asarray(job.ego.true_yaw_rad)) > SQUARE)
     if not job.shares:
         return along
-    if job.unsent != "masked" or job.cells_by != "confidence" or len({s.rho for s in job.shares}) > 1:
+    if job.unsent != "masked" or len({s.rho for s in job.shares}) > 1:
         return None
     for s in job.shares:
         if s.representation != "features" or s.roi or s.weight < 1.0 or s.missing or s.capture.t_s != job.ego.t_s:

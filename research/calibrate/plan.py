@@ -58,7 +58,6 @@ class DetectorJob:
     ego: Capture
     shares: tuple[Share, ...]
     unsent: Literal["masked", "zero"]
-    cells_by: Literal["confidence", "norm"]
     condition: str
     """Jobs of one condition are judged together; empty where they are only fitted."""
     join: Rule = "nms"
@@ -130,7 +129,7 @@ def moment(seed: int, split: Split, scene: int, index: int, condition_egos: int 
             return [job for ego in egos for job in conditions(ego, now, old)]
         x, y, _ = TargetPath.of(draw_target(seed, split, scene)).pose(now[0].t_s)
         return [job for ego in egos for job in street_conditions(ego, now, old, Disc(x, y, 32.0))]
-    jobs = [DetectorJob(ego, (), "masked", "confidence", "") for ego in now]
+    jobs = [DetectorJob(ego, (), "masked", "") for ego in now]
     jobs += [_exchange(rng, ego, now, old) for ego in now for _ in range(DRAWN)]
     return jobs + [_plain(rng, ego, now) for ego in now for _ in range(PLAIN)]
 
@@ -149,7 +148,6 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         who: list[int] = peers,
         unsent: Literal["masked", "zero"] = "masked",
         *,
-        cells_by: Literal["confidence", "norm"] = "confidence",
         roi: Disc | None = None,
         age_s: float = 0.0,
         representation: str = "features",
@@ -160,14 +158,13 @@ def conditions(ego: int, now: list[Capture], old: dict[float, list[Capture]]) ->
         of = old[age_s] if age_s else now
         shares = tuple(Share(of[i], representation, rho, roi, weight) for i in who)
         shares += tuple(Share(of[i], "detections", 0.0, None, 1.0) for i in boxes_of or [])
-        return DetectorJob(now[ego], shares, unsent, cells_by, name, join)
+        return DetectorJob(now[ego], shares, unsent, name, join)
 
     yield job("alone", 0.0, [])
     for rho in BUDGETS:
         yield job(f"all-4, ρ = {rho:g}", rho)
     for rho in (0.01, 0.05, 0.25):
         yield job(f"all-4, ρ = {rho:g}, zeros", rho, unsent="zero")
-    yield job("all-4, ρ = 0.1, norm", 0.1, cells_by="norm")
     yield job("all-4, ρ = 0.25, weight ½", 0.25, weight=0.5)
     yield job("all-4, ρ = 0.25, 0.2 s older", 0.25, age_s=0.2)
     yield job("all-4, ρ = 0.25, 0.4 s older", 0.25, age_s=0.4)
@@ -198,7 +195,7 @@ def street_conditions(
         join: Rule = "nms",
     ) -> DetectorJob:
         shares = tuple(Share(of[i], representation, rho, roi, 1.0) for i in peers if name != "alone")
-        return DetectorJob(now[ego], shares, "masked", "confidence", f"street: {name}", join, disc)
+        return DetectorJob(now[ego], shares, "masked", f"street: {name}", join, disc)
 
     yield job("alone", 0.0)
     for rho in (0.006, 0.025, 0.1, 0.35):
@@ -308,14 +305,14 @@ def _plain(rng: np.random.Generator, ego: Capture, now: list[Capture]) -> Detect
     """All others send a drawn part of their maps as they are now."""
     rho = _rho(*rng.random(2))
     shares = tuple(Share(c, "features", rho, None, 1.0) for c in now if c is not ego)
-    return DetectorJob(ego, shares, "masked", "confidence", "")
+    return DetectorJob(ego, shares, "masked", "")
 
 
 def _exchange(
     rng: np.random.Generator, ego: Capture, now: list[Capture], old: dict[float, list[Capture]]
 ) -> DetectorJob:
     """A drawn exchange: who, how many cells, where, how old, what a cell that was not sent counts as."""
-    u = rng.random(9)
+    u = rng.random(8)
     peers = rng.permutation([c.drone for c in now if c is not ego])[: 1 + int(4 * u[0])]
     if u[0] > 0.6:
         peers = np.array([c.drone for c in now if c is not ego])
@@ -334,4 +331,4 @@ def _exchange(
         Share((old[float(a)] if a else now)[p], "features", rho, roi, float(w))
         for p, a, w in zip(peers, ages, weights, strict=True)
     )
-    return DetectorJob(ego, shares, "zero" if u[7] < 0.25 else "masked", "norm" if u[8] < 0.15 else "confidence", "")
+    return DetectorJob(ego, shares, "zero" if u[7] < 0.25 else "masked", "")

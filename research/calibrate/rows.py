@@ -35,8 +35,8 @@ Array = NDArray[Any]
 class FitRows:
     """Rows of one or more scenes.
 
-    Looks (l): `look` [l, 19] covariates, `confidence` [l] and `norm` [l] what ranks the car's best cell, `above` [l] and
-    `above_norm` [l] the fraction of all cells that rank higher, `look_object` [l] which car of which scene, `look_cars` [l] how many its capture shows.
+    Looks (l): `look` [l, 19] covariates, `confidence` [l] of the car's best cell, `above` [l] the fraction of all cells that rank
+    higher, `look_object` [l] which car of which scene, `look_cars` [l] how many its capture shows.
     Fusions (f): `fused` [f, 28] covariates, `score` [f] (0: no box), `offset` [f, 5] box against car (ahead, left, yaw, log
     length, log width), `xy_m` [f, 2] the car in the ego's frame, `heading` [f] and how it is turned there,
     `shift` [f, 2] the mean that its peers' maps are off.
@@ -46,9 +46,7 @@ class FitRows:
 
     look: Array
     confidence: Array
-    norm: Array
     above: Array
-    above_norm: Array
     look_object: Array
     look_cars: Array
     fused: Array
@@ -89,17 +87,14 @@ def rows_of(recorded: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
     looks = eyes.look(fleet)
     ranks = np.stack([recorded.ranks[c] for c in captures])
     r, c = cell_of(looks.xy_m)
-    there = ranks[looks.capture[:, None], 0, r, c]
+    there = ranks[looks.capture[:, None], r, c]
     best = there.argmax(axis=1)
     n = np.arange(len(best))
     cell_r, cell_c = r[n, best], c[n, best]
-    confidence, norm = there[n, best], ranks[looks.capture, 1, cell_r, cell_c]
-    order = np.sort(ranks.reshape(len(captures), 2, -1), axis=-1)
+    confidence = there[n, best]
+    order = np.sort(ranks.reshape(len(captures), -1), axis=-1)
     above = np.array(
-        [4096 - np.searchsorted(order[k, 0], v, side="right") for k, v in zip(looks.capture, confidence, strict=True)]
-    )
-    above_norm = np.array(
-        [4096 - np.searchsorted(order[k, 1], v, side="right") for k, v in zip(looks.capture, norm, strict=True)]
+        [4096 - np.searchsorted(order[k], v, side="right") for k, v in zip(looks.capture, confidence, strict=True)]
     )
 
     jobs = [(j.ego, j.shares) for j in recorded.jobs]
@@ -107,8 +102,7 @@ def rows_of(recorded: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
     exchange = FeatureShares.of(jobs, column)
     pairs = pair(exchange, looks, fleet)
     sent = _sent(recorded, pairs, cell_r, cell_c, column)
-    by_norm = np.array([j.cells_by == "norm" for j in recorded.jobs])[pairs.row, None]
-    rank = np.where(by_norm, above_norm[pairs.peer], above[pairs.peer]) / 4096.0
+    rank = above[pairs.peer] / 4096.0
     fused = covariates(pairs, exchange, looks, confidence, sent, rank.astype(np.float32), zeros[pairs.row])
     late = np.array([any(not s.is_map for s in j.shares) for j in recorded.jobs])
     shift = mean_shift(pairs, exchange, sent)
@@ -125,7 +119,7 @@ def rows_of(recorded: DetectorRuns, floor: float, seed: int = 0) -> FitRows:
     of_jobs = alarm_covariates(exchange, looks, fleet, zeros, scene.config)
     of_jobs[late] = np.nan  # boxes that were sent are worked out, not fitted
     return FitRows(
-        looks.covariates, confidence, norm, above / 4096.0, above_norm / 4096.0, looks.car,
+        looks.covariates, confidence, above / 4096.0, looks.car,
         np.bincount(looks.capture, minlength=len(captures))[looks.capture],
         fused[keep], np.concatenate(score)[keep], np.concatenate(offset)[keep], looks.xy_m[pairs.look][keep], shift[keep],
         (looks.yaw_rad[pairs.look] - fleet.yaw_rad[exchange.ego[pairs.row]])[keep],
@@ -144,8 +138,7 @@ def _sent(
         for s in job.shares:
             if not s.is_map or s.weight <= 0:
                 continue
-            rank = recorded.ranks[s.capture][0 if job.cells_by == "confidence" else 1]
-            mask = budget.select(rank, s.rho, s.roi, *s.capture.est_pose)
+            mask = budget.select(recorded.ranks[s.capture], s.rho, s.roi, *s.capture.est_pose)
             peer = pairs.peer[mine, slot]
             sent[mine, slot] = (peer >= 0) & mask[cell_r[peer], cell_c[peer]]
             slot += 1

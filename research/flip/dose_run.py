@@ -31,7 +31,6 @@ from sortie.perception.evaluation.evaluate import exchanges, frame_hash, frame_k
 from sortie.perception.evaluation.matched import FrameResult, Settings, assemble, read_frames, write_frames
 from sortie.perception.evaluation.selection import link_bytes
 from sortie.perception.geometry import CELLS, Geometry, to_local
-from sortie.perception.network.checkpoint import load_weights
 
 Progress = Callable[[str, int, int], None]
 Found = tuple[dict[str, FrameResult], dict[str, list[float]]]
@@ -87,7 +86,7 @@ def measure_frames(
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, list[Found]]:
     """By network: every frame in turn under every dose. One frame is finished in all networks before the next begins."""
-    networks = {n: CarNetInstrument(load_weights(weights / f"{n}.safetensors"), device) for n in plan.networks}
+    networks = {n: CarNetInstrument.load(weights / f"{n}.safetensors", device) for n in plan.networks}
     keys, of_plan = frame_keys(data), _digest(plan)
     start = next(iter(networks.values())).start_worker
 

@@ -5,7 +5,6 @@ The boxes are those of `CarNetView.detect` under a network that was tuned to the
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -13,12 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from research.flip.fusion import DosedDiscoNet, silent_in
 from research.paper.instrument import BATCH, CarNetView
-from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import Unsent
 from sortie.perception.evaluation.contract import Exchange, Floats
-from sortie.perception.network.fusion.base import Fusion, weighted_sum
-from sortie.perception.network.fusion.disconet import DiscoNet, silent_in
+from sortie.perception.network.fusion.base import weighted_sum
 from sortie.perception.network.warp import arriving
 
 
@@ -49,25 +47,14 @@ class Prepared(NamedTuple):
     """[1 + k, p] bool"""
 
 
-def tuned(fusion: Fusion, tuning: Tuning) -> DiscoNet:
-    """A copy of a network's fusion, tuned to a dose; it shares the weights.
-
-    Raises:
-        InputError: the network's fusion is not DiscoNet.
-    """
-    if not isinstance(fusion, DiscoNet):
-        raise InputError(f"fusion is {fusion.name}, must be disconet")
-    out = copy.copy(fusion)
-    out.tune(tuning.temperature, tuning.silent_weight)
-    return out
-
-
 class DoseView:
     """A `CarNetView` of a network with DiscoNet's fusion, under several tunings of it."""
 
     def __init__(self, view: CarNetView, tunings: Sequence[Tuning]) -> None:
         self.view = view
-        self.fusions: dict[Tuning, DiscoNet] = {t: tuned(view.net.fusion, t) for t in tunings}
+        self.fusions = {
+            t: DosedDiscoNet(view.net.fusion, temperature=t.temperature, silent_weight=t.silent_weight) for t in tunings
+        }
         self._alone: dict[int, torch.Tensor] = {}
         self._shares: dict[tuple[int, tuple[int, ...], Tuning], torch.Tensor] = {}
 
@@ -105,7 +92,7 @@ class DoseView:
         return Prepared(e.ego, e.peers, under.inside.flatten(1), at, arrived[:, at], said, logit, silent_in(said))
 
     @property
-    def _disconet(self) -> DiscoNet:
+    def _disconet(self) -> DosedDiscoNet:
         return next(iter(self.fusions.values()))
 
     def _fuse(self, p: Prepared, t: Tuning) -> torch.Tensor:
@@ -134,6 +121,6 @@ class DoseView:
         return self._shares[key]
 
 
-def _shares(fusion: DiscoNet, logit: torch.Tensor, silent: torch.Tensor, peers: torch.Tensor) -> torch.Tensor:
+def _shares(fusion: DosedDiscoNet, logit: torch.Tensor, silent: torch.Tensor, peers: torch.Tensor) -> torch.Tensor:
     part = torch.cat([torch.ones_like(peers[:1]), peers])
-    return fusion.softmax(logit, silent, part, logit.new_ones(1, 1).expand(part.shape))
+    return fusion.dosed(logit, silent, part, logit.new_ones(1, 1).expand(part.shape))

@@ -1,7 +1,7 @@
 """The dose–response study: weight that silent peers draw is raised by intervention, and the flip looked for. Free of torch.
 
 `doses.toml` is the plan. The networks stay as they were trained; only their fusion's softmax is changed
-(`DiscoNet.tune`), so a difference between two doses has no other cause.
+(`fusion.DosedDiscoNet`), so a difference between two doses has no other cause.
 """
 
 from __future__ import annotations

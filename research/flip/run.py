@@ -14,6 +14,7 @@ import torch
 from research.benchmark.dataset import Benchmark, load_frames, make_split
 from research.benchmark.difficulty import Density, Difficulty
 from research.flip.measure import F1, StudyRow, optimal_f1, rows_of
+from research.flip.networks import config_of
 from research.flip.plan import MeasuredGrid, StudyPlan, Variant
 from research.paper.instrument import CPU, CarNetInstrument
 from research.paper.measures import under
@@ -22,8 +23,6 @@ from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing
 from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.evaluation.matched import FLOOR, Evaluation
-from sortie.perception.network.checkpoint import load_weights
-from sortie.perception.network.model import ModelConfig
 
 log_to_nowhere = logging.getLogger("sortie.study")
 Progress = Callable[[str, int, int], None]
@@ -67,7 +66,7 @@ def train_job(
     return train(
         folder / f"{job}.safetensors",
         variant.recipe_for(seed),
-        ModelConfig(**variant.model),
+        config_of(variant.model),
         root=root,
         work=folder / job,
         warm_start=warm_start,
@@ -98,7 +97,7 @@ def measure(
         weights = weights_of(job, *folders)
         if weights is None:
             continue
-        instrument = CarNetInstrument(load_weights(weights), device)
+        instrument = CarNetInstrument.load(weights, device)
         first = variant is plan.variants[0] and seed == variant.seeds[0]
         tau_f1 = _f1(instrument, root, folder, workers, partial(tell, f"{job}: tau split"))
         rows: list[StudyRow] = []

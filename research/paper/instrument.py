@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from research.flip.fusion import DosedDiscoNet
+from research.flip.networks import load
 from research.train.devices import gpu_name
 from sortie.perception.errors import InputError
 from sortie.perception.evaluation.condition import CellsBy
 from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
 from sortie.perception.geometry import Geometry
-from sortie.perception.network.checkpoint import load_weights
 from sortie.perception.network.decode import decode
 from sortie.perception.network.fusion.base import Fusion, PerCell
 from sortie.perception.network.fusion.disconet import DiscoNet
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
 from sortie.perception.network.warp import Support, arriving, rows, support
-from sortie.scenarios.schema.base import Params
 
 CPU = torch.device("cpu")
 BATCH = 5
@@ -33,14 +34,13 @@ BATCH = 5
 class CarNetInstrument:
     """A network on frames that carry `images` uint8 [n, d, 4, px, px]."""
 
-    def __init__(self, net: CarNet, device: torch.device = CPU, fusion_params: Params | None = None) -> None:
+    def __init__(self, net: CarNet, device: torch.device = CPU, fusion_params: Mapping[str, Any] | None = None) -> None:
         """
         Args:
             device: where it computes; a GPU is part of the fingerprint, because it rounds in its own way.
-            fusion_params: change how the network's fusion mixes (`Fusion.tune`).
+            fusion_params: the dose of the network's fusion (`DosedDiscoNet`); left out, it fuses as it was trained.
         """
-        params = fusion_params or {}
-        net.fusion.tune(**params)
+        params: Mapping[str, Any] = fusion_params or {}
         self.fingerprint = fingerprint(net) + "".join(f" {k}={v!r}" for k, v in sorted(params.items()))
         if gpu := gpu_name(device):
             self.fingerprint += f" on {gpu}"
@@ -48,12 +48,17 @@ class CarNetInstrument:
         self.fused_cells = net.config.fused_cells
         """Cells along a side of the maps that are fused."""
         self._device = device
-        self._net = folded(net).to(device)
+        self._net = folded(net)
+        if params:
+            self._net.fusion = DosedDiscoNet(self._net.fusion, **params)
+        self._net.to(device)
 
     @classmethod
-    def load(cls, weights: Path, device: torch.device = CPU, fusion_params: Params | None = None) -> CarNetInstrument:
+    def load(
+        cls, weights: Path, device: torch.device = CPU, fusion_params: Mapping[str, Any] | None = None
+    ) -> CarNetInstrument:
         """From a weights file; InputError where it is missing or does not fit."""
-        return cls(load_weights(weights), device, fusion_params)
+        return cls(load(weights), device, fusion_params)
 
     def start_worker(self) -> None:
         """For a thread of `evaluate`: frames side by side, each in one thread, beat two threads in every operation."""

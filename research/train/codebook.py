@@ -100,7 +100,7 @@ def make_codebook(
     paths = make_split(bench, "train", root, scenes=recipe.scenes)
     cells = sample(net, (load_frames([p]) for p in paths), recipe.seed)
     stages = fit(cells, recipe, progress)
-    codebook = Codebook(torch.from_numpy(stages), encoder_digest(net), net.config.exchange == "rectified")
+    codebook = Codebook(torch.from_numpy(stages), encoder_digest(net))
     spread = float(((cells - cells.mean(axis=0)) ** 2).sum())
     unexplained = {}
     for length in (1, 2, 5, 8, 10, 16, 20):

@@ -103,13 +103,13 @@ def train(
     Loss and validation AP are kept as CSV beside the weights, and if Rerun is installed as its recording (training.rrd).
     """
     from research.benchmark.dataset import Benchmark  # here: torch takes a second to import
+    from research.flip.networks import config_of
     from research.train.devices import device_named
     from research.train.recipe import Recipe
     from research.train.train import train as train_detector
     from sortie.perception.geometry import Geometry
     from sortie.perception.network.detector import named_weights, shipped
     from sortie.perception.network.fusion.registry import FUSIONS
-    from sortie.perception.network.model import ModelConfig
     from sortie.scenarios.plugins.reference import resolve
 
     half_extent_m = float(range_.value)
@@ -134,7 +134,12 @@ def train(
     if warm_start is not None and not warm_start.is_file():
         raise RunError(f"{warm_start}: no such weights")
     ensure_files(out_file)
-    config = ModelConfig(half_extent_m, fusion, exchange.value, decoder.value, grid.value, int(image_px.value))
+    config = config_of(
+        {
+            "half_extent_m": half_extent_m, "fusion": fusion, "exchange": exchange.value, "decoder": decoder.value,
+            "grid": grid.value, "image_px": int(image_px.value),
+        }
+    )  # fmt: skip
     with stages() as progress, _curves(out_file) as scalars:
         result = train_detector(
             out_file,

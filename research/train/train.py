@@ -26,6 +26,7 @@ from torch import Tensor
 
 from research.benchmark.dataset import Benchmark, Frames, load_frames, make_split
 from research.benchmark.difficulty import VARIED
+from research.flip.networks import load, network, read_config
 from research.train.devices import device_named, gpu_name
 from research.train.learn import SHARDS, Batch, Thinning, apply, draw_batch, gradients
 from research.train.recipe import PEAK_LR, Recipe, benchmark_root
@@ -33,7 +34,6 @@ from research.train.validation import history, publish, validate, validate_all
 from sortie.perception.errors import InputError
 from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference
-from sortie.perception.network.checkpoint import load_weights, read_config
 from sortie.perception.network.fusion.own import OwnFusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.model import CarNet, ModelConfig
@@ -131,7 +131,7 @@ def train(
     where = device_named(device)
     root, work = root or benchmark_root(), work or out.parent
     torch.manual_seed(recipe.seed)
-    net = CarNet(config, None if config.fusion in FUSIONS else OwnFusion(config.fusion))
+    net = network(config, None if config.fusion in FUSIONS else OwnFusion(config.fusion))
     if warm_start is not None:
         _begin_from(net, warm_start, log)
     net = net.to(where).train()
@@ -244,7 +244,7 @@ def _first(frames: Frames, count: int) -> Frames:
 def _begin_from(net: CarNet, path: Path, log: logging.Logger) -> None:
     """Take over the tensors of `path` that the network has in the same shape."""
     own = read_config(path).fusion not in FUSIONS and isinstance(net.fusion, OwnFusion)
-    given = load_weights(path, copy.deepcopy(net.fusion) if own else None)
+    given = load(path, copy.deepcopy(net.fusion) if own else None)
     found = read_config(path)
     if found.half_extent_m != net.config.half_extent_m:
         raise InputError(f"{path}: made for another range than ±{net.config.half_extent_m:g} m")

@@ -12,6 +12,7 @@ import torch
 
 from research.benchmark.dataset import SIZES, Benchmark, Frames
 from research.benchmark.difficulty import VARIED
+from research.flip.networks import read_config
 from research.paper.instrument import CarNetInstrument
 from research.paper.results import TAU
 from research.train.learn import EGOS
@@ -21,7 +22,7 @@ from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.files import replacing
 from sortie.perception.geometry import IMAGE_PX, Geometry
 from sortie.perception.metrics.bootstrap import Difference, compare
-from sortie.perception.network.checkpoint import read_config, read_facts, save_weights
+from sortie.perception.network.checkpoint import read_facts, save_weights
 from sortie.perception.network.model import CarNet
 from sortie.scenarios.report_text import interval, table
 

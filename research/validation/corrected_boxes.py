@@ -38,8 +38,19 @@ from pathlib import Path
 import numpy as np
 
 from research.benchmark.difficulty import Difficulty
-from research.validation.fused_grids import WEIGHTS, frame, interval
-from research.validation.sent_boxes import BOXES, BUDGET, Way, flown, found_by_others, frames, own_look_table, shares
+from research.validation.sent_boxes import (
+    BOXES,
+    BUDGET,
+    WEIGHTS,
+    Way,
+    flown,
+    found_by_others,
+    frame,
+    frames,
+    interval,
+    own_look_table,
+    shares,
+)
 from research.validation.stored import Column, Table, points
 from sortie.perception.metrics.ap import average_precision
 from sortie.perception.metrics.bootstrap import compare, rank

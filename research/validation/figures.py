@@ -477,12 +477,6 @@ def _fine_network() -> Tables:
     return fine_network.tables(ROOT / "runs/bench", ROOT / "research/pages/fine_network.png")
 
 
-def _fused_grids() -> Tables:
-    from research.validation import fused_grids
-
-    return fused_grids.tables()
-
-
 def _sent_boxes() -> Tables:
     from research.validation import sent_boxes
 
@@ -523,12 +517,6 @@ def _corrected_times() -> Tables:
     from research.validation import corrected_boxes
 
     return {"corrected_times": corrected_boxes.times()}
-
-
-def _grid_times() -> Tables:
-    from research.validation import fused_grids
-
-    return {"grid_times": fused_grids.times()}
 
 
 def _trucks() -> Tables:
@@ -834,10 +822,8 @@ FIGURES: dict[str, Figure] = {
     "handshakes": Figure(5, _handshakes),
     "requests": Figure(5, _requests),
     "fine_times": Figure(1, _fine_times, timed=True),
-    "grid_times": Figure(1, _grid_times, timed=True),
     "corrected_times": Figure(1, _corrected_times, timed=True),
     "fine_network": Figure(7, _fine_network),
-    "fused_grids": Figure(50, _fused_grids),
     "sent_boxes": Figure(20, _sent_boxes),
     "sent_own_look": Figure(10, _sent_own_look),
     "sent_flights": Figure(30, _sent_flights),
@@ -855,6 +841,8 @@ FIGURES: dict[str, Figure] = {
     "doses": Figure(110, _doses),
 }
 """By the name of the file."""
+CLOSED = ("fused_grids",)
+"""Stored tables whose scripts left with the options that they measured: their pages keep them, and no command makes them."""
 
 
 def _sortie(*words: object) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +57,7 @@ class Way:
     code_bytes: int = 0
     join: Rule = "average"
     common: float | None = None
-    """As for `joined_many`."""
+    """The share of a variance that several drones' errors may have in common; None: as fitted."""
 
 
 SILENCE = Way("none", "silence")
@@ -160,8 +160,9 @@ def _boxes(
                     late.append(source_of(Share(peer, way.representation, 0.0, None, 1.0), boxes, errors))
                     count = budget.boxes_sent(way.representation, len(boxes))
                     sent += budget.content_bytes(way.representation, boxes=count)
-            sources = EgoSources.of(ego, (), found[ego.drone], False, late)._replace(errors=errors)
-            units.append(match(joined_many([sources], way.join, way.common)[0], truth))
+            own_errors = errors if way.common is None else replace(errors, common=way.common)
+            sources = EgoSources.of(ego, (), found[ego.drone], False, late)._replace(errors=own_errors)
+            units.append(match(joined_many([sources], way.join)[0], truth))
         yield way, units, sent / len(captures)
 
 

@@ -8,25 +8,24 @@ split of benchmark seed 0, in two scenes of seed 12, and in 6 s over town 101.
   that flies. Then it sends the boxes that it found to the four, and each drone joins them with its own. On still frames
   no time passes between the two.
 - Ways. Silence, averaged boxes (each drone's by its own look alone), maps in four shares of the cells, and codes of 10 B in two;
-  maps and codes with and without the boxes; whole maps on all grids; boxes, whole maps and codes with corrected poses as well.
+  maps and codes with and without the boxes; boxes, whole maps and codes with corrected poses as well.
 - Flights. `track_target` for 16 s, scored once a second, in eight towns, 111 to 118, with as many seeds: `silence`, `boxes`, and
-  with a received budget of a twentieth `all-4` and `codes`, without and with `perception.maps_bring_boxes`; `all-4` on all
-  grids. AP of the full scene; the unit is the flight.
+  with a received budget of a twentieth `all-4` and `codes`, without and with `perception.maps_bring_boxes`. AP of the full
+  scene; the unit is the flight.
 - Time. One ego with four whole maps, without and with the boxes of its four peers, and with the coarse network, in turn (now in
   `corrected_boxes.py`).
 
 Expected:
 1. Whole maps with boxes beat averaged boxes by 3 points; where poses are corrected, by 2.
-2. They are at least as good as whole maps on all grids.
-3. A fiftieth of the cells with boxes beats averaged boxes by 2 points, and as codes by 1.
-4. In flight boxes add 5 points to a twentieth of the cells, which are then better than on all grids, and better than `boxes`.
-5. In flight codes of a twentieth of the cells with boxes are better than `boxes`.
+2. A fiftieth of the cells with boxes beats averaged boxes by 2 points, and as codes by 1.
+3. In flight boxes add 5 points to a twentieth of the cells, which are then better than `boxes`.
+4. In flight codes of a twentieth of the cells with boxes are better than `boxes`.
 Added after the frames were measured, and before this was: the same maps with the boxes of each sender's own look, on the same frames.
 They cost no further fusing, and part of the gain may come from any boxes. Expected: they gain half of what boxes of fused maps gain
 with whole maps, and most of it with codes of a fiftieth of the cells; boxes of fused maps are a point better with either.
 
 Time:
-6. An ego with four maps and the boxes takes at most 1.1 times as long as without the boxes, and 1.6 times as long as with
+5. An ego with four maps and the boxes takes at most 1.1 times as long as without the boxes, and 1.6 times as long as with
    the coarse network.
 """
 
@@ -39,21 +38,25 @@ from pathlib import Path
 import numpy as np
 
 from research.benchmark.difficulty import Difficulty
-from research.validation.fused_grids import SHORT, WEIGHTS, frame, interval
+from research.benchmark.scenes import draw_captures, draw_scene
 from research.validation.stored import Column, Table, points
 from sortie.perception import budget
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import Matched, average_precision, match
 from sortie.perception.metrics.bootstrap import compare, rank
 from sortie.perception.network.detector import TorchDetector
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
-from sortie.scenarios.intervals import percentile_interval, resamples
+from sortie.scenarios.intervals import mean_interval, percentile_interval, resamples
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Perception
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 
+WEIGHTS = Path("fine.safetensors")
 BENCH_SEED, SCENES = 13, 120
+AREA_M = (-60.0, -60.0, 60.0, 60.0)
+SHORT = ("duration_s=16", "perception.sample_rate_hz=1", f"perception.weights={WEIGHTS}")
 TOWNS = range(111, 119)
 CODE_BYTES = 10
 
@@ -67,7 +70,6 @@ class Way:
     rho: float = 1.0
     boxes: bool = False
     """Whether the boxes of fused maps are sent as well."""
-    grids: str = "own"
     matched: bool = False
 
     @property
@@ -75,13 +77,13 @@ class Way:
         """In words."""
         maps = f"{'codes of 10 B' if self.sent == 'codes' else 'maps'}, ρ = {self.rho:g}"
         label = {"none": "silence", "detections": "averaged boxes"}.get(self.sent, maps)
-        return label + ", with boxes" * self.boxes + ", all grids" * (self.grids == "all") + ", corrected poses" * self.matched  # fmt: skip
+        return label + ", with boxes" * self.boxes + ", corrected poses" * self.matched
 
 
 MAPS = (*(Way("features", rho) for rho in (0.02, 0.05, 0.25, 1.0)), *(Way("codes", rho) for rho in (0.02, 0.05)))
 MATCHED = Way("features", matched=True), Way("codes", 0.02, matched=True)
 WAYS = (
-    Way("none"), Way("detections"), *(w for way in MAPS for w in (way, replace(way, boxes=True))), Way("features", grids="all"),
+    Way("none"), Way("detections"), *(w for way in MAPS for w in (way, replace(way, boxes=True))),
     Way("detections", matched=True), *(w for way in MATCHED for w in (way, replace(way, boxes=True))),
 )  # fmt: skip
 
@@ -102,11 +104,10 @@ def frames(scenes: int, ways: Sequence[Way] = WAYS, seed: int = BENCH_SEED) -> M
         scene, fleet = frame(k, Difficulty(), seed)
         truths = [ground_truth(scene.cars_at(c.t_s).table(), c.true_pose) for c in fleet]
         alone: list[Boxes] = []
-        for grids, matched in dict.fromkeys((way.grids, way.matched) for way in ways):
-            config = Perception(fused_grids=grids, match_poses=matched, code_bytes=CODE_BYTES)
-            detector = TorchDetector(scene, config, k, WEIGHTS)
+        for matched in dict.fromkeys(way.matched for way in ways):
+            detector = TorchDetector(scene, Perception(match_poses=matched, code_bytes=CODE_BYTES), k, WEIGHTS)
             alone = alone or detector.detect([(ego, []) for ego in fleet])
-            for way in (w for w in ways if (w.grids, w.matched) == (grids, matched)):
+            for way in (w for w in ways if w.matched == matched):
                 looks = alone if way.sent == "detections" or (way.matched and way.sent != "none") else None
                 sent = None
                 fused = detector.detect([(ego, list(shares(way, ego, fleet))) for ego in fleet])
@@ -116,6 +117,12 @@ def frames(scenes: int, ways: Sequence[Way] = WAYS, seed: int = BENCH_SEED) -> M
                 found[way].matched.extend(match(b, truth) for b, truth in zip(fused, truths, strict=True))
                 found[way].received_b.extend(_received_b(way, i, (looks, sent), len(fleet)) for i in range(len(fleet)))
     return found
+
+
+def frame(k: int, difficulty: Difficulty, seed: int) -> tuple[SceneModel, Sequence[Capture]]:
+    """A scene of the test split, and a fleet's captures in it."""
+    scene = SceneModel(draw_scene(seed, "test", k, difficulty), None, AREA_M)
+    return scene, draw_captures(seed, "test", k, 0, difficulty)
 
 
 def shares(way: Way, ego: Capture, fleet: Sequence[Capture]) -> Iterator[Share]:
@@ -145,15 +152,14 @@ def frame_table(found: Mapping[Way, Found]) -> Table:
     rows: list[list[object]] = []
     for way, its in found.items():
         ap = average_precision(its.matched), *percentile_interval(rank(its.matched, scene).ap(resamples(egos // 5)))
-        others = Way("detections", matched=way.matched), replace(way, boxes=False), Way("features", grids="all")
+        others = Way("detections", matched=way.matched), replace(way, boxes=False)
         over = [
             points(compare(found[other].matched, its.matched, scene)) if other != way and way.sent != "none" else None
-            for other in others[: 2 if way.matched else 3]
+            for other in others
         ]
-        over += [None] * (3 - len(over))
         rows.append([way.label, float(np.mean(its.received_b)), ap, *over])
     columns = [Column("shared"), Column("an ego receives in a frame", ",.1f", " kB", 1e-3), Column("AP@0.5", ".3f")]
-    names = "over averaged boxes, same poses", "gain from the boxes", "over whole maps on all grids"
+    names = "over averaged boxes, same poses", "gain from the boxes"
     columns += [Column(name, "+.1f", factor=100) for name in names]
     about = f"{SCENES} frames of the test split of benchmark seed {BENCH_SEED}, five egos each; intervals over scenes."
     return Table(columns, rows, about)  # type: ignore[arg-type]
@@ -213,7 +219,7 @@ def draw(table: Table, path: Path) -> None:
     kinds = {"maps": ("features", "o"), "codes of 10 B": ("codes", "^"), "averaged boxes": ("detections", "s")}
     for kind, (sent, marker) in kinds.items():
         for boxes, colour in ((False, "#7a7d85"), (True, "#1d6f80")):
-            ways = (w for w in WAYS if (w.sent, w.boxes, w.grids, w.matched) == (sent, boxes, "own", False))
+            ways = (w for w in WAYS if (w.sent, w.boxes, w.matched) == (sent, boxes, False))
             chosen = [rows[way.label] for way in ways]
             if chosen:
                 x, (ap, low, high) = [v[0] for v in chosen], np.array([v[1] for v in chosen]).T
@@ -228,14 +234,12 @@ def draw(table: Table, path: Path) -> None:
 
 
 BUDGET = "policy.params={received_budget: 0.05}"
-ALL_GRIDS = "all-4, ρ = 0.05, all grids"
 BOXES = "perception.maps_bring_boxes=true"
 ARMS: Mapping[str, tuple[str, ...]] = {
     "silence": ("silence",),
     "boxes": ("boxes",),
     "all-4, ρ = 0.05": ("all-4", BUDGET),
     "all-4, ρ = 0.05, with boxes": ("all-4", BUDGET, BOXES),
-    ALL_GRIDS: ("all-4", BUDGET, "perception.fused_grids=all"),
     "codes, ρ = 0.05": ("codes", BUDGET),
     "codes, ρ = 0.05, with boxes": ("codes", BUDGET, BOXES),
 }
@@ -247,14 +251,11 @@ def flight_table() -> Table:
     ap = {arm: [each for each, _ in its] for arm, its in flights.items()}
     rows: list[list[object]] = []
     for arm, each in ap.items():
-        others = "silence", "boxes", arm.replace(", with boxes", ""), ALL_GRIDS
+        others = "silence", "boxes", arm.replace(", with boxes", "")
         over = [None if other == arm else interval(np.subtract(each, ap[other]).tolist()) for other in others]
         rows.append([arm, float(np.mean([mbps for _, mbps in flights[arm]])), interval(each), *over])
     columns = [Column("policy"), Column("the fleet sends", ".2f", " MB/s"), Column("AP of the full scene", ".3f")]
-    columns += [
-        Column(name, "+.1f", factor=100)
-        for name in ("over silence", "over `boxes`", "gain from the boxes", "over all grids")
-    ]
+    columns += [Column(name, "+.1f", factor=100) for name in ("over silence", "over `boxes`", "gain from the boxes")]
     about = f"`track_target` for 16 s, scored once a second; towns and seeds {TOWNS[0]} to {TOWNS[-1]}; intervals over flights."
     return Table(columns, rows, about)  # type: ignore[arg-type]
 
@@ -266,6 +267,12 @@ def flown(town: int, policy: str, *changes: str) -> tuple[float, float]:
     record = run_sortie(scenario, None, town)
     sent_b = record.tables["transmissions"]["payload_bytes"].to_numpy().sum()
     return float(outcome(record)["ap50"]["full_scene"]), float(sent_b / scenario.duration_s * 1e-6)
+
+
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """The mean over flights, with its interval."""
+    found = mean_interval(values)
+    return found.mean, found.low, found.high
 
 
 def tables(picture: Path) -> dict[str, Table]:

@@ -68,14 +68,11 @@ class Perception(Section):
         description="The detector: the network, its fast surrogate, a recording of another model, one of one's own (docs/guide), or none: the traffic alone.",
     )
     detector_params: Params = Field({}, description="Keyword arguments of a detector of one's own.")
-    fusion: Annotated[str, ModelName("fusion", FUSIONS, take_params=("disconet",))] = Field(
+    fusion: Annotated[str, ModelName("fusion", FUSIONS)] = Field(
         "disconet",
         description="How what peers sent is fused, or a fusion of one's own (docs/guide); weights belong to a fusion, none, late and one's own take any; the surrogate takes its calibration's, or none.",
     )
-    fusion_params: Params = Field(
-        {},
-        description="Keyword arguments of a fusion of one's own. Of disconet, for studies: temperature (the softmax's logits are divided by it; 1e9 gives equal weights) and silent_weight (added to the logit of cells that were not sent and count as zeros).",
-    )
+    fusion_params: Params = Field({}, description="Keyword arguments of a fusion of one's own.")
     weights: str | None = Field(
         None,
         description="A safetensors file: a network's. The surrogate takes the calibration beside it (`NAME.surrogate.safetensors`), or the file if it is one. Left out, the default network of the fusion; `disconet.safetensors` names the coarse one, which was the default before and was trained as those of other fusions were.",
@@ -106,7 +103,7 @@ class Perception(Section):
         50,
         ge=1,
         le=MOST_DRONES,
-        description="How many drones are scored at each scored moment. A larger fleet takes turns in a random order; it is scored whole where motion_compensation is false or absent_peers is zeros, as a drone's boxes then depend on where all others are.",
+        description="How many drones are scored at each scored moment. A larger fleet takes turns in a random order; it is scored whole where motion_compensation is false, as a drone's boxes then depend on where all others are.",
     )
     tracking_rate_hz: float = Field(
         2.0,
@@ -129,35 +126,18 @@ class Perception(Section):
         "average",
         description="How boxes of several drones become one list: of those that overlap, their weighted mean (average), or only the best (nms).",
     )
-    fused_grids: Literal["own", "all"] = Field(
-        "own",
-        description="On which grids a receiver fuses maps: on its own, or also on that of each drone that sent one (all), and the boxes of all grids are joined (the torch detector's).",
-    )
     maps_bring_boxes: bool = Field(
         False,
-        description="With each feature map, or codes of one, go the boxes that its sender found when it last fused the maps that it held (the torch detector's).",
+        description="With each feature map, or codes of one, go the boxes that its sender found when it last fused the maps that it held (perception/README.md says what this needs).",
     )
     match_poses: bool = Field(
         False,
-        description="Receivers correct the poses of all drones that they hear, and their own, by the cars that these have in common, before they fuse; boxes of the sender's own look go with its maps for that (the torch detector's).",
-    )
-    common_errors: Literal["fitted", "unknown"] = Field(
-        "fitted",
-        description="What covariance intersection assumes that the errors of several drones' boxes have in common: a fitted share, or anything, as in its first form (Julier and Uhlmann 1997).",
+        description="Receivers correct the poses of all drones that they hear, and their own, by the cars that these have in common, before they fuse; boxes of the sender's own detection go with its maps for that (perception/README.md says what this needs).",
     )
     score_threshold: float = Field(0.25, ge=0, le=1, description="Detections below this score are dropped.")
-    cells_by: Literal["confidence", "norm"] = Field("confidence", description="What ranks the cells under a budget.")
-    serve: Literal["grid", "region_first"] = Field(
-        "grid",
-        description="Which cells go first under a budget without a region of interest: all by rank, or those in the sender's mission region before all others (for studies; not the surrogate's).",
-    )
     unsent_cells: Literal["masked", "zero"] = Field(
         "masked",
         description="Cells that were not sent: out of the fusion softmax, or zeros in it (as in the paper's instrument).",
-    )
-    absent_peers: Literal["excluded", "zeros"] = Field(
-        "excluded",
-        description="Peers of whom no map came: out of the fusion, or zeros in it wherever their grids reach, with unsent_cells zero (for studies; the torch detector's).",
     )
     people: tuple[Person, ...] = Field((), max_length=100, description="People who walk about.")
     thermal: Thermal | None = Field(
@@ -166,25 +146,9 @@ class Perception(Section):
     scene: Scene = Scene()
 
     @property
-    def common_share(self) -> float | None:
-        """The share of a variance that several drones' errors may have in common; None: as fitted."""
-        return None if self.common_errors == "fitted" else 1.0
-
-    @property
     def classes(self) -> tuple[str, ...]:
         """The classes of targets that drones look for."""
         return "car", *(["truck"] if self.scene.trucks > 0.0 else []), *(["person"] if self.thermal is not None else [])
-
-    @model_validator(mode="after")
-    def _boxes_come_with_maps_that_are_fused(self) -> Perception:
-        unsupported = {"detector": self.detector not in ("torch", "none"), "fusion": self.fusion in ("none", "late")}
-        here_only = {  # else what a drone finds depends on which drones are scored at the moment
-            "motion_compensation": not self.motion_compensation, "absent_peers": self.absent_peers != "excluded",
-        }  # fmt: skip
-        for option, refused in (("match_poses", unsupported), ("maps_bring_boxes", unsupported | here_only)):
-            for name in (name for name, is_refused in refused.items() if is_refused and getattr(self, option)):
-                raise inconsistent((option,), "true", f"false where {name} is {str(getattr(self, name)).lower()}")
-        return self
 
     @model_validator(mode="after")
     def _recording_where_recorded(self) -> Perception:

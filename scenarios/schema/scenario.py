@@ -75,9 +75,7 @@ class Scenario(Section):
             until_s = getattr(event, "until_s", None)
             if until_s is not None and until_s <= event.at_s:
                 raise inconsistent(("events", i, "until_s"), f"{until_s:g}", f"above at_s = {event.at_s:g}")
-        for name in ("maps_bring_boxes", "match_poses"):
-            if getattr(self.perception, name) and self.radio.framing == "tiles":
-                raise inconsistent(("perception", name), "true", "false where radio.framing is tiles")
+        self._maps_can_bring_boxes()
         self._stations_stay()
         # What is done at an instant must have its instant. Phases and expected decisions may lie beyond the end: missions
         # are flown shortened, and an expectation of a time that was not flown fails.
@@ -99,6 +97,20 @@ class Scenario(Section):
             bound = f"above degraded_after_periods = {degraded:g}"
             raise inconsistent(("context", "detached_after_periods"), f"{detached:g}", bound)
         return self
+
+    def _maps_can_bring_boxes(self) -> None:
+        """Check that boxes are wanted with maps only where receivers fuse whole maps by the torch detector."""
+        perception = self.perception
+        unsupported = [
+            *(f"a drone's detector is {n.detector}" for n in self.networks if n.detector not in ("torch", "none")),
+            *([f"fusion is {perception.fusion}"] if perception.fusion in ("none", "late") else []),
+            *(["radio.framing is tiles"] if self.radio.framing == "tiles" else []),
+        ]
+        # without compensation, what a drone finds depends on which drones are scored at the moment
+        here_only = [] if perception.motion_compensation else ["motion_compensation is false"]
+        for option, refused in (("match_poses", unsupported), ("maps_bring_boxes", unsupported + here_only)):
+            if getattr(perception, option) and refused:
+                raise inconsistent(("perception", option), "true", f"false where {refused[0]}")
 
     def _stations_stay(self) -> None:
         """Check that no ground station is sent home, and that what fails of one is there."""
@@ -252,8 +264,7 @@ class Scenario(Section):
     def scored_drones(self) -> int:
         """How many of them are scored at each scored moment."""
         perception, every = self.perception, len(self.scorable_drones)
-        whole = not perception.motion_compensation or perception.absent_peers == "zeros"
-        return every if whole else min(perception.egos, every)
+        return min(perception.egos, every) if perception.motion_compensation else every
 
     @property
     def takes_turns(self) -> bool:

@@ -76,17 +76,11 @@ def ready(agent: Agent) -> Capture | None:
 class Fusing:
     """What drones fuse, of their own looks and of what they hold."""
 
-    def __init__(
-        self, scenario: Scenario, own_tracks: Callable[[int], Tracks], region: Callable[[int, float], Disc | None]
-    ) -> None:
-        """Args:
-        own_tracks: what a drone's own tracker follows.
-        region: a drone's mission region at a time.
-        """
+    def __init__(self, scenario: Scenario, own_tracks: Callable[[int], Tracks]) -> None:
+        """Args: `own_tracks` gives what a drone's own tracker follows."""
         config = scenario.perception
         self._limit_s, self._fusion_delay_s = config.max_age_s + INSTANT_S, config.fusion_delay_s
         self._own_tracks, self._delays_s = own_tracks, scenario.compute_delays_s
-        self._region = region if config.serve == "region_first" else None
 
     def maps(self, agent: Agent, now_s: float) -> list[Share]:
         """The maps among what the agent received lately, by ascending peer."""
@@ -105,13 +99,11 @@ class Fusing:
         return shares
 
     def _held(self, agent: Agent, now_s: float) -> Iterator[tuple[Received, Share]]:
-        memory, region = agent.memory, self._region
+        memory = agent.memory
         for peer, received in sorted(memory.held.items()):
             age_s = memory.payload_age_s(received, now_s)
             if age_s <= self._limit_s:
-                share = as_share(received, memory.trust_in(peer), age_s)
-                capture = share.capture
-                yield received, share if region is None else share._replace(first=region(peer, capture.t_s))
+                yield received, as_share(received, memory.trust_in(peer), age_s)
 
     def job(self, agent: Agent, here: Capture, shares: list[Share], now_s: float) -> Job | None:
         """The agent's capture and its recent shares, where `here` is its present pose.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.types import Boxes, Capture
@@ -16,14 +15,9 @@ class OwnBoxes:
     it in flight at little more than what it costs at the end of a sortie.
     """
 
-    def __init__(
-        self, detector: Detector, coming: Callable[[float], Iterable[Capture]], *, one_by_one: bool = False
-    ) -> None:
-        """Args:
-        coming: gives captures after a time that will probably be asked for; in flight they may turn out others.
-        one_by_one: each capture is a call of its own, for a detector to which the drones of one call are peers.
-        """
-        self._detector, self._coming, self._one_by_one = detector, coming, one_by_one
+    def __init__(self, detector: Detector, coming: Callable[[float], Iterable[Capture]]) -> None:
+        """Args: `coming` gives captures after a time that will probably be asked for; in flight they may turn out others."""
+        self._detector, self._coming = detector, coming
         self._many = detector if isinstance(detector, DetectsMany) else None
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
         self._known: dict[Capture, Boxes] = {}
@@ -32,9 +26,8 @@ class OwnBoxes:
     def __call__(self, captures: Sequence[Capture]) -> list[Boxes]:
         """The boxes of each capture, ENU, best first."""
         if self._many is None:
-            calls = [[c] for c in captures] if self._one_by_one else [captures]
-            begun = [self._begin(call) for call in calls]
-            return [boxes for wait in begun for boxes in wait()]
+            jobs = [(capture, ()) for capture in captures]
+            return self._detector.detect(jobs) if self._ahead is None else self._ahead.begin(jobs)()
         missing = [c for c in captures if c not in self._known]
         if missing:
             now_s = max(c.t_s for c in captures)
@@ -45,7 +38,3 @@ class OwnBoxes:
                 missing = list(dict.fromkeys([*missing, *next_ones]))
             self._known.update(zip(missing, self._many.detect_many([[(c, ())] for c in missing]), strict=True))
         return [self._known.pop(c) for c in captures]
-
-    def _begin(self, captures: Sequence[Capture]) -> Callable[[], list[Boxes]]:
-        jobs = [(capture, ()) for capture in captures]
-        return partial(self._detector.detect, jobs) if self._ahead is None else self._ahead.begin(jobs)

@@ -254,10 +254,9 @@ def build(
 
     ahead = captures_ahead(scenario, capture_of)
     looking = detector.looks if isinstance(detector, LooksByAnother) else detector
-    zeros = scenario.perception.absent_peers == "zeros"  # all drones of one call are peers
-    own_boxes: OwnBoxesOf = TargetSeen(scene) if looking is None else OwnBoxes(looking, ahead, one_by_one=zeros)
+    own_boxes: OwnBoxesOf = TargetSeen(scene) if looking is None else OwnBoxes(looking, ahead)
     tracking = FleetTracking(scenario, people.with_people(own_boxes))
-    fusing, finding = Fusing(scenario, tracking.tracks, plan.region), None
+    fusing, finding = Fusing(scenario, tracking.tracks), None
     if scenario.perception.maps_bring_boxes:
         finding = FindingEachFrame(env, scenario, detector, fusing, partial(cars_in_reach, scene))
     agents = [

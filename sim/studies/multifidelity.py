@@ -20,6 +20,7 @@ from sortie.perception.detectors import Detector, KeepsCaptures, make_detector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.control_variates import Controlled, controlled_mean, plan_units, widened
 from sortie.scenarios.intervals import mean_interval
+from sortie.scenarios.reading.load import build
 from sortie.scenarios.schema import Perception
 from sortie.sim.engine.sortie import DetectorMaker, run_sortie
 from sortie.sim.folders import RunError
@@ -222,12 +223,17 @@ def _mean_of(several: Sequence[Gains]) -> Gains:
 
 
 def with_detector(contender: Contender, detector: str) -> Contender:
-    """A contender with another detector; weights are the shipped ones, as a file is of one detector."""
-    perception = contender.scenario.perception
-    if perception.detector == detector:
+    """A contender with another detector; weights are the shipped ones, as a file is of one detector.
+
+    Raises:
+        ScenarioError: the scenario has an option that this detector cannot fly.
+    """
+    scenario = contender.scenario
+    if scenario.perception.detector == detector:
         return contender
-    changed = perception.model_copy(update={"detector": detector, "weights": None, "detector_params": {}})
-    return contender._replace(scenario=contender.scenario.model_copy(update={"perception": changed}))
+    own: dict[str, Any] = {"detector": detector, "weights": None, "detector_params": {}}
+    changed = scenario.model_copy(update={"perception": scenario.perception.model_copy(update=own)})
+    return contender._replace(scenario=build(changed.model_dump(mode="json", exclude_none=True), source=scenario.name))
 
 
 def shared_detector() -> DetectorMaker:

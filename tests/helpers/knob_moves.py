@@ -471,8 +471,8 @@ UNSIGNED: dict[str, str] = {
     **{
         f"perception.{name}": _KIND
         for name in (
-            "fusion", "fusion_params", "recording", "recorded_fusion", "precision", "motion_compensation", "cells_by", "join", "serve", "unsent_cells", "absent_peers",
-            "codebook", "common_errors", "match_poses", "fused_grids", "maps_bring_boxes",
+            "fusion", "fusion_params", "recording", "recorded_fusion", "precision", "motion_compensation", "join", "unsent_cells",
+            "codebook", "match_poses", "maps_bring_boxes",
         )
     },
     **{

@@ -119,11 +119,12 @@ def test_a_place_is_the_intersection_of_its_boxes_and_all_else_their_average() -
     covariances = spread_of(FLAT, own, HERE), spread_of(FITTED, theirs, (60.0, 0.0, 1.0))
     peer = SourceBoxes(theirs, 0.5, HERE, covariance_m2=covariances[1])
     plain = joined_many([ego(own, replace(peer, covariance_m2=None))], "average")[0]
-    for common_share, given in ((FLAT.common, None), (1.0, 1.0)):
-        found = joined_many([ego(own, peer)], "nms", given)[0]  # whichever rule is chosen for other boxes
+    for errors in (FLAT, replace(FLAT, common=1.0)):
+        of = ego(own, peer)._replace(errors=errors)
+        found = joined_many([of], "nms")[0]  # whichever rule is chosen for other boxes
         information = inverse(np.concatenate(covariances).astype(float)) * np.array([[1.0], [0.5]])
         at = np.concatenate([own.xy_m, theirs.xy_m]).astype(float)
-        wanted = intersect(at, information, np.zeros(2, np.intp), common_share)
+        wanted = intersect(at, information, np.zeros(2, np.intp), errors.common)
         np.testing.assert_allclose(found.xy_m, wanted.xy_m, atol=1e-5)
         for name in ("size_m", "yaw_rad", "score"):
             np.testing.assert_array_equal(getattr(found, name), getattr(plain, name))

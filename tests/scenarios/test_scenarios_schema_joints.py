@@ -79,8 +79,8 @@ def campaign(**changes: Any) -> Campaign:
             "perception.detector_params: {'a': 1}, must be left out where detector is none",
         ),
         (
-            "perception: {fusion: late, fusion_params: {a: 1}}",
-            "perception.fusion_params: {'a': 1}, must be left out where fusion is late",
+            "perception: {fusion_params: {temperature: 2}}",
+            "perception.fusion_params: {'temperature': 2}, must be left out where fusion is disconet",
         ),
     ],
 )
@@ -89,7 +89,6 @@ def test_parameters_that_belong_to_no_model_are_refused(text: str, said: str) ->
 
 
 def test_parameters_of_built_in_models_that_take_some_and_of_what_flew_once_are_accepted() -> None:
-    assert scenario("perception: {fusion_params: {temperature: 2}}").perception.fusion_params == {"temperature": 2}
     assert scenario("fleet: {mobility: gauss_markov, mobility_params: {alpha: 0.5}}").fleet.mobility_params
     with models_of_the_past():
         assert scenario("radio: {link_params: {a: 1}}").radio.link_params == {"a": 1}

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
-from sortie.perception.errors import InputError
 from sortie.perception.network.fusion.traffic import LinkBytes, features_of
 
 UnsentCells = Literal["masked", "zero"]
@@ -61,15 +60,6 @@ class Fusion(nn.Module):
             weight: [n, k], from the directives.
         """
         return weight
-
-    def tune(self, **params: Any) -> None:
-        """Change how a trained method fuses, for studies.
-
-        Raises:
-            InputError: a parameter that the method does not have, or a value that it cannot take.
-        """
-        for name in params:
-            raise InputError(f"perception.fusion_params.{name}: fusion {self.name} has no such parameter")
 
     def fold(self) -> None:
         """Fold batch norms into the layers before them, for inference; what has none does nothing."""

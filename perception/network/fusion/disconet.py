@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
-from sortie.perception.errors import InputError
 from sortie.perception.geometry import CHANNELS
 from sortie.perception.network.fusion.base import PerCell, weighted_sum
 
@@ -56,37 +55,10 @@ class DiscoNet(PerCell):
     def __init__(self, channels: int = CHANNELS) -> None:
         super().__init__()
         self.edge = EdgeWeights(channels)
-        self.tune()
-
-    def tune(self, temperature: float = 1.0, silent_weight: float = 0.0, **params: Any) -> None:
-        """Intervene on the softmax.
-
-        Args:
-            temperature: the logits are divided by it; infinite gives equal weights.
-            silent_weight: added to a peer's logit in cells of which nothing was sent and that count as zeros.
-        """
-        super().tune(**params)
-        if not (isinstance(temperature, float | int) and temperature > 0.0):
-            raise InputError(f"perception.fusion_params.temperature is {temperature!r}, must be a number above 0")
-        if not (isinstance(silent_weight, float | int) and math.isfinite(silent_weight)):
-            raise InputError(f"perception.fusion_params.silent_weight is {silent_weight!r}, must be a finite number")
-        self.temperature, self.silent_weight = temperature, silent_weight
 
     def weights(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
         """Each agent's softmax weight, [agents, p]; as for `mix`."""
-        silent = silent_in(features) if self.silent_weight else None
-        return self.softmax(self.edge(features), silent, part, weight)
-
-    def softmax(self, logit: Tensor, silent: Tensor | None, part: Tensor, weight: Tensor) -> Tensor:
-        """Each agent's softmax weight from the edge network's logits, all [agents, p].
-
-        Args: `silent` as `silent_in` gives it, or None: nobody's logit is changed.
-        """
-        if self.temperature != 1.0:
-            logit = logit / self.temperature
-        if silent is not None:
-            logit = logit + self.silent_weight * silent
-        return (logit + weight.clamp_min(1e-12).log()).masked_fill(~part, -math.inf).softmax(dim=0)
+        return softmax(self.edge(features), part, weight)
 
     def mix(self, features: Tensor, part: Tensor, weight: Tensor) -> Tensor:
         return weighted_sum(self.weights(features, part, weight), features)
@@ -98,8 +70,6 @@ class DiscoNet(PerCell):
             edge.norms[i] = nn.Identity()
 
 
-def silent_in(features: Tensor) -> Tensor:
-    """In which cells an agent counts as zeros, bool [agents, p] from [agents, p, channels]; never the ego, the first."""
-    silent = ~features.any(dim=-1)
-    silent[0] = False
-    return silent
+def softmax(logit: Tensor, part: Tensor, weight: Tensor) -> Tensor:
+    """Each agent's softmax weight from the edge network's logits, all [agents, p]; a link's weight multiplies it."""
+    return (logit + weight.clamp_min(1e-12).log()).masked_fill(~part, -math.inf).softmax(dim=0)

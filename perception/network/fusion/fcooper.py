@@ -12,7 +12,7 @@ class FCooper(PerCell):
     """Element by element, the largest of all agents' values; it has no parameters.
 
     A link's weight w takes the peer's value that part of the way up: the ego's x becomes x + w · (peer − x) where the
-    peer's is larger, so w = 1 is the maximum and w → 0 the ego alone, for signed features too.
+    peer's is larger, so w = 1 is the maximum and w → 0 the ego alone, for features below 0 too.
     """
 
     name = "fcooper"

@@ -3,8 +3,8 @@
 Coverage grids replace its confidence maps: a drone is confident where it sees well. In the first round a sender uses
 its own confidence alone. In later rounds it also uses the receiver's request, the cells where the receiver lacks
 confidence (C_i ⊙ (1 − C_j)). Each such round costs the bytes of the receiver's request map. A directive's region is a
-disc: the smallest around the bounding box of the chosen coverage cells. Under a budget, `perception.cells_by` chooses
-the feature cells inside it by the detector's own confidence.
+disc: the smallest around the bounding box of the chosen coverage cells. Under a budget, the feature cells
+inside it are chosen by the detector's own confidence.
 """
 
 from __future__ import annotations

@@ -111,7 +111,7 @@ class FakeProbe:
         return Boxes.placed(rows, (0.0, 0.0, 0.0))
 
     def ranks(self, capture: Capture) -> np.ndarray:
-        return np.full((2, 64, 64), capture.drone, np.float32)
+        return np.full((64, 64), capture.drone, np.float32)
 
 
 def test_a_calibration_that_its_card_would_replace_is_refused_before_anything_is_run(tmp_path: Path) -> None:

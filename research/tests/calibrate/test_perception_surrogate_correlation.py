@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from surrogate_examples import detector_runs
 
-from research.calibrate.correlation import fit_correlation
+from research.calibrate.correlation import estimate_shared, fit_correlation, fit_shared_false_positives
 from sortie.perception.surrogate.model import SHIPPED, Parameters, load
 from sortie.scenarios.shipped import CALIBRATION, NETWORKS
 
@@ -65,3 +65,29 @@ def test_between_two_factors_the_gain_is_straight(
     found = fit_correlation(parameters, [], 0, 0.1, lambda done, of: None)
     assert float(found.alike[0] / BASE[0]) == pytest.approx(factor, rel=1e-4)
     assert float(found.alike[3]) == pytest.approx(0.25, rel=1e-4)
+
+
+@pytest.mark.parametrize(("part", "chance"), [(0.5, 0.3), (0.9, 0.7), (1.0, 0.25)])
+def test_what_alarms_have_in_common_is_found_from_how_many_have_them(part: float, chance: float) -> None:
+    rng = np.random.default_rng(1)
+    shared = rng.random(200_000) < part
+    seen = np.where(shared, rng.binomial(4, chance, size=len(shared)), 0)
+    assert estimate_shared(seen.tolist(), 4) == pytest.approx((part, chance), abs=0.01)
+
+
+def test_where_nobody_shares_an_alarm_there_are_no_shared_false_positives() -> None:
+    assert estimate_shared([0, 0, 0], 4) == (0.0, 1.0)
+    assert estimate_shared([], 4) == (0.0, 1.0)
+    assert estimate_shared([4, 4], 4) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), pytest.param(0.5, 0.3, marks=pytest.mark.slow), (0.9, 0.8)])
+def test_a_fleet_of_known_shared_false_positives_is_measured_as_such(part: float, chance: float) -> None:
+    planted = replace(load(SHIPPED), shared_false_positives=np.array([part, chance, 0.4, 0.1], np.float32))
+    found = fit_shared_false_positives(detector_runs(planted, 40), planted.floor, 0)
+    # how often another has it too: some stand so near a car that was missed that they are taken for it
+    assert 0.75 * part * chance <= found[0] * found[1] <= part * chance + 0.02
+    if part:
+        assert found[1] == pytest.approx(chance, abs=0.1)
+        assert found[2] == pytest.approx(0.4, abs=0.1)
+        assert found[3] == pytest.approx(0.1, abs=0.03)

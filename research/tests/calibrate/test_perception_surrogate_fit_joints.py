@@ -65,12 +65,12 @@ def test_what_was_sent_is_by_each_job_s_own_ranking_region_and_slot() -> None:
     rng = np.random.default_rng(1)
     ego = capture(0.0, 0.0)
     peers = [capture(5.0, 0.0, drone=k, est=(20.0 * k, 3.0, 60.0, 0.4)) for k in (1, 2)]
-    ranks = {c: rng.random((2, 64, 64)) for c in peers}
+    ranks = {c: rng.random((64, 64)) for c in peers}
     weightless = Share(peers[0], "features", 1.0, None, 0.0)
     one = Share(peers[0], "features", 0.4, Disc(20.0, 3.0, 40.0), 1.0)
     two = Share(peers[1], "features", 0.5, None, 0.7)
     several = (weightless, Share(peers[0], "detections", 0.0, None, 1.0), one, two)
-    jobs = [DetectorJob(ego, several, "masked", by, "") for by in ("confidence", "norm")]
+    jobs = [DetectorJob(ego, several, "masked", "")] * 2
     n = 300
     r, c = rng.integers(64, size=n), rng.integers(64, size=n)
     row, peer = (
@@ -80,7 +80,7 @@ def test_what_was_sent_is_by_each_job_s_own_ranking_region_and_slot() -> None:
     sent = _sent(SimpleNamespace(jobs=jobs, ranks=ranks), SimpleNamespace(row=row, peer=peer), r, c, {})  # type: ignore[arg-type]
     for i in range(n):
         for slot, share in enumerate((one, two)):
-            mask = budget.select(ranks[share.capture][row[i]], share.rho, share.roi, *share.capture.est_pose)
+            mask = budget.select(ranks[share.capture], share.rho, share.roi, *share.capture.est_pose)
             at = peer[i, slot]
             assert sent[i, slot] == (at >= 0 and mask[r[at], c[at]])
     assert 0 < sent[:, 0].sum() < sent[:, 1].sum() < n
@@ -200,7 +200,7 @@ def test_what_a_floor_costs_is_measured_on_drones_alone_or_with_shares(monkeypat
     (x, y, length, width, yaw), *_ = only_target(10.0, 0.0).cars_at(5.0).table().tolist()
     right, wrong = (x, y, length, width, yaw), (-40.0, 0.0, length, width, yaw)
     share = Share(capture(5.0, 0.0, drone=1), "features", 1.0, None, 1.0)
-    jobs = [DetectorJob(ego, shares, "masked", "confidence", "") for shares in ((), (share,), (share,))]
+    jobs = [DetectorJob(ego, shares, "masked", "") for shares in ((), (share,), (share,))]
     found = [
         boxes((*wrong, 0.9), (*right, 0.5)),
         boxes((*right, 0.15)),
@@ -216,7 +216,7 @@ def test_what_a_floor_costs_is_measured_on_drones_alone_or_with_shares(monkeypat
 def test_what_a_drone_alone_would_send_is_counted_over_its_cars_and_its_jobs(monkeypatch: pytest.MonkeyPatch) -> None:
     ego, other = capture(0.0, 0.0), capture(9.0, 0.0, drone=1)
     share = Share(other, "features", 1.0, None, 1.0)
-    jobs = [DetectorJob(e, s, "masked", "confidence", "") for e, s in ((ego, ()), (ego, (share,)), (other, ()))]
+    jobs = [DetectorJob(e, s, "masked", "") for e, s in ((ego, ()), (ego, (share,)), (other, ()))]
     runs = DetectorRuns("fit", 0, jobs, [boxes(), boxes((0, 0, 1, 1, 0, 1)), boxes()], {})
     asked: list[Any] = []
     alarm = np.zeros((3, 6))

@@ -41,19 +41,18 @@ def jobs_at(t_s: float) -> list[DetectorJob]:
         maps = tuple(Share(c, "features", 0.02, None, 1.0) for c in peers)
         boxes = tuple(Share(c, "detections", 0.0, None, 1.0) for c in peers)
         out += [
-            DetectorJob(ego, (), "masked", "confidence", A, disc=DISC),
-            DetectorJob(ego, maps, "masked", "confidence", "maps"),
-            DetectorJob(ego, maps, "zero", "confidence", "zeros"),
-            DetectorJob(ego, maps, "masked", "norm", "norm"),
-            DetectorJob(ego, boxes, "masked", "confidence", B, disc=DISC),
-            DetectorJob(ego, boxes, "masked", "confidence", "averaged", "average"),
+            DetectorJob(ego, (), "masked", A, disc=DISC),
+            DetectorJob(ego, maps, "masked", "maps"),
+            DetectorJob(ego, maps, "zero", "zeros"),
+            DetectorJob(ego, boxes, "masked", B, disc=DISC),
+            DetectorJob(ego, boxes, "masked", "averaged", "average"),
         ]
     return out
 
 
 def found(job: DetectorJob, draw: int, eyes: Eyes) -> tuple[Boxes, Boxes]:
     """Boxes and truth."""
-    config = Perception(unsent_cells=job.unsent, cells_by=job.cells_by, join=job.join, score_threshold=THRESHOLD)
+    config = Perception(unsent_cells=job.unsent, join=job.join, score_threshold=THRESHOLD)
     detector = SurrogateDetector.of(TOWN, config, PARAMETERS, draw, eyes)
     return detector.detect([(job.ego, job.shares)])[0], detector.truth(job.ego.t_s, job.ego)
 
@@ -89,7 +88,7 @@ def test_every_condition_is_judged_under_its_own_rules_and_in_its_own_disc(
 ) -> None:
     verdict, both = judged
     assert {v.condition for v in verdict.levels} == set(both)
-    assert {A + IN_DISC, B + IN_DISC, "maps", "zeros", "norm", "averaged"} < set(both)
+    assert {A + IN_DISC, B + IN_DISC, "maps", "zeros", "averaged"} < set(both)
     for v in verdict.levels:
         theirs, ours = both[v.condition]
         torch, surrogate = average_precision(theirs), average_precision(ours)

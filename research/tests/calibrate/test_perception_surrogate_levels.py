@@ -20,14 +20,14 @@ PEER, OLD = capture(10.0, 0.0, drone=1), capture(10.0, 0.0, drone=1, t_s=4.8)
 
 def job(rho: float, ego: object = EGO, **other: object) -> DetectorJob:
     share = Share(PEER, "features", rho, None, 1.0)._replace(**other)  # type: ignore[arg-type]
-    return DetectorJob(ego, (share, share), "masked", "confidence", "")  # type: ignore[arg-type]
+    return DetectorJob(ego, (share, share), "masked", "")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("detector_job", "group"),
     [
-        (DetectorJob(EGO, (), "masked", "confidence", ""), 1),
-        (DetectorJob(ASKEW, (), "masked", "confidence", ""), 0),
+        (DetectorJob(EGO, (), "masked", ""), 1),
+        (DetectorJob(ASKEW, (), "masked", ""), 0),
         (job(0.01), 3),
         (job(0.01, ASKEW), 2),
         (job(0.015), 3),
@@ -41,7 +41,6 @@ def job(rho: float, ego: object = EGO, **other: object) -> DetectorJob:
         (job(0.5, missing=(3,)), None),
         (job(0.5, representation="detections"), None),
         (replace(job(0.5), unsent="zero"), None),
-        (replace(job(0.5), cells_by="norm"), None),
     ],
 )
 def test_plain_jobs_are_grouped_by_how_much_is_sent_and_how_the_drone_flies(

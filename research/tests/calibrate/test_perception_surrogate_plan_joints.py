@@ -56,7 +56,6 @@ def test_every_condition_sends_what_its_name_says(ego: int) -> None:
     expected |= {f"all-4, ρ = 0.25, {age:g} s older": shares(peers, rho=0.25, of=OLD[age]) for age in (0.2, 0.4)}
     expected |= {f"nearest 2, ρ = {rho:g}": shares(near[:2], rho=rho) for rho in (0.1, 0.5)}
     expected |= {
-        "all-4, ρ = 0.1, norm": shares(peers, rho=0.1),
         "all-4, ρ = 0.25, weight ½": shares(peers, rho=0.25, weight=0.5),
         "farthest 2, ρ = 0.5": shares(near[2:], rho=0.5),
         "detections": shares(peers, "detections"),
@@ -75,7 +74,6 @@ def test_every_condition_sends_what_its_name_says(ego: int) -> None:
     for name, j in jobs.items():
         assert (j.ego, j.disc) == (NOW[ego], None)
         assert (j.unsent == "zero") == ("zeros" in name)
-        assert (j.cells_by == "norm") == ("norm" in name)
         assert (j.join == "average") == ("average" in name)
 
 
@@ -92,7 +90,7 @@ def test_along_a_street_every_condition_is_judged_in_the_mission_s_disc_too(ego:
     }
     assert {name: j.shares for name, j in jobs.items()} == {f"street: {name}": s for name, s in expected.items()}
     for name, j in jobs.items():
-        assert (j.ego, j.disc, j.unsent, j.cells_by) == (NOW[ego], DISC, "masked", "confidence")
+        assert (j.ego, j.disc, j.unsent) == (NOW[ego], DISC, "masked")
         assert (j.join == "average") == ("average" in name)
 
 

@@ -21,12 +21,12 @@ TOWN = SceneModel(Scene(parked_density=0.4), None, (-60.0, -60.0, 60.0, 60.0))
 EGO, PEER = capture(10.0, 20.0, yaw=0.3), capture(25.0, 10.0, yaw=0.4, drone=1)
 MAP, SENT = Share(PEER, "features", 0.5, None, 1.0), Share(PEER, "detections", 0.0, None, 1.0)
 JOBS = [
-    DetectorJob(EGO, (MAP,), "masked", "confidence", ""),
-    DetectorJob(EGO, (SENT,), "masked", "confidence", ""),
-    DetectorJob(EGO, (MAP,), "zero", "norm", ""),
-    DetectorJob(EGO, (), "masked", "confidence", ""),
+    DetectorJob(EGO, (MAP,), "masked", ""),
+    DetectorJob(EGO, (SENT,), "masked", ""),
+    DetectorJob(EGO, (MAP,), "zero", ""),
+    DetectorJob(EGO, (), "masked", ""),
 ]
-RANKS = {c: np.random.default_rng(k).normal(size=(2, 64, 64)).astype(np.float32) for k, c in enumerate((EGO, PEER))}
+RANKS = {c: np.random.default_rng(k).normal(size=(64, 64)).astype(np.float32) for k, c in enumerate((EGO, PEER))}
 
 
 @pytest.fixture
@@ -50,19 +50,18 @@ def test_a_car_ranks_by_its_best_cell_among_all_of_its_drone(made: FitRows) -> N
     row, col = cell_of(looks.xy_m)
     for k, c in enumerate((EGO, PEER)):
         for i in np.flatnonzero(looks.capture == k).tolist():
-            about = [(RANKS[c][0, r, s], r, s) for r, s in zip(row[i], col[i], strict=True)]
-            best, r, s = max(about)
+            about = [RANKS[c][r, s] for r, s in zip(row[i], col[i], strict=True)]
+            best = max(about)
             assert made.confidence[i] == best
-            assert made.norm[i] == RANKS[c][1, r, s]
-            assert made.above[i] == pytest.approx((RANKS[c][0] > best).mean())
-            assert made.above_norm[i] == pytest.approx((RANKS[c][1] > RANKS[c][1, r, s]).mean())
+            assert made.above[i] == pytest.approx((RANKS[c] > best).mean())
             assert made.look_cars[i] == (looks.capture == k).sum()
 
 
 def test_what_is_about_a_car_is_told_by_the_ranking_that_chose(made: FitRows) -> None:
-    """By norm its own norm's rank decides which cells went, and how deep among them its cell lies."""
+    """Its rank decides which cells went, and how deep among them its cell lies."""
     looks = Eyes(TOWN).look(CaptureColumns.of([EGO, PEER]))
-    for job, above in ((0, made.above), (2, made.above_norm)):
+    above = made.above
+    for job in (0, 2):
         mine = made.fused_look[made.fused_job == job]
         peer = looks.index[1, looks.car[mine]]
         senders = column(made, job, "senders")

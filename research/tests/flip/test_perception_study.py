@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -160,8 +161,8 @@ def test_a_network_is_measured_at_each_density_and_its_threshold_is_found_on_sce
 
     stand_ins: dict[str, Any] = {
         "make_split": make_split, "load_frames": lambda paths: paths, "evaluate": lambda *_, **__: Found(),
-        "optimal_f1": lambda *_: "f1", "rows_of": lambda *a: [(a[3], a[5])], "CarNetInstrument": lambda net, device: net,
-        "load_weights": lambda path: path, "weights_of": lambda job, *_: Path(job),
+        "optimal_f1": lambda *_: "f1", "rows_of": lambda *a: [(a[3], a[5])], "CarNetInstrument": SimpleNamespace(load=lambda path, device: path),
+        "weights_of": lambda job, *_: Path(job),
     }  # fmt: skip
     for name, made in stand_ins.items():
         monkeypatch.setattr(study_run, name, made)

@@ -11,6 +11,7 @@ import pytest
 
 from research.flip import run as study_run
 from research.flip.measure import StudyRow
+from research.flip.networks import StudyConfig
 from research.flip.plan import PLAN, MeasuredGrid, StudyPlan, Variant, read_plan
 from research.flip.report import FixedSettings, StudyRows, answers, flips, networks, short, thresholds
 from research.flip.run import conditions
@@ -206,7 +207,7 @@ def test_a_network_is_trained_as_the_plan_says_from_the_weights_that_it_begins_f
         (folder / "full-0.safetensors").write_bytes(b"")
         assert trained("signed-0") == "trained"
         assert asked.pop() == (
-            mine / "signed-0.safetensors", signed.recipe_for(0), ModelConfig(exchange="signed"), root, mine / "signed-0",
+            mine / "signed-0.safetensors", signed.recipe_for(0), StudyConfig(exchange="signed"), root, mine / "signed-0",
             folder / "full-0.safetensors",
         )  # fmt: skip
     assert asked == [

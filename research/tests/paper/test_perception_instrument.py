@@ -11,6 +11,7 @@ import torch
 from harness_examples import SeenFrames, made_frames, with_images
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from research.flip.networks import StudyConfig, StudyNet
 from research.paper.instrument import CarNetInstrument, fingerprint
 from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.evaluation.contract import Exchange
@@ -122,7 +123,7 @@ def test_ranks(frames: SeenFrames) -> None:
 def test_a_fingerprint_is_of_weights_and_configuration(tmp_path: Path) -> None:
     net = network("disconet")
     assert fingerprint(net) == fingerprint(network("disconet")) != fingerprint(network("disconet", seed=1))
-    signed = CarNet(ModelConfig(exchange="signed")).eval()
+    signed = StudyNet(StudyConfig(exchange="signed")).eval()
     rectified = CarNet(ModelConfig()).eval()
     signed.encoder.load_state_dict(rectified.encoder.state_dict(), strict=False)
     assert fingerprint(signed) != fingerprint(rectified)

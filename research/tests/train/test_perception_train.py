@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 
 from research.benchmark.dataset import Benchmark, Frames, load_frames, make_scene_file
 from research.benchmark.difficulty import VARIED
+from research.flip.networks import StudyConfig, StudyNet
 from research.train import train as training
 from research.train.learn import Thinning, draw_batch, gradients, local_cars
 from research.train.recipe import Recipe, command
@@ -155,7 +156,7 @@ def test_thinning_drops_as_often_and_as_much_as_it_says() -> None:
 
 def test_the_command_repeats_the_run() -> None:
     recipe = Recipe(steps=150, seed=2, cell_dropout=0.8, unsent="zero", warm_start="full-2.safetensors")
-    model = asdict(ModelConfig(decoder="deep", half_extent_m=51.2))
+    model = asdict(StudyConfig(decoder="deep", half_extent_m=51.2))
     assert command({**asdict(recipe), "done": 150}, model, 3, "w.safetensors") == (
         "sortie train --steps 150 --seed 2 --cell-dropout 0.8 --unsent zero --warm-start full-2.safetensors "
         "--range 51.2 --decoder deep --bench-seed 3 --out w.safetensors"
@@ -197,7 +198,7 @@ def test_a_card_names_each_run_with_the_network_that_it_made(tmp_path: Path) -> 
     net, bench, done = CarNet(), Benchmark(), {"done": 5, "loss": 1.0, "minutes": 2.0}
     publish(net, tmp_path / "first.safetensors", bench, [asdict(Recipe(steps=5)) | done], [])
     runs = [*history(tmp_path / "first.safetensors"), asdict(Recipe(steps=7, warm_start="first.safetensors")) | done]
-    deep = CarNet(ModelConfig(fusion="fcooper", decoder="deep"))
+    deep = StudyNet(StudyConfig(fusion="fcooper", decoder="deep"))
     publish(deep, tmp_path / "second.safetensors", bench, runs, [])
     runs = [*history(tmp_path / "second.safetensors"), asdict(Recipe(warm_start="second.safetensors")) | done]
     publish(net, tmp_path / "third.safetensors", bench, runs, [])
@@ -212,7 +213,7 @@ def test_a_warm_start_takes_what_fits_and_names_the_rest(tmp_path: Path, caplog:
     torch.manual_seed(1)
     old = CarNet()
     save_weights(old, tmp_path / "old.safetensors")
-    deep = CarNet(ModelConfig(decoder="deep"))
+    deep = StudyNet(StudyConfig(decoder="deep"))
     with caplog.at_level(logging.INFO, "sortie.train"):
         training._begin_from(deep, tmp_path / "old.safetensors", logging.getLogger("sortie.train"))
     assert torch.equal(deep.encoder.stem[0].weight, old.encoder.stem[0].weight)

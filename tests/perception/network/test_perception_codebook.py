@@ -32,14 +32,14 @@ from sortie.scenarios.schema import Perception, Scene
 from sortie.scenarios.shipped import CODEBOOK, beside
 
 
-def drawn(stages: int = 3, seed: int = 0, *, rectified: bool = False) -> Codebook:
+def drawn(stages: int = 3, seed: int = 0) -> Codebook:
     made = torch.from_numpy(np.random.default_rng(seed).normal(size=(stages, ENTRIES, 80))).float()
     made = made * torch.tensor([1.0, 0.5, 0.25, 0.1])[:stages, None, None]
-    return Codebook(made.half().float(), "of none", rectified)  # as a file has them
+    return Codebook(made.half().float(), "of none")  # as a file has them
 
 
 def test_each_byte_names_the_entry_nearest_to_what_is_left() -> None:
-    codebook, cells = drawn(), torch.from_numpy(np.random.default_rng(1).normal(size=(40, 80))).float()
+    codebook, cells = drawn(), torch.from_numpy(np.random.default_rng(1).normal(size=(40, 80))).float().relu()
     codes = codebook.encode(cells, 3)
     assert codes.shape == (40, 3)
     assert codes.dtype == torch.uint8
@@ -55,11 +55,12 @@ def test_each_byte_names_the_entry_nearest_to_what_is_left() -> None:
     read = [codebook.decode(codebook.encode(cells, k)) for k in (1, 2, 3)]
     lost = [float(((cells - r) ** 2).sum()) for r in read]
     assert lost[0] > lost[1] > lost[2] > 0.0
-    torch.testing.assert_close(read[2], sum(s[c.long()] for s, c in zip(codebook.stages, codes.T, strict=True)).half().float())  # fmt: skip
+    summed = torch.stack([s[c.long()] for s, c in zip(codebook.stages, codes.T, strict=True)]).sum(dim=0)
+    torch.testing.assert_close(read[2], summed.clamp_min(0.0).half().float())
 
 
-def test_a_map_is_read_where_it_was_sent_and_rectified_features_stay_so() -> None:
-    codebook = drawn(rectified=True)
+def test_a_map_is_read_where_it_was_sent_and_features_stay_0_or_above() -> None:
+    codebook = drawn()
     features = torch.from_numpy(np.random.default_rng(4).normal(size=(80, 4, 4))).float().relu()
     whole = codebook.read(features, 2)
     assert float(whole.min()) == 0.0
@@ -76,11 +77,11 @@ def test_a_map_is_read_where_it_was_sent_and_rectified_features_stay_so() -> Non
 
 def test_the_fit_finds_clusters_stage_by_stage_and_repeats() -> None:
     rng = np.random.default_rng(6)
-    coarse, fine = rng.normal(size=(12, 80)) * 4.0, rng.normal(size=(9, 80)) * 0.2
+    coarse, fine = np.abs(rng.normal(size=(12, 80))) * 4.0 + 1.0, rng.normal(size=(9, 80)) * 0.2
     cells = (coarse[rng.integers(12, size=900)] + fine[rng.integers(9, size=900)]).astype(np.float32)
     recipe = CodebookRecipe(stages=2, iterations=10)
     stages = fit(cells, recipe)
-    codebook = Codebook(torch.from_numpy(stages), "of none", rectified=False)
+    codebook = Codebook(torch.from_numpy(stages), "of none")
     read = codebook.decode(codebook.encode(torch.from_numpy(cells), 2)).numpy()
     assert ((cells - read) ** 2).sum() < 0.01 * ((cells - cells.mean(axis=0)) ** 2).sum()
     np.testing.assert_array_equal(fit(cells, recipe), stages)
@@ -92,15 +93,15 @@ def test_the_file_is_read_as_it_was_written_and_belongs_to_its_network(tmp_path:
     net = load_weights(SHIPPED_WEIGHTS)
     path = beside(tmp_path / "net.safetensors", CODEBOOK)
     made = drawn()
-    codebook = Codebook(made.stages, encoder_digest(net), rectified=True)
+    codebook = Codebook(made.stages, encoder_digest(net))
     save_codebook(codebook, path, {})
     read = load_codebook(path, net)
     torch.testing.assert_close(read.stages, codebook.stages)
-    assert (read.encoder, read.rectified, read.longest) == (codebook.encoder, True, 3)
+    assert (read.encoder, read.longest) == (codebook.encoder, 3)
     other = CarNet(ModelConfig()).eval()
     with pytest.raises(InputError, match="fitted to another encoder than the weights'"):
         load_codebook(path, other)
-    save_file({"stages": torch.zeros(2, 5, 80)}, path, metadata={"codebook": '{"encoder": "", "rectified": true}'})
+    save_file({"stages": torch.zeros(2, 5, 80)}, path, metadata={"codebook": '{"encoder": ""}'})
     with pytest.raises(InputError, match=r"stages have shape \[2, 5, 80\], must be \[1 to 20, 256, 80\]"):
         load_codebook(path, net)
     save_weights(other, path)
@@ -123,7 +124,6 @@ def test_a_codebook_s_card_names_the_command_that_repeats_it(seed: int, told: st
 def test_the_shipped_codebook_belongs_to_the_shipped_network_and_has_every_length() -> None:
     codebook = load_codebook(beside(SHIPPED_WEIGHTS, CODEBOOK), load_weights(SHIPPED_WEIGHTS))
     assert codebook.longest == 20
-    assert codebook.rectified
     assert len(codebook_digest(beside(SHIPPED_WEIGHTS, CODEBOOK))) == 14
 
 
@@ -216,6 +216,6 @@ def test_a_codebook_that_is_missing_or_too_short_is_one_error(
     with pytest.raises(InputError, match=r"none\.safetensors: no such codebook"):
         TorchDetector(scene, Perception(codebook=str(tmp_path / "none.safetensors")), 1).detect(job)
     path = tmp_path / "short.safetensors"
-    save_codebook(Codebook(drawn().stages, encoder_digest(load_weights(SHIPPED_WEIGHTS)), rectified=True), path, {})
+    save_codebook(Codebook(drawn().stages, encoder_digest(load_weights(SHIPPED_WEIGHTS))), path, {})
     with pytest.raises(InputError, match=r"perception.code_bytes is 10, must be at most 3, the stages of .*short"):
         TorchDetector(scene, Perception(codebook=str(path)), 1).detect(job)

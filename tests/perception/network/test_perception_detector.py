@@ -13,9 +13,7 @@ import torch
 from perception_examples import capture, cross
 from places import HELPERS
 
-from sortie.perception.budget import cells_sent
 from sortie.perception.detectors import make_detector
-from sortie.perception.errors import InputError
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import EgoSources, joined_many, source_of
 from sortie.perception.metrics.ap import match
@@ -24,7 +22,6 @@ from sortie.perception.scene import render
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.perception.uncertainty import BoxErrors
-from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception, Scene, Target
 
 
@@ -130,45 +127,8 @@ def test_a_budget_an_roi_and_the_two_masks_matter(
         ]
     )
     zero = TorchDetector(scene, Perception(unsent_cells="zero"), seed=1).detect([(fleet[0], shares)])[0]
-    norm = TorchDetector(scene, Perception(cells_by="norm"), seed=1).detect([(fleet[0], shares)])[0]
-    answers = [full, tenth, disc, zero, norm]
+    answers = [full, tenth, disc, zero]
     assert not any(same(a, b) for k, a in enumerate(answers) for b in answers[:k])
-
-
-def test_peers_of_whom_nothing_came_dilute_where_they_count_as_zeros(scene: SceneModel, fleet: list[Capture]) -> None:
-    """As if each of them had sent a map of which no cell arrived."""
-    ego, first, *others = fleet
-    jobs = [(ego, [share(first)]), *((c, []) for c in (first, *others))]
-    zeros = {"unsent_cells": "zero", "absent_peers": "zeros"}
-    found, *rest = TorchDetector(scene, Perception.model_validate(zeros), 1).detect(jobs)
-    nothing = [Share(c, "features", 1.0, None, 1.0, missing=tuple(range(4096))) for c in others]
-    as_sent = TorchDetector(scene, Perception(unsent_cells="zero"), 1)
-    assert same(found, as_sent.detect([(ego, [share(first), *nothing])])[0])
-    assert not same(found, as_sent.detect([(ego, [share(first)])])[0])
-    assert not same(rest[0], as_sent.detect([(first, [])])[0])  # to whom nobody sends anything
-    masked = TorchDetector(scene, Perception(absent_peers="zeros"), 1)
-    assert same(masked.detect(jobs)[0], TorchDetector(scene, Perception(), 1).detect(jobs)[0])
-
-
-@pytest.mark.parametrize(("looked", "score"), [(True, 0.4), (False, 0.8)])
-def test_boxes_beside_silent_peers_alone_are_not_fused_ones(looked: bool, score: float) -> None:
-    """No map came: a drone that looked and saw nothing votes with a weight of 1, one without a look does not vote."""
-    nothing, car = Boxes.empty(), Boxes.placed(np.array([(20.0, 0.0, 4.5, 1.9, 0.0, 0.8)]), (0.0, 0.0, 0.0))
-
-    class Silence(TorchDetector):
-        def __init__(self) -> None:
-            self._config, self._shares = Perception(unsent_cells="zero", absent_peers="zeros"), "features"
-
-        def _fuse(self, *_: object) -> torch.Tensor:
-            return torch.zeros(0)
-
-        def _place(self, *_: object) -> Boxes:
-            return nothing
-
-    ego, peer = cross(0.0, 0.0, 0.0)[:2]
-    ego, detections = ego._replace(looked=looked), Share(peer, "detections", 0.0, None, 1.0, boxes=car)
-    found = Silence()._detect_ego(ego, [detections], {0: ego, 1: peer}, {})
-    assert found.score.tolist() == pytest.approx([score])
 
 
 def test_weights_without_fitted_errors_join_uncertain_boxes_of_another_network(tmp_path: Path) -> None:
@@ -193,48 +153,6 @@ def test_weights_without_fitted_errors_join_uncertain_boxes_of_another_network(t
     found = Alone()._detect_ego(ego, [share], {0: ego, 1: peer}, {ego: SimpleNamespace(boxes=None, maps=maps)})  # type: ignore[dict-item]
     wanted = joined_many([EgoSources(ego.est_pose, car, False, [source_of(share, None)])], "average")[0]
     assert same(found, wanted)
-
-
-def test_cells_of_the_region_that_is_served_first_are_all_that_a_small_budget_sends(
-    scene: SceneModel, fleet: list[Capture]
-) -> None:
-    """A region with more cells than the budget lets through: as if only cells in it might be sent."""
-    detector, region = TorchDetector(scene, Perception(unsent_cells="zero"), seed=1), Disc(10.0, 20.0, 32.0)
-    plain = [share(c, rho=0.01) for c in fleet[1:]]
-    assert all(cells_sent(1.0, region, *c.est_pose) > cells_sent(0.01, None, *c.est_pose) for c in fleet[1:])
-    by_rank, first, within, both = detector.detect(
-        [
-            (fleet[0], plain),
-            (fleet[0], [s._replace(first=region) for s in plain]),
-            (fleet[0], [s._replace(roi=region) for s in plain]),
-            (fleet[0], [s._replace(roi=region, first=Disc(0.0, 0.0, 5.0)) for s in plain]),
-        ]
-    )
-    assert same(first, within)
-    assert same(both, within)  # a region of interest sends nothing from elsewhere
-    assert not same(first, by_rank)
-
-
-@pytest.mark.parametrize(
-    ("detector", "message"),
-    [
-        ("surrogate", "perception.absent_peers is 'zeros': .* was calibrated without them, must be excluded"),
-        ("recorded", "perception.absent_peers is 'zeros', must be excluded for a recording"),
-    ],
-)
-def test_other_detectors_refuse_peers_as_zeros(scene: SceneModel, detector: str, message: str) -> None:
-    recording = "none.npz" if detector == "recorded" else None
-    config = Perception.model_validate({"detector": detector, "absent_peers": "zeros", "recording": recording})
-    with pytest.raises(InputError, match=message):
-        make_detector(scene, config, 1)
-
-
-def test_the_surrogate_serves_by_rank_alone(scene: SceneModel) -> None:
-    config = Perception(detector="surrogate", serve="region_first")
-    with pytest.raises(
-        InputError, match=r"perception.serve is 'region_first': .* was calibrated without it, must be grid"
-    ):
-        make_detector(scene, config, 1)
 
 
 def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(

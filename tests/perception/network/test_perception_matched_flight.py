@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 from perception_examples import cross
 
-from sortie.perception.errors import InputError
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.pose_matching import matched_poses, sure
-from sortie.perception.recordings.detector import RecordedDetector
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Capture, Share
 from sortie.policies.contract import Disc
 from sortie.scenarios.schema import Perception, Scene
@@ -89,21 +86,3 @@ def test_a_drone_that_hears_nobody_keeps_its_pose(detectors: dict[bool, TorchDet
     ego = cross(10.0, 20.0, 0.3)[0]
     (plain,), (matched,) = (detectors[match].detect([(ego, ())]) for match in (False, True))
     np.testing.assert_array_equal(matched.table(), plain.table())
-
-
-@pytest.mark.parametrize(
-    ("option", "value", "shown", "usual"),
-    [
-        ("match_poses", True, "true", "false"),
-        ("maps_bring_boxes", True, "true", "false"),
-        ("fused_grids", "all", "'all'", "own"),
-    ],
-)
-def test_the_surrogate_and_recordings_refuse_it(option: str, value: object, shown: str, usual: str) -> None:
-    """Also where a configuration was changed after it was read, as comparisons by several detectors do."""
-    scene, on = SceneModel(Scene(), None, (-50, -50, 50, 50)), {option: value}
-    recorded = Perception.model_validate({"detector": "recorded", "recording": "seen.npz"})
-    with pytest.raises(InputError, match=rf"perception.{option} is {shown}: .* calibrated without it, must be {usual}"):
-        SurrogateDetector(scene, Perception(detector="surrogate").model_copy(update=on), 1)
-    with pytest.raises(InputError, match=rf"perception\.{option} is {shown}, must be {usual} for a recording"):
-        RecordedDetector(recorded.model_copy(update=on))

@@ -304,20 +304,3 @@ def test_received_boxes_lie_in_the_ego_s_frame_and_square_and_came_with_their_ce
     assert len(received_boxes(rec, None, here, sent)) == 1
     wide = received_boxes(rec, None, there, [Sent(0, 1, cells, there)])
     assert wide[:, 0].tolist() == [0.0, 5.0, -101.0]
-
-
-def test_the_region_that_is_served_first_is_served_first_by_a_recorded_detector_too(tmp_path: Path) -> None:
-    """One cell is sent: that of the sure box, or that of the one in the region."""
-    two = np.concatenate([box(-40.0, score=0.9), box(40.0, score=0.5)])
-    maps = [np.stack([score_map(two)] * 3)] * 3
-    path = recorded(tmp_path / "r.npz", [[NONE, two, NONE]] * 3, features=maps, est_pose=POSE)
-    one_cell = 1 / 64**2
-    x_m = {
-        first: flown(path)
-        .detect([(at(0), [Share(at(1), "features", one_cell, None, 1.0, first=first)])])[0]
-        .xy_m[:, 0]
-        .tolist()
-        for first in (None, Disc(20.0 + 40.0, 0.0, 10.0))
-    }
-    assert [len(found) for found in x_m.values()] == [1, 1]
-    assert [round(found[0]) for found in x_m.values()] == [20 - 40, 20 + 40]

@@ -34,10 +34,8 @@ def equal(a: Boxes, b: Boxes) -> bool:
 @pytest.mark.parametrize(
     ("kind", "option"),
     [
-        ("features", {"cells_by": "norm"}),
         ("features", {"unsent_cells": "zero"}),
         ("detections", {"join": "nms"}),
-        ("uncertain_boxes", {"common_errors": "unknown"}),
     ],
 )
 def test_an_option_changes_what_a_fleet_finds_and_nothing_that_a_drone_finds_alone(

@@ -5,15 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from perception_examples import capture, cross
-from surrogate_examples import detector_runs
 
 from research.benchmark.scenes import model_of
-from research.calibrate.correlation import fit_shared_false_positives
 from research.calibrate.plan import scene_model
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.features import CaptureColumns
 from sortie.perception.surrogate.model import SHIPPED, load
-from sortie.perception.surrogate.shared_false_positives import TILE_M, SharedFalsePositives, estimate_shared
+from sortie.perception.surrogate.shared_false_positives import TILE_M, SharedFalsePositives
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Perception, Scene
 
@@ -51,32 +49,6 @@ def test_things_stand_where_they_stand_whichever_drones_look() -> None:
     np.testing.assert_array_equal(alone.xy_m[alone.there[0]][here], both.xy_m[seen][there])
     np.testing.assert_array_equal(alone.key[alone.there[0]][here], both.key[seen][there])
     assert not np.array_equal(SharedFalsePositives(8).about(fleet((300, -200)), 20.0).xy_m, alone.xy_m)
-
-
-@pytest.mark.parametrize(("part", "chance"), [(0.5, 0.3), (0.9, 0.7), (1.0, 0.25)])
-def test_what_alarms_have_in_common_is_found_from_how_many_have_them(part: float, chance: float) -> None:
-    rng = np.random.default_rng(1)
-    shared = rng.random(200_000) < part
-    seen = np.where(shared, rng.binomial(4, chance, size=len(shared)), 0)
-    assert estimate_shared(seen.tolist(), 4) == pytest.approx((part, chance), abs=0.01)
-
-
-def test_where_nobody_shares_an_alarm_there_are_no_shared_false_positives() -> None:
-    assert estimate_shared([0, 0, 0], 4) == (0.0, 1.0)
-    assert estimate_shared([], 4) == (0.0, 1.0)
-    assert estimate_shared([4, 4], 4) == (1.0, 1.0)
-
-
-@pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), pytest.param(0.5, 0.3, marks=pytest.mark.slow), (0.9, 0.8)])
-def test_a_fleet_of_known_shared_false_positives_is_measured_as_such(part: float, chance: float) -> None:
-    planted = replace(load(SHIPPED), shared_false_positives=np.array([part, chance, 0.4, 0.1], np.float32))
-    found = fit_shared_false_positives(detector_runs(planted, 40), planted.floor, 0)
-    # how often another has it too: some stand so near a car that was missed that they are taken for it
-    assert 0.75 * part * chance <= found[0] * found[1] <= part * chance + 0.02
-    if part:
-        assert found[1] == pytest.approx(chance, abs=0.1)
-        assert found[2] == pytest.approx(0.4, abs=0.1)
-        assert found[3] == pytest.approx(0.1, abs=0.03)
 
 
 def test_alarms_come_as_often_whether_they_are_shared_or_not() -> None:

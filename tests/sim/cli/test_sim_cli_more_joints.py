@@ -97,7 +97,7 @@ def test_train(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = {"shipped": lambda fusion: here / f"{fusion}.own", "named_weights": lambda path: here / path}
     stand_in(monkeypatch, "sortie.perception.network.detector", **names)
     stand_in(monkeypatch, "sortie.perception.network.fusion.registry", FUSIONS={"none": 1, "late": 2, "disconet": 3})
-    stand_in(monkeypatch, "sortie.perception.network.model", ModelConfig=tuple_of)
+    stand_in(monkeypatch, "research.flip.networks", config_of=lambda fields: tuple(fields.values()))
     stand_in(monkeypatch, "research.train.recipe", Recipe=dict)
     stand_in(monkeypatch, "research.train.train", train=seen)
     monkeypatch.setitem(sys.modules, "research.train.playback", None)  # type: ignore[arg-type]  # Rerun is missing

@@ -393,7 +393,7 @@ class Nobody:
         return Boxes.empty()
 
 
-def _scored(agents: Sequence[Any], *sets: str, region: Any = None, own: Any = None) -> tuple[Seer, Recorder]:
+def _scored(agents: Sequence[Any], *sets: str, own: Any = None) -> tuple[Seer, Recorder]:
     """Score the frame of 1 s, at 1.1 s."""
     scenario = example(
         "perception={detector: surrogate, max_age_s: 0.5, fusion_delay_s: 0.1, compute_delay_s: 0.05}",
@@ -402,7 +402,7 @@ def _scored(agents: Sequence[Any], *sets: str, region: Any = None, own: Any = No
     env, seer, recorder = simpy.Environment(), Seer(), Recorder()
     env.run(until=1.1)
     planned = lambda drone, frame: capture(drone, 1000.0 + frame)  # noqa: E731
-    scorer = Scorer(env, scenario, seer, agents, recorder, planned, Fusing(scenario, own, region), Nobody(), [])  # type: ignore[arg-type]
+    scorer = Scorer(env, scenario, seer, agents, recorder, planned, Fusing(scenario, own), Nobody(), [])  # type: ignore[arg-type]
     scorer._score(10, agents)
     return seer, recorder
 
@@ -431,15 +431,6 @@ def test_own_tracks_move_boxes_that_come_late_and_nothing_else() -> None:
     seer, _ = _scored([agent(3, 1.0, 1.0, mind)], own=lambda drone: asked.append(drone) or own)
     assert [s.tracks is own for s in seer.jobs[3][1]] == [False, True]
     assert asked == [3]
-
-
-def test_cells_of_the_sender_s_region_at_its_capture_come_first() -> None:
-    mind = Mind([(1, 0.8, 0.1, 1.0, {}), (2, 0.9, 0.1, 1.0, {})])
-    agents = [agent(0, 1.0, 1.0, mind)]
-    seer, _ = _scored(agents, "perception.serve=region_first", region=lambda drone, t_s: Disc(drone, t_s, 1.0))
-    assert [s.first for s in seer.jobs[0][1]] == [Disc(1, 0.8, 1.0), Disc(2, 0.9, 1.0)]
-    seer, _ = _scored(agents, region=lambda drone, t_s: Disc(drone, t_s, 1.0))
-    assert [s.first for s in seer.jobs[0][1]] == [None, None]
 
 
 @pytest.mark.parametrize(
@@ -510,7 +501,7 @@ def test_a_detector_of_many_moments_waits_until_there_are_enough(monkeypatch: py
     env, recorder = simpy.Environment(), Recorder()
     agents = [agent(d, 0.0, 0.0, Mind()) for d in (0, 1)]
     scenario = example("perception={detector: surrogate}", "fleet.drones=2")
-    fusing = Fusing(scenario, None, None)  # type: ignore[arg-type]
+    fusing = Fusing(scenario, None)  # type: ignore[arg-type]
     scorer = Scorer(env, scenario, All(), agents, recorder, None, fusing, Nobody(), [])  # type: ignore[arg-type]
     rows = []
     for _ in range(4):

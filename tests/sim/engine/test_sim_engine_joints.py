@@ -99,31 +99,6 @@ def test_a_detector_of_single_moments_detects_when_it_is_asked() -> None:
     assert _told(OwnBoxes(Ahead(), lambda _: [])(asked)) == [(1, 100.5), (0, 100.5)]  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("ahead", [False, True])
-@pytest.mark.parametrize(("absent", "calls"), [("excluded", [2]), ("zeros", [1, 1])])
-def test_where_absent_peers_count_as_zeros_each_look_of_a_tracker_is_a_call_of_its_own(
-    absent: str, calls: list[int], ahead: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A detector takes the other captures of a call for peers, so a tracker's boxes would depend on what waits with them."""
-    asked: list[int] = []
-
-    class Net:
-        truth = count_boxes = camera_views = None
-
-        def detect(self, jobs: Sequence[tuple[Capture, Any]]) -> list[Boxes]:
-            asked.append(len(jobs))
-            return [_box(c) for c, _ in jobs]
-
-    if ahead:
-        Net.begin = lambda self, jobs: lambda: self.detect(jobs)  # type: ignore[attr-defined]
-    made: list[OwnBoxes] = []
-    monkeypatch.setattr(engine, "OwnBoxes", lambda *args, **more: made.append(OwnBoxes(*args, **more)) or made[0])
-    scenario = example(f"perception.absent_peers={absent}")
-    build(scenario, plan_for(scenario), 1, detector_of=lambda *_: Net())  # type: ignore[arg-type,return-value]
-    assert _told(made[0]([capture(1, 0.5), capture(0, 0.5)])) == [(1, 0.5), (0, 0.5)]
-    assert asked == calls
-
-
 # --- moves -------------------------------------------------------------------------------------------
 
 

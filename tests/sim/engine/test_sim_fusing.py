@@ -93,7 +93,8 @@ def test_maps_and_codes_bring_the_boxes_of_their_look_where_poses_are_corrected(
     ("other", "named"),
     [
         ("radio.framing=tiles", "radio.framing is tiles"),
-        ("perception.detector=surrogate", "detector is surrogate"),
+        ("perception.detector=surrogate", "a drone's detector is surrogate"),
+        ("fleet.makes=[{name: a, drones: [0], detector: surrogate}]", "a drone's detector is surrogate"),
         ("perception.fusion=late", "fusion is late"),
         ("perception.fusion=none", "fusion is none"),
     ],
@@ -109,11 +110,10 @@ def test_corrected_poses_are_refused_where_no_map_is_fused(other: str, named: st
     ("other", "named"),
     [
         ("radio.framing=tiles", "radio.framing is tiles"),
-        ("perception.detector=surrogate", "detector is surrogate"),
+        ("perception.detector=surrogate", "a drone's detector is surrogate"),
         ("perception.fusion=late", "fusion is late"),
         ("perception.fusion=none", "fusion is none"),
         ("perception.motion_compensation=false", "motion_compensation is false"),
-        ("perception.absent_peers=zeros", "absent_peers is zeros"),
     ],
 )
 def test_it_is_refused_where_it_would_mean_nothing(other: str, named: str) -> None:
@@ -126,7 +126,7 @@ def test_it_is_refused_where_it_would_mean_nothing(other: str, named: str) -> No
 def test_boxes_that_came_with_a_map_follow_it_and_are_as_old_as_their_look() -> None:
     found = Found(capture(1, 0.7), 2, boxes(2))
     mind = Mind([(4, 0.9, 0.1, 1.0, {}), (1, 0.9, 0.2, 0.5, {"found": found, "roi": REGION})])
-    shares = Fusing(example(CONFIG), lambda drone: None, None).shares(agent(0, 1.0, 1.0, mind), 1.0)  # type: ignore[arg-type]
+    shares = Fusing(example(CONFIG), lambda drone: None).shares(agent(0, 1.0, 1.0, mind), 1.0)  # type: ignore[arg-type]
     assert [(s.capture.drone, s.representation, s.weight) for s in shares] == [
         (1, "features", 0.25),
         (1, "detections", 0.25),
@@ -141,7 +141,7 @@ def test_boxes_that_came_with_a_map_follow_it_and_are_as_old_as_their_look() -> 
 def test_boxes_of_a_look_that_is_too_old_are_left_out(look_s: float, fresh: bool) -> None:
     """The map came at an age of 0.25 s."""
     mind = Mind([(1, 0.9, 0.25, 1.0, {"found": Found(capture(1, look_s), 2, boxes(2))})])
-    shares = Fusing(example(CONFIG), lambda drone: None, None).shares(agent(0, 1.0, 1.0, mind), 1.0)  # type: ignore[arg-type, return-value]
+    shares = Fusing(example(CONFIG), lambda drone: None).shares(agent(0, 1.0, 1.0, mind), 1.0)  # type: ignore[arg-type, return-value]
     assert [s.representation for s in shares] == ["features", "detections"][: 1 + fresh]
 
 
@@ -166,7 +166,7 @@ def test_a_drone_finds_by_its_own_look_and_maps_alone_once_a_frame_and_only_when
         agent(2, 0.0, None, Mind([(1, 0.0, 0.1, 1.0, {})]), looks=False),
         agent(3, 0.0, None, Mind()),
     ]
-    finding = FindingEachFrame(env, scenario, seer, Fusing(scenario, None, None), lambda look, roi: 99)  # type: ignore[arg-type]
+    finding = FindingEachFrame(env, scenario, seer, Fusing(scenario, None), lambda look, roi: 99)  # type: ignore[arg-type]
     finding.start(agents)
     assert finding.last(0, None) is None, "before the first time"
     calls = seer.calls
@@ -201,7 +201,7 @@ class Places(Seer):
 def _finding(detector: Seer | None, *agents: Any) -> tuple[simpy.Environment, FindingEachFrame]:
     env, scenario = simpy.Environment(), example(CONFIG)
     counted = lambda look, roi: 7 if roi is None else 2  # noqa: E731
-    finding = FindingEachFrame(env, scenario, detector, Fusing(scenario, None, None), counted)  # type: ignore[arg-type]
+    finding = FindingEachFrame(env, scenario, detector, Fusing(scenario, None), counted)  # type: ignore[arg-type]
     finding.start(agents)
     return env, finding
 

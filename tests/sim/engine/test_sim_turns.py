@@ -65,7 +65,6 @@ def test_each_drone_has_the_same_chance_at_every_moment() -> None:
         (("fleet.drones=51",), 50),
         (("fleet.drones=51", "perception.egos=51"), 51),
         (("fleet.drones=51", "perception.motion_compensation=false"), 51),
-        (("fleet.drones=51", "perception.unsent_cells=zero", "perception.absent_peers=zeros"), 51),
         (("fleet.drones=4", "perception.egos=3", "fleet.ground=[{drone: 1, position_m: [0, 20, 3]}]"), 3),
     ],
 )

@@ -347,14 +347,9 @@ CHANGED = {
     "perception.join": "nms",
     "perception.codebook": "other.safetensors",
     "perception.match_poses": "true",
-    "perception.fused_grids": "all",
     "perception.maps_bring_boxes": "true",
-    "perception.common_errors": "unknown",
     "perception.score_threshold": "0.5",
-    "perception.cells_by": "norm",
-    "perception.serve": "region_first",
     "perception.unsent_cells": "zero",
-    "perception.absent_peers": "zeros",
 }
 
 

@@ -558,3 +558,11 @@ def test_progress_ends_each_stage(flights: list[tuple[str, int]]) -> None:
         "batch 2: paired seeds",
         "batch 2: further seeds by the surrogate",
     ]
+
+
+def test_a_scenario_that_the_surrogate_cannot_fly_is_refused_before_it_stands_in() -> None:
+    one = contenders({**SHORT, "perception.detector": "torch", "perception.match_poses": True})[0]
+    with pytest.raises(
+        sortie.SortieError, match="match_poses: true, must be false where a drone's detector is surrogate"
+    ):
+        with_detector(one, "surrogate")
