@@ -297,7 +297,7 @@ def test_a_bound_object_is_named_by_its_class_and_not_by_its_address() -> None:
 
 
 def test_a_run_s_folder_says_what_flew_and_ends_in_its_fingerprint() -> None:
-    record = run_sortie(example("duration_s=0.1", "policy.name=best-2"), seed=4, replication=2)
+    record = run_sortie(example("duration_s=0.1", "policy={name: best-2}"), seed=4, replication=2)
     assert str(run_folder.default_path(record)) == f"runs/example-s4-best-2-r2-{record.fingerprint[:8]}"
     own = dataclasses.replace(record, policy="p/a.py:f", replication=0)
     assert str(run_folder.default_path(own)) == f"runs/example-s4-p_a.py_f-{own.fingerprint[:8]}"

@@ -197,7 +197,7 @@ def test_fly_prints_the_outcome_and_keeps_the_run(scenario: Path, tmp_path: Path
     assert done.returncode == 0, done.stderr
     for word in ("context plane", "data plane", "energy", "fingerprint", "decisions and events"):
         assert word in done.stdout
-    (folder,) = (tmp_path / "runs").glob("example-s1-worked-??????")
+    (folder,) = (tmp_path / "runs").glob("example-s1-worked-????????")
     kept = json.loads((folder / "outcome.json").read_text())
     assert max(kept["battery"].values()) < 0.5
     again = sortie(
@@ -223,10 +223,10 @@ SECOND = ("--set", "duration_s=1", "--set", "perception.detector=none", "--set",
 @pytest.mark.parametrize(
     ("arguments", "folder"),
     [
-        ((), "track_target-s1-worked-[0-9a-f]{6}"),  # shorter than the library's
-        (("--seed", "4"), "track_target-s4-worked-[0-9a-f]{6}"),
-        (("--replication", "2"), "track_target-s1-worked-r2-[0-9a-f]{6}"),
-        (("--policy", "silence"), "track_target-s1-silence-[0-9a-f]{6}"),
+        ((), "track_target-s1-worked-[0-9a-f]{8}"),  # shorter than the library's
+        (("--seed", "4"), "track_target-s4-worked-[0-9a-f]{8}"),
+        (("--replication", "2"), "track_target-s1-worked-r2-[0-9a-f]{8}"),
+        (("--policy", "silence"), "track_target-s1-silence-[0-9a-f]{8}"),
     ],
 )
 def test_a_runs_folder_is_named_after_what_flew(
@@ -263,7 +263,7 @@ def test_a_scenario_that_lacks_a_field_in_its_file_flies_with_it_set(
     (tmp_path / "open.yaml").write_text("name: open\nduration_s: -1\nperception: {detector: none}\n")
     assert command("fly", "open.yaml", "--no-recording", "--set", "duration_s=0.5") == 0
     (made,) = (tmp_path / "runs").iterdir()
-    assert re.fullmatch("open-s1-worked-[0-9a-f]{6}", made.name)
+    assert re.fullmatch("open-s1-worked-[0-9a-f]{8}", made.name)
 
 
 def test_another_run_is_replaced_with_replace_alone(
@@ -317,9 +317,7 @@ def test_an_edited_policy_has_a_folder_of_its_own(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     policy = "def decide(view):\n    return []\n"
-    other = (
-        "from sortie import Directive\n\n\ndef decide(view):\n    return [Directive(view.ego, p) for p in view.peers]\n"
-    )
+    other = "from sortie import Directive, Representation\n\n\ndef decide(view):\n    return [Directive(view.ego, p, representation=Representation.DETECTIONS, rate_hz=10.0) for p in view.peers]\n"
     fly = ("fly", scenario, "--no-recording", "--policy", "mine.py:decide", "--set", "duration_s=0.5")
     for text in (policy, other, policy):
         Path("mine.py").write_text(text)

@@ -94,12 +94,6 @@ def test_counterexamples_have_a_folder_before_anything_is_proved(
     assert "example.yaml is a file" in told
 
 
-@pytest.mark.parametrize("seconds", ["inf", "7201"])
-def test_overhead_flies_at_most_as_long_as_a_scenario(seconds: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command("overhead", "--seconds", seconds) == 2
-    assert "7200" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("theirs", ["{}", "[]", "not JSON", '{"title": "Scenario", "properties": {}}'])
 def test_a_schema_of_somebody_else_is_not_replaced(
     theirs: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
