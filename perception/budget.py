@@ -2,7 +2,7 @@
 
 A sender ranks the cells whose centres lie in its region of interest, by its own confidence, and sends
 the best ⌊ρ · 4096⌋ of them. Pose and directive alone decide *how many* cells that is. So traffic is exact without
-running the detector. The evaluation (`evaluation/selection.py`) ranks cells by the same rule.
+running the detector. The evaluation (`evaluation/sharing.py`) ranks cells by the same rule.
 """
 
 from __future__ import annotations

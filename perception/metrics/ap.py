@@ -247,7 +247,8 @@ class Judged:
     """Detections of many images, and which truths each overlaps enough, so that parts of them are matched for little.
 
     `order` [n] puts the detections in the order of `best_first`; in that order `score` [n] and `image` [n]. `cars` [m]
-    is each truth's image. `i` and `j` are pairs of detection and truth, in each image as `best_pairs`.
+    is each truth's image. `i` and `j` are pairs of detection and truth, in each image as `best_pairs`. `match` is the
+    convention's.
     """
 
     images: int
@@ -257,22 +258,31 @@ class Judged:
     cars: Ints
     i: Ints
     j: Ints
+    match: Literal["remaining", "first"]
 
     def matched(self, own: Bools | None = None, cars: Bools | None = None) -> list[Matched]:
         """Image by image; with masks (`own` in the order of `best_first`) as if there were those boxes alone."""
         i, j, score, image, of_cars = self.i, self.j, self.score, self.image, self.cars
         if own is None or cars is None:
-            hit = hits(len(score), i, j)
+            hit = hits(len(score), i, j, self.match)
         else:
             both = own[i] & cars[j]
-            hit = hits(len(score), i[both], j[both])[own]
+            hit = hits(len(score), i[both], j[both], self.match)[own]
             score, image, of_cars = score[own], image[own], of_cars[cars]
         first = np.searchsorted(image, np.arange(self.images + 1)).tolist()
         truths = np.bincount(of_cars, minlength=self.images).tolist()
         return [Matched(score[a:b], hit[a:b], n) for a, b, n in zip(first[:-1], first[1:], truths, strict=True)]
 
 
-def judge(found: Boxes, image: Ints, truth: Boxes, cars: Ints, images: int, iou: float = 0.5) -> Judged:
+def judge(
+    found: Boxes,
+    image: Ints,
+    truth: Boxes,
+    cars: Ints,
+    images: int,
+    iou: float = 0.5,
+    convention: Convention = ROTATED,
+) -> Judged:
     """Detections and truths of so many images, joined; `image` and `cars` say of which each is, and ascend."""
     order = best_first(found.table(), found.score, image)
     found = found.take(order)
@@ -280,10 +290,10 @@ def judge(found: Boxes, image: Ints, truth: Boxes, cars: Ints, images: int, iou:
     parts = []
     first, first_car = np.searchsorted(image, cuts).tolist(), np.searchsorted(cars, cuts).tolist()
     for a, b, c, d in zip(first[:-1], first[1:], first_car[:-1], first_car[1:], strict=True):
-        i, j = alike(found.take(slice(a, b)), truth.take(slice(c, d)), image[a:b], cars[c:d], iou)
+        i, j = alike(found.take(slice(a, b)), truth.take(slice(c, d)), image[a:b], cars[c:d], iou, convention.overlap)
         parts.append((i + a, j + c))
     i, j = (np.concatenate(v) for v in zip(*parts, strict=True))
-    return Judged(images, order, found.score.astype(np.float64), image, cars, i, j)
+    return Judged(images, order, found.score.astype(np.float64), image, cars, i, j, convention.match)
 
 
 def average_precision(frames: Sequence[Matched], convention: Convention = ROTATED) -> float:

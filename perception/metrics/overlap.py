@@ -1,7 +1,7 @@
 """How far boxes on the ground overlap, for many pairs at once. Free of torch.
 
 Boxes are rows x, y, length, width, yaw. numpy and not torch: the record of what was found is numpy's, and on a CPU
-torch is no faster at it (measured in `evaluation/README.md`).
+torch is no faster at it (measured in `research/paper/README.md`).
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ class Recording:
             raise RecordingError(f"{self.path}: features are missing, must be there to be fused or ranked by norm")
         return self._read("features", frame, drone).astype(np.float32)
 
-    def rank(self, frame: int, drone: int, by: str) -> Floats:
+    def rank(self, frame: int, drone: int, by: str = "confidence") -> Floats:
         """[64, 64] what ranks the exchanged cells: their highest confidence, or the norm of their features.
 
         Where no confidence was recorded a cell's is the highest score of the boxes centred in it, 0 without one.

@@ -24,18 +24,28 @@ from research.flip.run import SHIPPED
 from research.paper.instrument import CPU, CarNetInstrument
 from research.paper.results import TAU
 from research.paper.scores import Bootstrap
+from research.paper.ways import SINGLE, Sharing, in_order, under_all_names
 from sortie.perception.code_digest import boxes_digest
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.condition import SINGLE, Sharing
-from sortie.perception.evaluation.evaluate import exchanges, frame_hash, frame_keys, in_order, match_all, truth
-from sortie.perception.evaluation.matched import FrameResult, Settings, assemble, read_frames, write_frames
-from sortie.perception.evaluation.selection import link_bytes
+from sortie.perception.evaluation.harness import (
+    FrameResult,
+    Settings,
+    assemble,
+    exchanges,
+    frame_hash,
+    frame_keys,
+    match_all,
+    read_frames,
+    truth,
+    write_frames,
+)
+from sortie.perception.evaluation.sharing import link_bytes
 from sortie.perception.geometry import CELLS, Geometry, to_local
 
 Progress = Callable[[str, int, int], None]
 Found = tuple[dict[str, FrameResult], dict[str, list[float]]]
 """By a dose's label: a frame's matched boxes, and the weight on zeros in each of its cells with a car."""
-SETTINGS = Settings(floor=TAU)
+SETTINGS = Settings(floor=TAU, regions=("full",))
 
 
 def measure(
@@ -68,9 +78,10 @@ def measure(
     )
     for network, several in found.items():
         for dose in plan.dose:
-            wanted = tuple(plan.conditions(dose))
+            wanted = {c: c.plain() for c in plan.conditions(dose)}
             results = [results[dose.label] for results, _ in several]
-            every = assemble(results, wanted, ("full",), SETTINGS, data.scene, {c: c.plain() for c in wanted})
+            distinct = assemble(results, tuple(dict.fromkeys(wanted.values())), SETTINGS, data.scene)
+            every = under_all_names(distinct, wanted)
             weight = float(np.concatenate([weights[dose.label] for _, weights in several]).mean())
             yield row_of(plan, network, dose, weight, Bootstrap(every, dose.unsent, ways=dose.ways), len(data))
 
@@ -105,7 +116,7 @@ def measure_frames(
         return {n: of_network(instrument) for n, instrument in networks.items()}
 
     out: dict[str, list[Found]] = {n: [] for n in networks}
-    for done, found in enumerate(in_order(task, len(data), workers, start), 1):
+    for done, found in enumerate(in_order(task, range(len(data)), workers, start), 1):
         for network, one in found.items():
             out[network].append(one)
         if progress is not None:
@@ -158,7 +169,7 @@ def frame_of(
         for tuning, boxes in under.items():
             at[exchanged, tuning] = slice(len(local), len(local) + settings.egos)
             local += boxes
-    there = [truth(data, f, ego, geometry).table() for ego in range(settings.egos)]
+    there = [truth(data, f, ego, geometry) for ego in range(settings.egos)]
     ego_of = np.tile(np.arange(settings.egos), len(at))
     units = match_all(local, ego_of, data.est_pose[f], there, {"full": None}, settings)["full"]
     cost = {
@@ -170,8 +181,8 @@ def frame_of(
         wanted = dict.fromkeys(c.plain(drones) for c in plan.conditions(dose))
         results[dose.label] = FrameResult(
             (np.nan, np.nan),
-            {(c, "full"): units[at[_computed_as(dose, c)]] for c in wanted},
-            {c: cost[_computed_as(dose, c)[0]] for c in wanted},
+            {(c.label, "full"): units[at[_computed_as(dose, c)]] for c in wanted},
+            {c.label: cost[_computed_as(dose, c)[0]] for c in wanted},
         )
     cells = [cells_with_cars(data, f, ego, geometry, instrument.fused_cells) for ego in range(drones)]
     weights = {d.label: dosed.weight_on_zeros(_tuning(d), cells) for d in plan.dose}

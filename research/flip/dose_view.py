@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from research.flip.fusion import DosedDiscoNet, silent_in
 from research.paper.instrument import BATCH, CarNetView
-from sortie.perception.evaluation.condition import Unsent
-from sortie.perception.evaluation.contract import Exchange, Floats
+from sortie.perception.evaluation.sharing import Exchange, Floats, Unsent
 from sortie.perception.network.fusion.base import weighted_sum
 from sortie.perception.network.warp import arriving
 

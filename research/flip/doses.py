@@ -18,8 +18,9 @@ from pydantic import TypeAdapter, ValidationError
 from scipy.stats import spearmanr
 
 from research.paper.measures import Contrast, Scores
+from research.paper.ways import SINGLE, Absent, Sharing, Ways
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.condition import SINGLE, Absent, Sharing, Unsent, Ways
+from sortie.perception.evaluation.sharing import Unsent
 from sortie.scenarios.regular import regular
 from sortie.scenarios.schema.base import Params
 

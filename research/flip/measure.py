@@ -14,8 +14,8 @@ from research.paper.measures import POINTS, ApOf, Contrast, Oracle
 from research.paper.results import TAU
 from research.paper.scores import Bootstrap
 from research.paper.verdict import MeasuredValue as Measurement
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
-from sortie.perception.evaluation.matched import Evaluation
+from research.paper.ways import FULL_SHARING, SINGLE, Sharing
+from sortie.perception.evaluation.harness import Evaluation
 from sortie.perception.metrics.ap import Matched
 from sortie.scenarios.intervals import percentile_interval
 

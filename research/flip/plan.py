@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 from research.benchmark.difficulty import Density
+from research.paper.ways import CellsBy, Sharing
 from research.train.recipe import Recipe
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.condition import CellsBy, Sharing, Unsent
+from sortie.perception.evaluation.sharing import Unsent
 from sortie.scenarios.regular import regular
 
 PLAN = Path(__file__).parent / "variants.toml"

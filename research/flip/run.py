@@ -18,11 +18,10 @@ from research.flip.networks import config_of
 from research.flip.plan import MeasuredGrid, StudyPlan, Variant
 from research.paper.instrument import CPU, CarNetInstrument
 from research.paper.measures import under
+from research.paper.ways import FULL_SHARING, SINGLE, CellsBy, Sharing, evaluate
 from research.train.train import TrainResult, train
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing
-from sortie.perception.evaluation.evaluate import evaluate
-from sortie.perception.evaluation.matched import FLOOR, Evaluation
+from sortie.perception.evaluation.harness import FLOOR, Evaluation
 
 log_to_nowhere = logging.getLogger("sortie.study")
 Progress = Callable[[str, int, int], None]

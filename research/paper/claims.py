@@ -33,7 +33,7 @@ from research.paper.measures import (
     WrongChoice,
 )
 from research.paper.verdict import Judgement, MeasuredValue, Paper
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
+from research.paper.ways import FULL_SHARING, SINGLE, Sharing
 
 CURVE = (0.01, 0.02, 0.05, 0.1, 0.25, 1.0)
 BUDGETS = (0.02, 0.05, 0.1, 0.25)

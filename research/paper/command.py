@@ -14,7 +14,7 @@ from rich.text import Text
 from research.paper import report
 from research.paper.rows import INSTRUMENTS, ClaimRow, differ_by_chance
 from research.paper.verdict import ClaimVerdict
-from sortie.perception.evaluation.condition import Absent, CellsBy, Serve, Ways
+from research.paper.ways import Absent, CellsBy, Serve, Ways
 from sortie.sim.cli.console import out, print_written, stages
 from sortie.sim.cli.options import DeviceOption, WorkersOption, refuse
 from sortie.sim.folders import RunError, ensure_between

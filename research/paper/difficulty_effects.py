@@ -23,9 +23,8 @@ from research.benchmark.dataset import FORMAT, Frames, start_worker
 from research.benchmark.difficulty import Difficulty
 from research.benchmark.scenes import draw_captures, draw_scene, model_of, scene_id
 from research.paper.instrument import CarNetInstrument
+from research.paper.ways import FULL_SHARING, SINGLE, Sharing, evaluate
 from sortie.perception.code_digest import boxes_digest
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
-from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.files import replacing
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import Difference, compare

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from research.paper.picture import Picture
-from sortie.perception.evaluation.contract import Floats
+from sortie.perception.evaluation.sharing import Floats
 from sortie.perception.geometry import CELLS, to_world
 from sortie.perception.metrics.overlap import corners
 from sortie.perception.types import Boxes

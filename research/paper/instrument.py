@@ -14,10 +14,11 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from research.flip.fusion import DosedDiscoNet
 from research.flip.networks import load
+from research.paper.ways import CellsBy
 from research.train.devices import gpu_name
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.condition import CellsBy
-from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
+from sortie.perception.evaluation.harness import FleetFrames
+from sortie.perception.evaluation.sharing import Exchange, Floats
 from sortie.perception.geometry import Geometry
 from sortie.perception.network.decode import decode
 from sortie.perception.network.fusion.base import Fusion, PerCell
@@ -108,7 +109,7 @@ class CarNetView:
         self._silent: dict[tuple[int, tuple[int, ...]], torch.Tensor] = {}
 
     @torch.inference_mode()
-    def rank(self, by: CellsBy) -> NDArray[np.floating]:
+    def rank(self, by: CellsBy = "confidence") -> NDArray[np.floating]:
         """Confidence: the highest score of the cell's head pixels, each drone alone; norm: of its feature vector."""
         heat = None if by == "norm" else self.net.head(self._maps)[:, :1]
         plane = self.features.norm(dim=1) if heat is None else F.max_pool2d(heat, 2)[:, 0]

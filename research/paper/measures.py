@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from research.paper.verdict import MeasuredValue
-from sortie.perception.evaluation.condition import FULL_SHARING, PAPER_WAYS, SINGLE, CellsBy, Sharing, Unsent, Ways
+from research.paper.ways import FULL_SHARING, PAPER_WAYS, SINGLE, CellsBy, Sharing, Ways
+from sortie.perception.evaluation.sharing import Unsent
 from sortie.scenarios.intervals import p_value, percentile_interval
 
 Region = Literal["full", "mission"]

@@ -13,9 +13,9 @@ from research.benchmark.scenes import draw_captures, draw_scene, model_of, scene
 from research.paper.claims import conditions
 from research.paper.measures import under
 from research.paper.results import TableResults, TableSettings
+from research.paper.ways import evaluate
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.contract import FleetFrames, Instrument
-from sortie.perception.evaluation.evaluate import Region, evaluate
+from sortie.perception.evaluation.harness import FleetFrames, Instrument, Region
 from sortie.perception.geometry import FULL, Geometry
 from sortie.perception.scene.render import Renderer
 

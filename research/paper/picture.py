@@ -12,10 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from research.paper.measures import under
+from research.paper.ways import FULL_SHARING, PAPER_WAYS, CellsBy, Sharing, Ways
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.condition import FULL_SHARING, PAPER_WAYS, CellsBy, Sharing, Ways
-from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats, Instrument
-from sortie.perception.evaluation.evaluate import REGION_M, Settings, exchanges, frame_keys, mission_target, truth
+from sortie.perception.evaluation.harness import (
+    REGION_M,
+    FleetFrames,
+    Instrument,
+    Settings,
+    exchanges,
+    frame_keys,
+    mission_target,
+    truth,
+)
+from sortie.perception.evaluation.sharing import Exchange, Floats
 from sortie.perception.geometry import CELLS, Geometry, to_local, to_world
 from sortie.perception.metrics.ap import suppress
 from sortie.perception.types import Boxes

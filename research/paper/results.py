@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from research.paper.scores import Bootstrap, By
+from research.paper.ways import PAPER_WAYS, CellsBy, Ways
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.condition import PAPER_WAYS, CellsBy, Unsent, Ways
-from sortie.perception.evaluation.matched import FLOOR, Evaluation
+from sortie.perception.evaluation.harness import FLOOR, Evaluation
+from sortie.perception.evaluation.sharing import Unsent
 from sortie.scenarios.intervals import DRAWS
 
 TAU = 0.1

@@ -18,7 +18,7 @@ from research.paper.claims import CLAIMS, SECTIONS, Claim, Kind, conditions
 from research.paper.measures import ApOf, Elsewhere, Region, Scores
 from research.paper.verdict import ClaimVerdict, MeasuredValue
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.condition import Unsent
+from sortie.perception.evaluation.sharing import Unsent
 from sortie.scenarios.intervals import benjamini_hochberg
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.regular import regular

@@ -8,9 +8,10 @@ from typing import Literal
 import numpy as np
 
 from research.paper.measures import Floats, Region, under
-from sortie.perception.evaluation.condition import PAPER_WAYS, CellsBy, Sharing, Unsent, Ways
-from sortie.perception.evaluation.matched import Evaluation
-from sortie.perception.evaluation.matched import Region as Evaluated
+from research.paper.ways import PAPER_WAYS, CellsBy, Sharing, Ways
+from sortie.perception.evaluation.harness import Evaluation
+from sortie.perception.evaluation.harness import Region as Evaluated
+from sortie.perception.evaluation.sharing import Unsent
 from sortie.perception.metrics.bootstrap import Ranked, rank
 from sortie.scenarios.intervals import DRAWS, resamples
 from sortie.scenarios.streams import stream

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from research.paper.claims import CLAIMS, Claim
 from research.paper.results import DiscCentre, TableResults
-from sortie.perception.evaluation.condition import Unsent
+from sortie.perception.evaluation.sharing import Unsent
 
 TAUS = (0.01, 0.1, 0.2, 0.3, 0.5)
 DISCS: dict[DiscCentre, str] = {"mission": "around the target", "ego": "around the ego"}

@@ -15,10 +15,9 @@ from research.benchmark.difficulty import VARIED
 from research.flip.networks import read_config
 from research.paper.instrument import CarNetInstrument
 from research.paper.results import TAU
+from research.paper.ways import FULL_SHARING, SINGLE, evaluate
 from research.train.learn import EGOS
 from research.train.recipe import command, of_benchmark
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE
-from sortie.perception.evaluation.evaluate import evaluate
 from sortie.perception.files import replacing
 from sortie.perception.geometry import IMAGE_PX, Geometry
 from sortie.perception.metrics.bootstrap import Difference, compare

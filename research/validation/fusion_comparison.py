@@ -11,11 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from research.paper.instrument import CarNetInstrument
+from research.paper.ways import FULL_SHARING, SINGLE, CellsBy, Sharing, evaluate
 from research.validation.stored import Column, Table, points
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy, Sharing
-from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
-from sortie.perception.evaluation.evaluate import evaluate
-from sortie.perception.evaluation.selection import link_bytes
+from sortie.perception.evaluation.harness import FleetFrames
+from sortie.perception.evaluation.sharing import Exchange, Floats, link_bytes
 from sortie.perception.joining import Pose, Rule, SourceBoxes, joined, sendable
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.decode import placed_boxes
@@ -70,7 +69,7 @@ class LateView:
     def __init__(self, found: Sequence[Boxes], poses: Sequence[Pose], rule: Rule) -> None:
         self._found, self._poses, self._rule = found, poses, rule
 
-    def rank(self, by: CellsBy) -> NDArray[np.floating]:
+    def rank(self, by: CellsBy = "confidence") -> NDArray[np.floating]:
         """Nothing is ranked: cells are not sent."""
         return np.zeros((len(self._found), 64, 64))
 

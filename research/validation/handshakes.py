@@ -15,12 +15,11 @@ import torch
 from numpy.typing import NDArray
 
 from research.paper.instrument import CarNetInstrument, CarNetView
+from research.paper.ways import FULL_SHARING, SINGLE, CellsBy, evaluate
 from research.validation.stored import Column, Table, points
 from sortie.perception.budget import payload_bytes
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, CellsBy
-from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
-from sortie.perception.evaluation.evaluate import evaluate
-from sortie.perception.evaluation.selection import FOOTPRINT_M, footprint_overlap
+from sortie.perception.evaluation.harness import FleetFrames
+from sortie.perception.evaluation.sharing import FOOTPRINT_M, Exchange, Floats, footprint_overlap
 from sortie.perception.geometry import CELLS
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import Difference, compare
@@ -107,7 +106,7 @@ class ChosenView:
     view: CarNetView
     asks: NDArray[np.bool_]
 
-    def rank(self, by: CellsBy) -> NDArray[np.floating]:
+    def rank(self, by: CellsBy = "confidence") -> NDArray[np.floating]:
         """As the network ranks."""
         return self.view.rank(by)
 

@@ -18,12 +18,12 @@ from scipy import stats
 
 from research.benchmark.dataset import Benchmark, Frames, load_frames, make_split
 from research.paper.instrument import CarNetView
+from research.paper.ways import Sharing
 from research.train.box_errors import Calibration, Errors, Moment, calibration
 from research.train.boxes_alone import boxes_alone, moments_of
 from research.validation.stored import Column, Table
 from sortie.perception import budget
-from sortie.perception.evaluation.condition import Sharing
-from sortie.perception.evaluation.evaluate import Settings, exchanges, frame_keys, match_all
+from sortie.perception.evaluation.harness import Settings, exchanges, frame_keys, match_all
 from sortie.perception.geometry import CELLS, Geometry
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import EgoSources, Rule, joined_many, source_of
@@ -184,7 +184,7 @@ def _maps(
     view = CarNetView(net, features, near)
     conditions = [Sharing(r, unsent="masked") for r in rho]
     given = [e for e, _ in exchanges(view, frames, f, key, conditions, settings, geometry, None)]
-    there = [ground_truth(frames.cars[f], pose, geometry.half_extent_m).table() for pose in frames.true_pose[f]]
+    there = [ground_truth(frames.cars[f], pose, geometry.half_extent_m) for pose in frames.true_pose[f]]
     ego_of = np.array([e.ego for e in given])
     cells = features.permute(0, 2, 3, 1).reshape(-1, features.shape[1])
     codes = codebook.encode(cells, max(code_bytes)) if code_bytes else None

@@ -19,11 +19,10 @@ import torch
 from numpy.typing import NDArray
 
 from research.paper.instrument import CarNetInstrument, CarNetView
+from research.paper.ways import SINGLE, CellsBy, Sharing, evaluate
 from research.validation.stored import Column, Table, points
-from sortie.perception.evaluation.condition import SINGLE, CellsBy, Sharing
-from sortie.perception.evaluation.contract import Exchange, FleetFrames, Floats
-from sortie.perception.evaluation.evaluate import evaluate
-from sortie.perception.evaluation.selection import sending_order
+from sortie.perception.evaluation.harness import FleetFrames
+from sortie.perception.evaluation.sharing import Exchange, Floats, sending_order
 from sortie.perception.geometry import CELLS
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.fusion.where2comm import Where2comm, confidence_map, requested_rank
@@ -72,7 +71,7 @@ class RequestingView:
     view: CarNetView
     place: NDArray[np.int16]
 
-    def rank(self, by: CellsBy) -> NDArray[np.floating]:
+    def rank(self, by: CellsBy = "confidence") -> NDArray[np.floating]:
         """As the network ranks; how many cells are sent follows from it, and not which."""
         return self.view.rank(by)
 

@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 
 from sortie.perception.recordings.recording import open_recording
+from sortie.scenarios.report_text import points
 from sortie.sim.cli.console import bars, out, print_written
 from sortie.sim.folders import RunError, ensure_files
 
@@ -36,15 +37,17 @@ def evaluate(
         str | None, typer.Option(help="Your fusion, path/to/file.py:function; default: boxes by cell.")
     ] = None,
     conditions: Annotated[
-        str | None, typer.Option(help="Ways of sharing, separated by spaces: 'single best-2@0.02 all-4@1'.")
+        str | None,
+        typer.Option(
+            help="Ways of sharing, separated by spaces: 'single best-2@0.02 all-4@1'. Gains are over the first."
+        ),
     ] = None,
     tau: Annotated[float, typer.Option(help="Score threshold.")] = 0.1,
     save: Annotated[Path | None, typer.Option("--out", help="Write every match as Parquet here.")] = None,
 ) -> None:
-    """Compute AP and bytes of a recording under several ways of sharing. Without --fusion, boxes arrive with their cells."""
-    from sortie.perception.evaluation.condition import Sharing
-    from sortie.perception.evaluation.matched import FLOOR
-    from sortie.perception.recordings.instrument import evaluate_recording
+    """Compute AP, gains and bytes of a recording under several ways of sharing. Without --fusion, boxes arrive with their cells."""
+    from sortie.perception.evaluation import Sharing, evaluate_recording
+    from sortie.perception.evaluation.harness import FLOOR
 
     ensure_files(save)
     if not FLOOR <= tau <= 1.0:  # before the evaluation, which may take hours
@@ -55,13 +58,20 @@ def evaluate(
             path, asked, fusion=fusion, progress=lambda done, of: bar("frames", of)(done) if done == of else None
         )
     shown = found.at(tau)
-    table = Table(title=f"{path.name}, AP@0.5 at τ = {tau:g}")
-    for name in ("condition", "full scene", "mission", "payload B an ego", "index B an ego"):
-        table.add_column(name, justify="left" if name == "condition" else "right")
+    first = shown.conditions[0]
+    groups = len(set(shown.groups(by=shown.resampled).tolist()))
+    table = Table(
+        title=f"{path.name}, AP@0.5 at τ = {tau:g}",
+        caption=f"gain: points over {first.label}, full scene, with 95 % interval over {groups} {shown.resampled}(s);\n"
+        "bytes: mean of an ego in a frame",
+    )
+    for name in ("condition", "full", "gain", "mission", "payload, B", "index, B"):
+        table.add_column(name, justify="left" if name == "condition" else "right", no_wrap=name == "gain")
     for c in shown.conditions:
-        aps = (f"{shown.ap(c, region):.3f}" for region in shown.regions)
+        gain = None if c == first else shown.gain(c, first)
+        over = "" if gain is None else points((gain.delta, gain.low, gain.high), "+.1f")
         bytes_ = (f"{b[c].mean():.0f}" for b in (shown.payload_bytes, shown.index_bytes))
-        table.add_row(c.label, *aps, *bytes_)
+        table.add_row(c.label, f"{shown.ap(c):.3f}", over, f"{shown.ap(c, 'mission'):.3f}", *bytes_)
     out.print(table)
     if save is not None:
         found.save(save)

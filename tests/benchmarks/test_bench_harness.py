@@ -14,8 +14,8 @@ import shapely
 import torch
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation import selection
-from sortie.perception.evaluation.evaluate import Settings, match_all
+from sortie.perception.evaluation import Settings, sharing
+from sortie.perception.evaluation.harness import match_all
 from sortie.perception.geometry import FULL
 from sortie.perception.metrics.ap import Matched, average_precision, match, suppress
 from sortie.perception.metrics.bootstrap import rank
@@ -72,7 +72,10 @@ def by_loops(found: list[NDArray[np.float64]], cars: list[NDArray[np.float64]]) 
 def at_once(found: list[NDArray[np.float64]], cars: list[NDArray[np.float64]]) -> float:
     """The same by the harness's evaluator; it is given all images of a frame together, five egos under every condition."""
     n = len(found)
-    return average_precision(match_all(found, np.arange(n), np.zeros((n, 3)), cars, {"full": None}, Settings())["full"])
+    there = [Boxes(t[:, :2], t[:, 2:4], t[:, 4], np.ones(len(t))) for t in cars]
+    return average_precision(
+        match_all(found, np.arange(n), np.zeros((n, 3)), there, {"full": None}, Settings())["full"]
+    )
 
 
 def test_evaluator_against_shapely_loops(benchmark: Any) -> None:
@@ -124,12 +127,12 @@ def test_rotated_overlap_of_2000_pairs_by_vectorised_shapely(benchmark: Any) -> 
 def test_sending_order_of_five_drones(benchmark: Any) -> None:
     """All that top-k needs for every budget of a frame: a budget of b cells is `order < b` (below)."""
     scores = np.random.Generator(np.random.PCG64(1)).random((5, 64, 64), np.float32)
-    first = selection.in_disc(POSES.numpy().astype(np.float64), (5.0, 5.0, 32.0))
-    assert benchmark(selection.sending_order, scores, first).max() == 4095
+    first = sharing.in_disc(POSES.numpy().astype(np.float64), (5.0, 5.0, 32.0))
+    assert benchmark(sharing.sending_order, scores, first).max() == 4095
 
 
 def test_top_k_of_twenty_links_given_the_order(benchmark: Any) -> None:
-    order = selection.sending_order(np.random.Generator(np.random.PCG64(1)).random((5, 64, 64), np.float32))
+    order = sharing.sending_order(np.random.Generator(np.random.PCG64(1)).random((5, 64, 64), np.float32))
     counts = np.full(20, 82)[:, None, None]
     assert benchmark(lambda: order[PEERS] < counts).sum() == 20 * 82
 

@@ -17,12 +17,12 @@ from research.benchmark.dataset import Benchmark, Frames, load_frames, make_scen
 from research.flip.dose_run import frame_of
 from research.flip.doses import read_plan
 from research.paper.instrument import CarNetInstrument
+from research.paper.ways import FULL_SHARING, SINGLE, Sharing, evaluate
 from research.train import train as training
 from research.train.devices import gpu_name, measuring_device
 from research.train.recipe import Recipe
 from research.train.train import train
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
-from sortie.perception.evaluation.evaluate import Settings, evaluate, exchanges
+from sortie.perception.evaluation.harness import Settings, exchanges
 from sortie.perception.network.checkpoint import load_weights, read_facts
 from sortie.scenarios.shipped import NETWORKS
 

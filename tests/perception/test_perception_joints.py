@@ -39,8 +39,8 @@ from scipy.special import ndtr
 
 from sortie.perception import budget
 from sortie.perception.detectors import make_detector
-from sortie.perception.evaluation.condition import Sharing
-from sortie.perception.evaluation.selection import choose
+from sortie.perception.evaluation import Sharing
+from sortie.perception.evaluation.sharing import choose
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import EgoSources, SourceBoxes, joined_many, source_of
 from sortie.perception.lateness import map_weight, own_age_s, reach_m, still_right, weighed

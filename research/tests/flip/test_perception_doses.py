@@ -26,9 +26,8 @@ from research.flip.doses import (
 )  # fmt: skip
 from research.flip.run import SHIPPED
 from research.paper.instrument import CarNetInstrument
-from sortie.perception.evaluation.condition import SINGLE
-from sortie.perception.evaluation.evaluate import evaluate
-from sortie.perception.evaluation.matched import FrameResult, Settings
+from research.paper.ways import SINGLE, evaluate
+from sortie.perception.evaluation.harness import FrameResult, Settings
 from sortie.perception.geometry import CELLS, FULL
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.network.checkpoint import load_weights
@@ -121,11 +120,13 @@ def test_all_doses_at_once_give_what_each_gives_alone() -> None:
         conditions = tuple(SMALL_PLAN.conditions(dose))
         wanted = evaluate(alone, data, conditions, regions=("full",), egos=few.egos)
         for c in conditions:
-            for unit, other in zip(wanted.units[c, "full"], found[dose.label].units[c.plain(), "full"], strict=True):
+            for unit, other in zip(
+                wanted.units[c, "full"], found[dose.label].units[c.plain().label, "full"], strict=True
+            ):
                 assert unit.truths == other.truths
                 assert unit.score == pytest.approx(other.score, abs=1e-5)
                 assert unit.hit.tolist() == other.hit.tolist()
-            assert [row[0] for row in found[dose.label].cost[c.plain()]] == wanted.cells[c].tolist()
+            assert [row[0] for row in found[dose.label].cost[c.plain().label]] == wanted.cells[c].tolist()
         view = alone.look(data, 0)
         each = [view.weight_on_zeros(ego, cells_with_cars(data, 0, ego, FULL)) for ego in range(5)]
         expected = np.zeros(len(weights[dose.label])) if dose.unsent == "masked" else np.concatenate(each)
@@ -139,7 +140,7 @@ def test_a_study_that_was_cut_off_goes_on_where_it_was(tmp_path: Path, monkeypat
         if measured == [0]:
             raise KeyboardInterrupt
         measured.append(f)
-        found = FrameResult((math.nan, math.nan), {(SINGLE, "full"): [NO_BOXES]}, {SINGLE: [(0, 0, 0)]})
+        found = FrameResult((math.nan, math.nan), {("single", "full"): [NO_BOXES]}, {"single": [(0, 0, 0)]})
         return {"T 1": found}, {"T 1": [0.25 * f]}
 
     monkeypatch.setattr(dose_run, "frame_of", once)

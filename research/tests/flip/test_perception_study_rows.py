@@ -14,8 +14,8 @@ from research.flip.measure import F1, StudyRow, optimal_f1, rows_of, threshold
 from research.flip.plan import MeasuredGrid, Variant
 from research.paper.measures import under
 from research.paper.scores import Bootstrap
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
-from sortie.perception.evaluation.matched import Evaluation, Settings
+from research.paper.ways import FULL_SHARING, SINGLE, Sharing
+from sortie.perception.evaluation.harness import Evaluation, Settings
 from sortie.perception.metrics.ap import Matched, average_precision
 
 GRID = MeasuredGrid(
@@ -38,8 +38,8 @@ def evaluation(conditions: list[Sharing]) -> Evaluation:
     none = {c: np.zeros(FRAMES * EGOS, np.int64) for c in conditions}
     target = np.full((FRAMES, 2), np.nan)
     scene = np.arange(FRAMES) // 3
-    settings = Settings(egos=EGOS, floor=0.05)
-    return Evaluation(tuple(conditions), ("full",), settings, scene, target, units, none, none, none)  # type: ignore[arg-type]
+    settings = Settings(egos=EGOS, floor=0.05, regions=("full",))
+    return Evaluation(tuple(conditions), settings, scene, target, units, none, none, none)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from research.paper.measures import Region
 from research.paper.verdict import MeasuredValue
-from sortie.perception.evaluation.condition import Sharing
-from sortie.perception.evaluation.contract import Exchange, Floats
+from research.paper.ways import Sharing
+from sortie.perception.evaluation.sharing import Exchange, Floats
 from sortie.perception.geometry import CELLS, FULL
 
 DRAWS = 400
@@ -99,7 +99,7 @@ class MadeView:
     cars: Floats
     pose: Floats
 
-    def rank(self, by: str) -> NDArray[np.floating]:
+    def rank(self, by: str = "confidence") -> NDArray[np.floating]:
         return np.tile(-np.arange(CELLS * CELLS, dtype=float).reshape(1, CELLS, CELLS), (5, 1, 1))
 
     def detect(self, exchanges: Sequence[Exchange], floor: float) -> list[Floats]:

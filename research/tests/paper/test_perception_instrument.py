@@ -13,9 +13,9 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from research.flip.networks import StudyConfig, StudyNet
 from research.paper.instrument import CarNetInstrument, fingerprint
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
-from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.evaluate import Settings, evaluate, exchanges
+from research.paper.ways import FULL_SHARING, SINGLE, Sharing, evaluate
+from sortie.perception.evaluation.harness import Settings, exchanges
+from sortie.perception.evaluation.sharing import Exchange
 from sortie.perception.geometry import FULL
 from sortie.perception.network.checkpoint import save_weights
 from sortie.perception.network.decode import decode

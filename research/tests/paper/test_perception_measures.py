@@ -23,7 +23,7 @@ from research.paper.measures import (
     held_out,
     under,
 )
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
+from research.paper.ways import FULL_SHARING, SINGLE, Sharing
 
 PAPER = Made({}, papers_world)
 

@@ -13,7 +13,7 @@ from research.paper.claims import all_4
 from research.paper.measures import ApOf, Contrast, Kept, Peak, Region, Widest, under
 from research.paper.rows import points
 from research.paper.verdict import ClaimVerdict, MeasuredValue, Paper
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
+from research.paper.ways import FULL_SHARING, SINGLE, Sharing
 
 
 def region_alone(region: str) -> Made:

@@ -10,9 +10,9 @@ from paper_examples import MadeFrames, MadeInstrument, made_frames
 
 from research.paper import figure_frame, figures
 from research.paper.picture import picture, sharers
-from sortie.perception.evaluation.condition import Serve, Ways
-from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.evaluate import REGION_M
+from research.paper.ways import Serve, Ways
+from sortie.perception.evaluation.harness import REGION_M
+from sortie.perception.evaluation.sharing import Exchange
 from sortie.perception.geometry import CELLS, FULL, to_world
 
 

@@ -18,7 +18,7 @@ from research.paper.measures import Contrast
 from research.paper.rows import ClaimRow
 from research.paper.scores import split
 from research.paper.verdict import MeasuredValue
-from sortie.perception.evaluation.condition import Sharing
+from research.paper.ways import Sharing
 
 
 @pytest.fixture(scope="module")

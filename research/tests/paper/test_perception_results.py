@@ -14,7 +14,7 @@ from research.paper.measures import under
 from research.paper.measuring import bench_frames, measure
 from research.paper.results import TableResults, TableSettings
 from research.paper.sensitivity import BY_DISC, BY_TAU, DISCS, TAUS, sensitivity
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
+from research.paper.ways import FULL_SHARING, SINGLE, Sharing
 from sortie.perception.metrics.ap import average_precision
 
 N = 6

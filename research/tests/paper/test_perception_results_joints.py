@@ -11,13 +11,12 @@ from research.paper.measures import under
 from research.paper.picture import picture, sharers
 from research.paper.results import TableResults, TableSettings
 from research.paper.scores import Bootstrap, split
-from sortie.perception.evaluation import selection
-from sortie.perception.evaluation.condition import SINGLE, Sharing, Ways
-from sortie.perception.evaluation.evaluate import (
+from research.paper.ways import SINGLE, Sharing, Ways, evaluate
+from sortie.perception.evaluation import sharing
+from sortie.perception.evaluation.harness import (
     REGION_M,
     Evaluation,
     Settings,
-    evaluate,
     exchanges,
     frame_keys,
     mission_target,
@@ -114,21 +113,21 @@ def test_exchanges_go_by_what_drones_believe_and_by_the_settings_seed() -> None:
     conditions = [Sharing(0.05, "best-2"), Sharing(0.05, "random-2"), Sharing(0.05, roi=True), Sharing(0.05)]
     got = exchanges(view, frames, 1, key, conditions, settings, FULL, target)
     est = frames.est_pose[1]
-    overlap = selection.footprint_overlap(est[:, :2], np.full(5, selection.FOOTPRINT_M))
-    roi = selection.in_disc(est, Disc(*target, REGION_M), FULL)
-    plain = selection.sending_order(view.rank("confidence"))
-    steered = selection.sending_order(view.rank("confidence"), roi)
+    overlap = sharing.footprint_overlap(est[:, :2], np.full(5, sharing.FOOTPRINT_M))
+    roi = sharing.in_disc(est, Disc(*target, REGION_M), FULL)
+    plain = sharing.sending_order(view.rank("confidence"))
+    steered = sharing.sending_order(view.rank("confidence"), roi)
     total = int(0.05 * 4 * 4096)
     for n, c in enumerate(conditions):
         for ego in range(5):
             e, count = got[5 * n + ego]
-            assert e.peers == selection.choose(c, ego, overlap[ego], key, 6)
+            assert e.peers == sharing.choose(c, ego, overlap[ego], key, 6)
             assert sum(count) == total
             order = (steered if c.roi else plain)[list(e.peers)]
             np.testing.assert_array_equal(e.sent, order < np.array(count)[:, None, None])
-    by_truth = selection.footprint_overlap(frames.true_pose[1][:, :2], np.full(5, selection.FOOTPRINT_M))
-    assert any(selection.choose(conditions[0], k, by_truth[k]) != got[k][0].peers for k in range(5))
-    assert any(selection.choose(conditions[1], k, overlap[k], key) != got[5 + k][0].peers for k in range(5))
+    by_truth = sharing.footprint_overlap(frames.true_pose[1][:, :2], np.full(5, sharing.FOOTPRINT_M))
+    assert any(sharing.choose(conditions[0], k, by_truth[k]) != got[k][0].peers for k in range(5))
+    assert any(sharing.choose(conditions[1], k, overlap[k], key) != got[5 + k][0].peers for k in range(5))
 
 
 def test_targets_are_drawn_by_the_evaluations_seed_about_the_true_centre() -> None:
@@ -140,7 +139,7 @@ def test_targets_are_drawn_by_the_evaluations_seed_about_the_true_centre() -> No
     assert wanted != [mission_target(frames, f, key) for f, key in enumerate(keys)]
     for f in range(4):
         centre = frames.true_pose[f, :, :2].mean(axis=0)
-        assert np.hypot(*(found.target[f] - centre)) <= selection.FOOTPRINT_M
+        assert np.hypot(*(found.target[f] - centre)) <= sharing.FOOTPRINT_M
         for ego in range(2):  # the disc about an ego is where it truly is
             cars = truth(frames, f, ego, FULL).xy_m
             near = np.hypot(*(cars - frames.true_pose[f, ego, :2]).T) <= REGION_M

@@ -24,7 +24,7 @@ from research.paper.picture import Picture
 from research.paper.playback import SHADES, save_frame
 from research.paper.results import TableSettings
 from research.paper.sensitivity import Varied
-from sortie.perception.evaluation.condition import Ways
+from research.paper.ways import Ways
 from sortie.perception.geometry import CELLS, FULL, Geometry
 from sortie.perception.types import Boxes
 from sortie.policies.registry import resolve

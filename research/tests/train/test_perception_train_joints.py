@@ -11,12 +11,12 @@ import torch
 
 from research.benchmark.dataset import Benchmark, Frames
 from research.paper.results import TAU
+from research.paper.ways import FULL_SHARING, SINGLE
 from research.train import boxes_alone, validation
 from research.train.box_errors import common, errors_of
 from research.train.learn import Thinning, _fit, apply, local_cars, loss_of, targets
 from research.train.recipe import Recipe, command, of_benchmark
 from research.train.validation import LEVELS, validate, validate_all, with_errors
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE
 from sortie.perception.geometry import HEAD_PX, Geometry
 from sortie.perception.network.decode import REFERENCE_SIZE_M
 from sortie.perception.types import Boxes

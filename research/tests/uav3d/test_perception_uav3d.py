@@ -21,7 +21,7 @@ from research.uav3d.uav3d import (
     read_infos,
     read_tables,
 )
-from sortie.perception.recordings.instrument import frames_of
+from sortie.perception.evaluation.recorded import frames_of
 from sortie.perception.recordings.recording import open_recording
 
 SCENES = ("scene_0001", "scene_0861")

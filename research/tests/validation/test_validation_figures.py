@@ -36,7 +36,7 @@ NOT_MEASURED = {
         "| split | scenes × frames | for | layouts |": DEFINED,
         "| parameter | default | what it is |": DEFINED,
     },
-    "perception/evaluation/README.md": {
+    "research/paper/README.md": {
         "| ρ | 1 | 0.25 | 0.1 | 0.05 | 0.02 | 0.01 |": DEFINED,
         "| what | against | bound |": BOUNDS,
     },

@@ -9,7 +9,7 @@ from harness_examples import SeenFrames, made_frames, with_images
 
 from research.paper.instrument import CarNetInstrument
 from research.validation import requests_of_cells
-from sortie.perception.evaluation.contract import Exchange
+from sortie.perception.evaluation.sharing import Exchange
 from sortie.perception.network.fusion.where2comm import confidence_map
 from sortie.perception.network.model import CarNet, ModelConfig
 

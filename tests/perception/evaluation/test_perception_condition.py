@@ -1,10 +1,10 @@
-"""Conditions: what they refuse, their labels, and which of them are the same."""
+"""Conditions: what they refuse, and their labels."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
+from sortie.perception.evaluation import FULL_SHARING, SINGLE, Sharing
 
 conditions = st.one_of(
     st.just(SINGLE),
@@ -13,7 +13,6 @@ conditions = st.one_of(
         st.floats(0, 1),
         st.sampled_from(["all-4", "best-1", "best-2", "best-4", "worst-2", "worst-3", "random-2", "random-4"]),
         st.sampled_from(["uniform", "overlap"]),
-        st.sampled_from(["confidence", "norm"]),
         st.sampled_from(["zero", "masked"]),
         st.booleans(),
     ),
@@ -29,7 +28,7 @@ def test_labels_are_short() -> None:
     assert SINGLE.label == "single"
     assert FULL_SHARING.label == "all-4@1"
     assert Sharing(0.02, "best-2").label == "best-2@0.02"
-    assert Sharing(0.1, "all-4", "overlap", "norm", "masked", True).label == "all-4@0.1,overlap,norm,masked,roi"
+    assert Sharing(0.1, "all-4", "overlap", "masked", True).label == "all-4@0.1,overlap,masked,roi"
 
 
 @pytest.mark.parametrize(
@@ -41,7 +40,6 @@ def test_labels_are_short() -> None:
         ({"received_budget": 0.1, "peers": "best-0"}, "peers is 'best-0', must be"),
         ({"received_budget": 0.1, "peers": "none"}, "received_budget is 0.1 with no peers, must be 0"),
         ({"received_budget": 0.1, "allocation": "equal"}, "allocation is 'equal', must be uniform or overlap"),
-        ({"received_budget": 0.1, "cells_by": "luck"}, "cells_by is 'luck', must be confidence or norm"),
         ({"received_budget": 0.1, "unsent": "gone"}, "unsent is 'gone', must be zero or masked"),
     ],
 )
@@ -54,18 +52,3 @@ def test_what_a_condition_refuses(knobs: dict, message: str) -> None:
 def test_what_is_no_label(label: str) -> None:
     with pytest.raises(ValueError, match="must be like best-2@0\\.02,masked"):
         Sharing.parse(label)
-
-
-def test_conditions_that_differ_in_nothing() -> None:
-    parse = Sharing.parse
-    assert parse("best-4@0.1").plain() == parse("worst-4@0.1").plain() == parse("all-4@0.1")
-    assert parse("best-2@0.1").plain() == parse("best-2@0.1")
-    assert parse("all-4@1,overlap,norm,roi").plain() == FULL_SHARING
-    assert parse("best-2@0.5,norm").plain() == parse("best-2@0.5"), "half of full sharing is all that two have"
-    assert parse("best-2@0.49,norm").plain() == parse("best-2@0.49,norm")
-    assert parse("all-4@0,masked").plain() == SINGLE
-    assert parse("all-4@0").plain() == parse("all-4@0"), "four silent peers still dilute"
-    assert parse("best-2@0.1,zeros").plain() == parse("best-2@0.1,zeros"), "two absent peers dilute"
-    assert parse("all-4@0.1,zeros").plain() == parse("all-4@0.1"), "nobody is absent"
-    assert parse("best-2@0.1,masked,zeros").plain() == parse("best-2@0.1,masked")
-    assert parse("best-2@0.4").plain(drones=3) == parse("all-2@0.4")

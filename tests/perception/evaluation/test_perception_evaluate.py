@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from harness_examples import MadeFrames, MadeInstrument, made_frames
 
-from research.paper.scores import Bootstrap
-from sortie.perception.evaluation import selection
-from sortie.perception.evaluation.condition import FULL_SHARING, SINGLE, Sharing
-from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.evaluate import (
-    REGION_M,
-    Evaluation,
-    Settings,
-    evaluate,
-    frame_hash,
-    frame_keys,
-    match_all,
-    mission_target,
-    truth,
-)
+from sortie.perception.evaluation import FULL_SHARING, SINGLE, Evaluation, Settings, Sharing, evaluate, sharing
+from sortie.perception.evaluation.harness import REGION_M, frame_hash, frame_keys, match_all, mission_target, truth
+from sortie.perception.evaluation.sharing import Exchange
 from sortie.perception.metrics.ap import CONVENTIONS, average_precision, match, suppress
+from sortie.perception.metrics.bootstrap import compare
 from sortie.perception.types import Boxes
 
 BEST = Sharing(0.1, "best-2", roi=True)
 THREE = (SINGLE, BEST, FULL_SHARING)
 EVERYWHERE = ("full", "mission", "ego")
+
+
+def evaluated(
+    instrument: object, frames: MadeFrames, conditions: Sequence[Sharing], store: Path | None = None, **settings: Any
+) -> Evaluation:
+    return evaluate(instrument, frames, conditions, Settings(**settings), store=store)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +37,7 @@ def frames() -> MadeFrames:
 
 @pytest.fixture(scope="module")
 def whole(frames: MadeFrames) -> Evaluation:
-    return evaluate(MadeInstrument(), frames, THREE, regions=EVERYWHERE)
+    return evaluated(MadeInstrument(), frames, THREE, regions=EVERYWHERE)
 
 
 def some(frames: MadeFrames, which: list[int]) -> MadeFrames:
@@ -50,7 +48,7 @@ def alike(a: Evaluation, b: Evaluation, drop: int = 0) -> None:
     """Equal to the bit, `drop` frames at the start of b left out."""
     skip = drop * b.settings.egos
     assert a.conditions == b.conditions
-    assert a.regions == b.regions
+    assert a.settings.regions == b.settings.regions
     assert a.scene.tolist() == b.scene[drop:].tolist()
     assert np.array_equal(a.target, b.target[drop:], equal_nan=True)
     for key, units in a.units.items():
@@ -67,7 +65,7 @@ def alike(a: Evaluation, b: Evaluation, drop: int = 0) -> None:
 
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_all_images_at_once_are_one_after_another(frames: MadeFrames, name: str) -> None:
-    found = evaluate(MadeInstrument(), frames, [FULL_SHARING], regions=EVERYWHERE, convention=name)
+    found = evaluated(MadeInstrument(), frames, [FULL_SHARING], regions=EVERYWHERE, convention=name)
     hits = 0
     for f, key in enumerate(frame_keys(frames)):
         view = MadeInstrument().look(frames, f)
@@ -117,7 +115,7 @@ def test_the_order_of_boxes_and_cars_does_not_matter(name: str, seed: int) -> No
             [rng.permutation(local[ego]) for ego in egos],
             egos,
             np.zeros((4, 3)),
-            [rng.permutation(t) for t in there],
+            [Boxes(t[:, :2], t[:, 2:4], t[:, 4], np.ones(len(t))) for t in map(rng.permutation, there)],
         )
         units = match_all(*mixed, {"full": None}, Settings(nms_iou=0.7, convention=name))["full"]
         found.add(average_precision(units, CONVENTIONS[name]))
@@ -146,20 +144,20 @@ def test_a_target_is_near_the_fleet_and_the_frames_own(frames: MadeFrames) -> No
         centre = many.true_pose[f, :, :2].mean(axis=0)
         away = np.hypot(*(many.cars[f, :, :2] - centre).T)
         target = mission_target(many, f, key)
-        if not (away <= selection.FOOTPRINT_M).any():
+        if not (away <= sharing.FOOTPRINT_M).any():
             assert target is None
             continue
         which = np.flatnonzero((many.cars[f, :, :2] == target).all(axis=1))
         assert len(which) == 1
-        assert away[which[0]] <= selection.FOOTPRINT_M
-        chosen.append(np.count_nonzero(away[away <= selection.FOOTPRINT_M] < away[which[0]]) == 0)
+        assert away[which[0]] <= sharing.FOOTPRINT_M
+        chosen.append(np.count_nonzero(away[away <= sharing.FOOTPRINT_M] < away[which[0]]) == 0)
     assert 0.03 < np.mean(chosen) < 0.4, "drawn evenly, not the nearest"
 
 
 def test_frames_without_a_target_do_not_count_for_the_mission(frames: MadeFrames) -> None:
     cars = frames.cars.copy()
     cars[1, :, :2] += 500.0
-    found = evaluate(MadeInstrument(), replace(frames, cars=cars), [FULL_SHARING])
+    found = evaluated(MadeInstrument(), replace(frames, cars=cars), [FULL_SHARING])
     assert np.isnan(found.target[1]).all()
     assert not np.isnan(found.target[[0, 2, 3, 4]]).any()
     assert found.groups("mission").tolist() == [f for f in (0, 2, 3, 4) for _ in range(5)]
@@ -177,13 +175,27 @@ def test_bytes_of_a_fleet_frame(whole: Evaluation) -> None:
     assert whole.cells[SINGLE].tolist() == [0] * 25
 
 
-def test_what_is_resampled_is_in_our_convention(frames: MadeFrames) -> None:
-    """Intervals of another AP than the one beside them would look like any others."""
-    found = evaluate(MadeInstrument(), frames, [FULL_SHARING], convention="uav3d")
-    with pytest.raises(
-        ValueError, match=r"^the evaluation's convention is 'uav3d', must be 'rotated' to be resampled$"
-    ):
-        Bootstrap(found, "zero")
+def test_a_gain_is_paired_over_scenes(whole: Evaluation, frames: MadeFrames) -> None:
+    found = whole.gain(BEST, SINGLE, "mission")
+    wanted = compare(whole.matched(SINGLE, "mission"), whole.matched(BEST, "mission"), whole.groups("mission", "scene"))
+    assert found == wanted
+    assert found.low <= found.delta == whole.ap(BEST, "mission") - whole.ap(SINGLE, "mission") <= found.high
+    one_scene = evaluated(MadeInstrument(), replace(frames, scene=np.full(5, 7)), THREE)
+    assert (whole.resampled, one_scene.resampled) == ("scene", "frame")
+    other = evaluated(MadeInstrument(), frames, [FULL_SHARING], convention="uav3d")
+    with pytest.raises(ValueError, match=r"^convention is 'uav3d', must be 'rotated' to be resampled$"):
+        other.gain(FULL_SHARING, FULL_SHARING)
+
+
+def test_a_pool_of_threads_changes_nothing(frames: MadeFrames, whole: Evaluation) -> None:
+    seen: list[tuple[int, int]] = []
+    settings = Settings(regions=EVERYWHERE)
+    with ThreadPoolExecutor(3) as pool:
+        several = evaluate(
+            MadeInstrument(), frames, THREE, settings, each=pool.map, progress=lambda *done: seen.append(done)
+        )
+    alike(several, whole)
+    assert seen == [(k, 5) for k in range(1, 6)]
 
 
 def test_more_cells_find_more(whole: Evaluation) -> None:
@@ -191,7 +203,7 @@ def test_more_cells_find_more(whole: Evaluation) -> None:
 
 
 def test_a_threshold_after_is_a_floor_before(frames: MadeFrames, whole: Evaluation) -> None:
-    cut, floored = whole.at(0.3), evaluate(MadeInstrument(), frames, THREE, regions=EVERYWHERE, floor=0.3)
+    cut, floored = whole.at(0.3), evaluated(MadeInstrument(), frames, THREE, regions=EVERYWHERE, floor=0.3)
     for key, units in cut.units.items():
         for one, other in zip(units, floored.units[key], strict=True):
             assert one.hit.tolist() == other.hit.tolist()
@@ -203,19 +215,9 @@ def test_a_threshold_after_is_a_floor_before(frames: MadeFrames, whole: Evaluati
         cut.at(0.2)
 
 
-def test_equal_conditions_are_computed_once(frames: MadeFrames, whole: Evaluation) -> None:
-    instrument = MadeInstrument()
-    twins = (*THREE, Sharing(0.1, "best-4"), Sharing(0.1, "worst-4"), Sharing(1.0, cells_by="norm"), SINGLE)
-    found = evaluate(instrument, frames, twins)
-    assert instrument.computed == 4 * 25
-    assert found.conditions == twins[:-1]
-    assert found.ap(Sharing(1.0, cells_by="norm")) == whole.ap(FULL_SHARING)
-    assert found.cells[Sharing(0.1, "worst-4")].tolist() == [1638] * 25
-
-
 def test_frames_in_another_order_are_the_same_frames(frames: MadeFrames, whole: Evaluation) -> None:
     order = [2, 3, 4, 0, 1]
-    turned = evaluate(MadeInstrument(), some(frames, order), THREE, regions=EVERYWHERE)
+    turned = evaluated(MadeInstrument(), some(frames, order), THREE, regions=EVERYWHERE)
     for key, units in turned.units.items():
         for place, f in enumerate(order):
             for ego in range(5):
@@ -223,30 +225,6 @@ def test_frames_in_another_order_are_the_same_frames(frames: MadeFrames, whole: 
     for c in THREE:
         for region in EVERYWHERE:
             assert turned.ap(c, region) == pytest.approx(whole.ap(c, region), abs=1e-12)
-
-
-def test_workers_change_nothing(frames: MadeFrames, whole: Evaluation) -> None:
-    seen: list[tuple[int, int]] = []
-    several = evaluate(
-        MadeInstrument(), frames, THREE, regions=EVERYWHERE, workers=3, progress=lambda *done: seen.append(done)
-    )
-    alike(several, whole)
-    assert seen == [(k, 5) for k in range(1, 6)]
-
-
-def test_a_worker_is_told_to_start_and_its_error_comes_out(frames: MadeFrames) -> None:
-    class Broken(MadeInstrument):
-        started = 0
-
-        def start_worker(self) -> None:
-            Broken.started += 1
-
-        def look(self, frames: object, frame: int) -> object:
-            raise RuntimeError(f"no light in frame {frame}")
-
-    with pytest.raises(RuntimeError, match="no light in frame 0"):
-        evaluate(Broken(), frames, THREE, workers=2)
-    assert 1 <= Broken.started <= 2
 
 
 def test_an_evaluation_goes_on_where_it_was_cut_off(frames: MadeFrames, whole: Evaluation, tmp_path: Path) -> None:
@@ -257,17 +235,17 @@ def test_an_evaluation_goes_on_where_it_was_cut_off(frames: MadeFrames, whole: E
             return super().look(frames, frame)
 
     with pytest.raises(KeyboardInterrupt):
-        evaluate(Tired(), frames, THREE, regions=EVERYWHERE, store=tmp_path)
+        evaluated(Tired(), frames, THREE, regions=EVERYWHERE, store=tmp_path)
     rest = MadeInstrument()
-    alike(evaluate(rest, frames, THREE, regions=EVERYWHERE, store=tmp_path), whole)
+    alike(evaluated(rest, frames, THREE, regions=EVERYWHERE, store=tmp_path), whole)
     assert rest.looked == [3, 4], "three frames were kept"
 
     more = MadeInstrument()
-    wider = evaluate(more, frames, (*THREE, Sharing(0.02)), regions=EVERYWHERE, store=tmp_path)
+    wider = evaluated(more, frames, (*THREE, Sharing(0.02)), regions=EVERYWHERE, store=tmp_path)
     assert more.computed == 25, "only the new condition"
     assert wider.ap(BEST) == whole.ap(BEST)
     again = MadeInstrument()
-    alike(evaluate(again, some(frames, [2, 3, 4]), THREE, regions=EVERYWHERE, store=tmp_path), whole, drop=2)
+    alike(evaluated(again, some(frames, [2, 3, 4]), THREE, regions=EVERYWHERE, store=tmp_path), whole, drop=2)
     assert again.looked == []
 
 
@@ -275,10 +253,10 @@ def test_an_evaluation_goes_on_where_it_was_cut_off(frames: MadeFrames, whole: E
 def test_a_store_answers_only_for_what_it_holds(
     frames: MadeFrames, tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    evaluate(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
+    evaluated(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
     instrument = MadeInstrument("other" if change == "fingerprint" else "made")
     if change == "code":
-        monkeypatch.setattr("sortie.perception.evaluation.matched.boxes_digest", lambda: "another")
+        monkeypatch.setattr("sortie.perception.evaluation.harness.boxes_digest", lambda: "another")
     if change == "pose":
         frames = replace(frames, est_pose=frames.est_pose + 1e-6)
     knobs = {
@@ -287,7 +265,7 @@ def test_a_store_answers_only_for_what_it_holds(
         "convention": {"convention": "uav3d"},
         "regions": {"regions": ["ego"]},
     }
-    evaluate(instrument, frames, [FULL_SHARING], store=tmp_path, **knobs.get(change, {}))
+    evaluated(instrument, frames, [FULL_SHARING], store=tmp_path, **knobs.get(change, {}))
     assert len(instrument.looked) == 5
 
 
@@ -302,11 +280,11 @@ def test_a_frame_is_known_again_beside_frames_with_more_cars(frames: MadeFrames)
 
 
 def test_a_broken_store_says_which_file(frames: MadeFrames, tmp_path: Path) -> None:
-    evaluate(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
+    evaluated(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
     part = next(tmp_path.glob("*/*.parquet"))
     part.write_bytes(b"nothing")
     with pytest.raises(ValueError, match=rf"{part.name}: not part of an evaluation .* remove it to go on"):
-        evaluate(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
+        evaluated(MadeInstrument(), frames, [FULL_SHARING], store=tmp_path)
 
 
 def test_saved_and_read_back(whole: Evaluation, tmp_path: Path) -> None:
@@ -338,10 +316,10 @@ def test_what_is_not_an_evaluation(tmp_path: Path) -> None:
 def test_what_evaluate_refuses(frames: MadeFrames, knobs: dict, message: str) -> None:
     conditions = knobs.pop("conditions", [FULL_SHARING])
     with pytest.raises(ValueError, match=message):
-        evaluate(MadeInstrument(), frames, conditions, **knobs)
+        evaluated(MadeInstrument(), frames, conditions, **knobs)
 
 
 def test_fewer_egos_are_the_first_ones(frames: MadeFrames, whole: Evaluation) -> None:
-    two = evaluate(MadeInstrument(), frames, [FULL_SHARING], egos=2)
+    two = evaluated(MadeInstrument(), frames, [FULL_SHARING], egos=2)
     assert len(two.units[FULL_SHARING, "full"]) == 10
     assert two.units[FULL_SHARING, "full"][3].score.tolist() == whole.units[FULL_SHARING, "full"][6].score.tolist()

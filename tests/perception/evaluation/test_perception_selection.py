@@ -9,32 +9,31 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sortie.perception import budget
-from sortie.perception.evaluation import selection
-from sortie.perception.evaluation.condition import Sharing
+from sortie.perception.evaluation import Sharing, sharing
 from sortie.perception.geometry import FULL, SMALL
 from sortie.scenarios.disc import rank_by_overlap
 
 CROSS = np.array([(0.0, 0.0), (20.0, 0.0), (0.0, 20.0), (-20.0, 0.0), (0.0, -20.0)])
-RADII = np.full(5, selection.FOOTPRINT_M)
+RADII = np.full(5, sharing.FOOTPRINT_M)
 coordinate = st.floats(-120, 120)
 
 
 def test_the_footprint_is_the_papers() -> None:
-    assert pytest.approx(42.0, abs=0.02) == selection.FOOTPRINT_M
+    assert pytest.approx(42.0, abs=0.02) == sharing.FOOTPRINT_M
 
 
 def test_overlap_is_of_the_receivers_footprint() -> None:
-    shares = selection.footprint_overlap(np.array([(0.0, 0.0), (5.0, 0.0)]), np.array([42.0, 10.0]))
+    shares = sharing.footprint_overlap(np.array([(0.0, 0.0), (5.0, 0.0)]), np.array([42.0, 10.0]))
     assert shares == pytest.approx(np.array([[1.0, (10 / 42) ** 2], [1.0, 1.0]]))
 
 
 def test_best_worst_and_all_in_a_cross() -> None:
-    overlap = selection.footprint_overlap(CROSS, RADII)
+    overlap = sharing.footprint_overlap(CROSS, RADII)
     # drone 1 is at the tip: the centre is nearest, the opposite tip farthest, equal ones go by id after the ego's
-    assert selection.choose(Sharing(0.1, "best-2"), 1, overlap[1]) == (0, 2)
-    assert selection.choose(Sharing(0.1, "worst-2"), 1, overlap[1]) == (4, 3)
-    assert selection.choose(Sharing(0.1, "all-4"), 1, overlap[1]) == (0, 2, 3, 4)
-    assert selection.choose(Sharing(0.0, "none"), 1, overlap[1]) == ()
+    assert sharing.choose(Sharing(0.1, "best-2"), 1, overlap[1]) == (0, 2)
+    assert sharing.choose(Sharing(0.1, "worst-2"), 1, overlap[1]) == (4, 3)
+    assert sharing.choose(Sharing(0.1, "all-4"), 1, overlap[1]) == (0, 2, 3, 4)
+    assert sharing.choose(Sharing(0.0, "none"), 1, overlap[1]) == ()
 
 
 @given(st.lists(st.floats(0, 1), min_size=5, max_size=5), st.integers(0, 4), st.integers(1, 4))
@@ -43,7 +42,7 @@ def test_best_and_worst_are_brute_forces(overlap: list[float], ego: int, k: int)
     row = np.array(overlap)
     peers = [i for i in range(5) if i != ego]
     by_sum = {sum(sorted(overlap[i] for i in c)) for c in itertools.combinations(peers, k)}
-    chosen = {rule: selection.choose(Sharing(0.1, f"{rule}-{k}"), ego, row) for rule in ("best", "worst", "random")}
+    chosen = {rule: sharing.choose(Sharing(0.1, f"{rule}-{k}"), ego, row) for rule in ("best", "worst", "random")}
     assert sum(sorted(overlap[i] for i in chosen["best"])) == max(by_sum)
     assert sum(sorted(overlap[i] for i in chosen["worst"])) == min(by_sum)
     for some in chosen.values():
@@ -55,21 +54,21 @@ def test_best_and_worst_are_brute_forces(overlap: list[float], ego: int, k: int)
 
 
 def test_random_peers_are_the_frames_own_and_even() -> None:
-    overlap, condition = selection.footprint_overlap(CROSS, RADII), Sharing(0.1, "random-2")
-    draws = [selection.choose(condition, 0, overlap[0], (7, n)) for n in range(3000)]
-    assert draws[5] == selection.choose(condition, 0, overlap[0], (7, 5))
+    overlap, condition = sharing.footprint_overlap(CROSS, RADII), Sharing(0.1, "random-2")
+    draws = [sharing.choose(condition, 0, overlap[0], (7, n)) for n in range(3000)]
+    assert draws[5] == sharing.choose(condition, 0, overlap[0], (7, 5))
     pairs = [draws.count(pair) for pair in itertools.combinations((1, 2, 3, 4), 2)]
     assert sum(pairs) == 3000
     assert min(pairs) > 400  # 500 expected, σ 20
-    other = [selection.choose(condition, 1, overlap[1], (7, n)) for n in range(50)]
+    other = [sharing.choose(condition, 1, overlap[1], (7, n)) for n in range(50)]
     assert len(set(other)) > 3
-    assert draws[:50] != [selection.choose(condition, 0, overlap[0], (7, n), seed=1) for n in range(50)]
+    assert draws[:50] != [sharing.choose(condition, 0, overlap[0], (7, n), seed=1) for n in range(50)]
 
 
 @pytest.mark.parametrize("peers", ["best-5", "all-3", "all-5"])
 def test_a_condition_that_does_not_fit_the_fleet(peers: str) -> None:
     with pytest.raises(ValueError, match=f"peers is '{peers}', must fit a fleet with 4 peers"):
-        selection.choose(Sharing(0.1, peers), 0, np.ones(5))
+        sharing.choose(Sharing(0.1, peers), 0, np.ones(5))
 
 
 @pytest.mark.parametrize(
@@ -84,7 +83,7 @@ overlaps = st.lists(st.one_of(st.just(0.0), st.floats(1e-6, 1)), min_size=1, max
 
 @given(st.integers(0, 20_000), overlaps, st.sampled_from(["uniform", "overlap"]))
 def test_allocation_spends_the_whole_budget(total: int, overlap: list[float], rule: str) -> None:
-    cells = selection.allocate(total, overlap, rule)
+    cells = sharing.allocate(total, overlap, rule)
     assert sum(cells) == min(total, 4096 * len(overlap))
     assert all(0 <= c <= 4096 for c in cells)
 
@@ -93,7 +92,7 @@ def test_allocation_spends_the_whole_budget(total: int, overlap: list[float], ru
 def test_allocation_is_the_fairest_there_is(total: int, weights: list[int], most: int) -> None:
     """Brute force: cell by cell to whoever is farthest below the quota, all quotas found by raising one level."""
     overlap = [w / 9 for w in weights]
-    cells = selection.allocate(total, overlap, "overlap", most)
+    cells = sharing.allocate(total, overlap, "overlap", most)
     left, quota, open_, share = (
         float(total),
         [0.0] * len(weights),
@@ -119,11 +118,11 @@ def test_allocation_is_the_fairest_there_is(total: int, weights: list[int], most
 
 
 def test_remainders_go_to_the_largest_fraction_then_to_the_first() -> None:
-    assert selection.allocate(327, [0.7, 0.7, 0.6, 0.4], "uniform") == [82, 82, 82, 81]
-    assert selection.allocate(10, [0.5, 0.25, 0.25], "overlap") == [5, 3, 2]
-    assert selection.allocate(5000, [0.9, 0.1], "overlap") == [4096, 904]
-    assert selection.allocate(10, [0.0, 0.0], "overlap") == [5, 5]
-    assert selection.allocate(16384, [0.9, 0.1], "uniform") == [4096, 4096]
+    assert sharing.allocate(327, [0.7, 0.7, 0.6, 0.4], "uniform") == [82, 82, 82, 81]
+    assert sharing.allocate(10, [0.5, 0.25, 0.25], "overlap") == [5, 3, 2]
+    assert sharing.allocate(5000, [0.9, 0.1], "overlap") == [4096, 904]
+    assert sharing.allocate(10, [0.0, 0.0], "overlap") == [5, 5]
+    assert sharing.allocate(16384, [0.9, 0.1], "uniform") == [4096, 4096]
 
 
 @settings(max_examples=40, deadline=None)
@@ -132,7 +131,7 @@ def test_sent_cells_are_brute_forces(seed: int, levels: int, with_roi: bool, cel
     rng = np.random.Generator(np.random.PCG64(seed))
     rank = rng.integers(0, levels, (2, 64, 64)).astype(np.float32)  # many ties
     first = rng.random((2, 64, 64)) < 0.1 if with_roi else None
-    order = selection.sending_order(rank, first)
+    order = sharing.sending_order(rank, first)
     for d in range(2):
         wanted = sorted(
             range(4096),
@@ -143,7 +142,7 @@ def test_sent_cells_are_brute_forces(seed: int, levels: int, with_roi: bool, cel
 
 def test_without_a_disc_the_cells_are_the_sorties() -> None:
     rank = np.random.Generator(np.random.PCG64(3)).normal(size=(1, 64, 64)).astype(np.float32)
-    order = selection.sending_order(rank)
+    order = sharing.sending_order(rank)
     for rho in (0.02, 0.1, 0.25, 1.0):
         sent = budget.select(rank[0], rho, None, 0.0, 0.0, 0.0)
         assert np.array_equal(order[0] < math.floor(rho * 4096), sent)
@@ -151,17 +150,17 @@ def test_without_a_disc_the_cells_are_the_sorties() -> None:
 
 @given(st.tuples(coordinate, coordinate, st.floats(1, 60)), st.tuples(coordinate, coordinate, st.floats(-4, 4)))
 def test_the_disc_is_the_sorties(disc: tuple, pose: tuple) -> None:
-    assert np.array_equal(selection.in_disc(np.array([pose]), disc)[0], budget.roi_mask(disc, *pose))
+    assert np.array_equal(sharing.in_disc(np.array([pose]), disc)[0], budget.roi_mask(disc, *pose))
 
 
 def test_the_disc_in_cells() -> None:
     at = np.zeros((1, 3))
-    assert selection.in_disc(at, (0.0, 0.0, 32.0), FULL).sum() == pytest.approx(314, abs=6)
-    assert selection.in_disc(at, (0.0, 0.0, 32.0), SMALL).sum() == pytest.approx(4 * 314, abs=20)
+    assert sharing.in_disc(at, (0.0, 0.0, 32.0), FULL).sum() == pytest.approx(314, abs=6)
+    assert sharing.in_disc(at, (0.0, 0.0, 32.0), SMALL).sum() == pytest.approx(4 * 314, abs=20)
 
 
 def test_bytes_are_the_papers() -> None:
-    assert selection.link_bytes([4096] * 4) == (4 * 655_360, 0)
-    assert selection.link_bytes([1024] * 4) == (4 * 163_840, 4 * 512)
-    assert selection.link_bytes([82, 82, 82, 81]) == (327 * 160, 3 * 123 + 122)
-    assert selection.link_bytes([]) == (0, 0)
+    assert sharing.link_bytes([4096] * 4) == (4 * 655_360, 0)
+    assert sharing.link_bytes([1024] * 4) == (4 * 163_840, 4 * 512)
+    assert sharing.link_bytes([82, 82, 82, 81]) == (327 * 160, 3 * 123 + 122)
+    assert sharing.link_bytes([]) == (0, 0)

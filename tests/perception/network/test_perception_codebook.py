@@ -14,7 +14,7 @@ from research.paper.instrument import CarNetView
 from research.train.codebook import CodebookRecipe, card, fit
 from sortie.perception.budget import cells_in, content_bytes
 from sortie.perception.errors import InputError
-from sortie.perception.evaluation.contract import Exchange
+from sortie.perception.evaluation.sharing import Exchange
 from sortie.perception.files import codebook_digest
 from sortie.perception.network.checkpoint import load_weights, save_weights
 from sortie.perception.network.codebook import (

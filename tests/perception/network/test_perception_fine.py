@@ -20,7 +20,7 @@ from research.benchmark.dataset import Frames
 from research.paper.instrument import CarNetInstrument, CarNetView
 from research.train.learn import _fit, draw_batch, gradients, loss_of, step_loss, targets
 from research.train.recipe import Recipe
-from sortie.perception.evaluation.contract import Exchange
+from sortie.perception.evaluation.sharing import Exchange
 from sortie.perception.network import warp
 from sortie.perception.network.checkpoint import load_weights, read_config, save_weights
 from sortie.perception.network.decode import decode

@@ -14,11 +14,10 @@ from places import ROOT
 from recording_examples import small
 
 from sortie.perception.detectors import DETECTORS, make_detector
-from sortie.perception.evaluation.condition import SINGLE, Sharing
-from sortie.perception.evaluation.contract import Exchange
-from sortie.perception.evaluation.evaluate import evaluate
+from sortie.perception.evaluation import SINGLE, Settings, Sharing, evaluate, evaluate_recording
+from sortie.perception.evaluation.recorded import RecordedInstrument, frames_of
+from sortie.perception.evaluation.sharing import Exchange
 from sortie.perception.recordings.detector import RecordedDetector
-from sortie.perception.recordings.instrument import RecordedInstrument, evaluate_recording, frames_of
 from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Share
 from sortie.scenarios.plugins.reference import PluginError, resolve
@@ -99,7 +98,9 @@ def test_frames_that_stand_still_are_told_apart_where_they_are_kept(tmp_path: Pa
     boxes = [[np.append(car, [[0.9]], axis=1)], [np.zeros((0, 6))]]
     rec = open_recording(small(tmp_path / "r.npz", pose=pose, boxes=boxes, truth=[car, car], features=None))
     aps = [
-        evaluate(RecordedInstrument(rec), frames_of(rec, [f]), [SINGLE], egos=1, store=tmp_path / "store").ap(SINGLE)
+        evaluate(RecordedInstrument(rec), frames_of(rec, [f]), [SINGLE], Settings(1), store=tmp_path / "store").ap(
+            SINGLE
+        )
         for f in (0, 1, 0)
     ]
     assert aps == [1.0, 0.0, 1.0]
@@ -248,8 +249,7 @@ def test_a_recording_flies_without_torch(tmp_path: Path) -> None:
     code = f"""
 import sys
 from sortie.perception.detectors import make_detector
-from sortie.perception.evaluation.condition import SINGLE
-from sortie.perception.recordings.instrument import evaluate_recording
+from sortie.perception.evaluation import SINGLE, evaluate_recording
 from sortie.scenarios.schema import Perception
 make_detector(None, Perception(detector="recorded", recording={str(path)!r}), 1)
 evaluate_recording({str(path)!r} and __import__("pathlib").Path({str(path)!r}), [SINGLE])

@@ -10,12 +10,13 @@ import pytest
 from perception_examples import capture
 from recording_examples import score_map, small
 
-from sortie.perception.evaluation.contract import Exchange
+from sortie.perception.evaluation import evaluate_recording
+from sortie.perception.evaluation.recorded import RecordedInstrument, content_hash, frames_of
+from sortie.perception.evaluation.sharing import Exchange
 from sortie.perception.lateness import map_weight, reach_m, still_right
 from sortie.perception.motion import Tracks
 from sortie.perception.recordings.detector import RecordedDetector
 from sortie.perception.recordings.exchange import Sent, fusion_hash, received_boxes
-from sortie.perception.recordings.instrument import RecordedInstrument, content_hash, evaluate_recording, frames_of
 from sortie.perception.recordings.recording import RecordingError, open_recording
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.scenarios.disc import Disc

@@ -23,8 +23,9 @@ from sim_examples import BASE
 import sortie
 from research.learn.learn import Lesson
 from research.paper import command as paper_command
-from sortie.perception.evaluation.condition import Sharing
+from sortie.perception.evaluation import SINGLE, Sharing
 from sortie.perception.geometry import Geometry
+from sortie.perception.metrics.bootstrap import Difference
 from sortie.perception.uncertainty import BoxErrors
 from sortie.policies.contract import PolicyError
 from sortie.policies.verification.invariants import Invariant
@@ -362,28 +363,31 @@ def test_the_doses_of_the_study(
 
 
 def test_recording(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    way = Sharing.parse("all-4@1")
+    alone, way = SINGLE, Sharing.parse("all-4@1")
     shown = SimpleNamespace(
-        conditions=[way], regions=("full_scene", "mission"), ap=lambda c, region: {"full_scene": 0.25, "mission": 0.5}[region],
-        payload_bytes={way: np.array([100.0, 300.0])}, index_bytes={way: np.array([7.0, 9.0])},
+        conditions=[alone, way], resampled="scene", groups=lambda by: np.array([1, 1, 4]),
+        ap=lambda c, region="full": {"full": 0.25, "mission": 0.5}[region],
+        gain=lambda c, over: Difference(0.0, 0.0, 0.125, 0.1, 0.2) if (c, over) == (way, alone) else None,
+        payload_bytes={alone: np.zeros(2), way: np.array([100.0, 300.0])},
+        index_bytes={alone: np.zeros(2), way: np.array([7.0, 9.0])},
     )  # fmt: skip
     at, kept = Seen(shown), Seen(True)
-    evaluated, converted = Seen(SimpleNamespace(at=at, save=kept)), Seen(Path("o"))
-    monkeypatch.setattr("sortie.perception.recordings.instrument.evaluate_recording", evaluated)
-    monkeypatch.setattr("research.uav3d.uav3d.convert", converted)
+    evaluated = Seen(SimpleNamespace(at=at, save=kept))
+    monkeypatch.setattr("sortie.perception.evaluation.evaluate_recording", evaluated)
     options = ("--fusion", "own.py:fuse", "--conditions", "single best-2@0.02", "--tau", "0.25", "--out", "m.parquet")
     assert command("recording", "evaluate", "r.npz", *options) == 0
     (path, ways), given = evaluated.args, evaluated.kwargs
     assert (path, given) == (Path("r.npz"), {"fusion": "own.py:fuse"})
     assert [w.label for w in ways] == [Sharing.parse(text).label for text in ("single", "best-2@0.02")]
     assert (at.args, kept.args) == ((0.25,), (Path("m.parquet"),))
-    assert ["all-4@1", "0.250", "0.500", "200", "8"] in table_rows(capsys.readouterr().out)
+    printed = capsys.readouterr().out
+    assert ["single", "0.250", "", "0.500", "0", "0"] in table_rows(printed)
+    assert ["all-4@1", "0.250", "+12.5 [+10.0, +20.0]", "0.500", "200", "8"] in table_rows(printed)
+    assert "interval over 2 scene(s)" in printed
     assert command("recording", "evaluate", "r.npz", "--tau", "1") == 0
     assert (at.args, evaluated.args[1]) == ((1.0,), None)
     assert command("recording", "evaluate", "r.npz", "--tau", "1.01") == 2
     assert len(evaluated.calls) == 2
-    assert command("recording", "from-uav3d", "u", "--out", "o", "--split", "train") == 0
-    assert converted.args == (Path("u"), "train", Path("o"))
 
 
 # --- studies --------------------------------------------------------------------------------------------------------

@@ -11,9 +11,8 @@ import pytest
 from recording_examples import record_flight
 from sim_examples import example
 
-from sortie.perception.evaluation.condition import SINGLE, Sharing
+from sortie.perception.evaluation import SINGLE, Sharing, evaluate_recording
 from sortie.perception.metrics.ap import average_precision
-from sortie.perception.recordings.instrument import evaluate_recording
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.accuracy import matched
 from sortie.sim.results.record import SortieRecord

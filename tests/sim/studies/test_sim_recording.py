@@ -50,9 +50,7 @@ def test_wrong_questions_are_told(tmp_path: Path) -> None:
 def test_a_threshold_that_cannot_be_is_told_before_anything_is_evaluated(
     tau: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "sortie.perception.recordings.instrument.evaluate_recording", lambda *_, **__: pytest.fail("evaluated")
-    )
+    monkeypatch.setattr("sortie.perception.evaluation.evaluate_recording", lambda *_, **__: pytest.fail("evaluated"))
     done = CliRunner().invoke(app, ["recording", "evaluate", str(small(tmp_path / "m.npz")), "--tau", tau])
     assert str(done.exception) == f"tau is {tau}, must be 0.01 to 1"
 

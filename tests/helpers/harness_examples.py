@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sortie.perception.evaluation.condition import CellsBy
-from sortie.perception.evaluation.contract import Exchange, FleetFrames
+from sortie.perception.evaluation.harness import FleetFrames
+from sortie.perception.evaluation.sharing import Exchange
 from sortie.perception.geometry import FULL, Geometry
 
 CROSS = 20.0 * np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], float)
@@ -75,7 +75,7 @@ class MadeView:
     frames: FleetFrames
     frame: int
 
-    def rank(self, by: CellsBy) -> NDArray[np.float64]:
+    def rank(self, by: str = "confidence") -> NDArray[np.float64]:
         seed = int(abs(self.frames.cars[self.frame, 0, 0]) * 1e6) + (by == "norm")
         return np.random.Generator(np.random.PCG64(seed)).random((5, 64, 64))
 
