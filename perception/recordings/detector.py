@@ -114,7 +114,7 @@ class RecordedDetector:
             est = capture.est_pose
             rank = np.zeros((CELLS, CELLS))
             if share.missing or budget.must_choose(share.rho, share.roi, *est):
-                rank = self._recording.rank(frame, capture.drone, "confidence")
+                rank = self._recording.rank(frame, capture.drone)
             cells = budget.select(rank, share.rho, share.roi, *est, share.missing)
         lies = capture if config.motion_compensation else now.get(capture.drone, capture)
         return Sent(frame, capture.drone, cells, self._pose(lies), share.weight, share.age_s)

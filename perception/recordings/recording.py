@@ -116,15 +116,12 @@ class Recording:
             raise RecordingError(f"{self.path}: features are missing, must be there to be fused or ranked by norm")
         return self._read("features", frame, drone).astype(np.float32)
 
-    def rank(self, frame: int, drone: int, by: str = "confidence") -> Floats:
-        """[64, 64] what ranks the exchanged cells: their highest confidence, or the norm of their features.
+    def rank(self, frame: int, drone: int) -> Floats:
+        """[64, 64] what ranks the exchanged cells: their highest confidence.
 
         Where no confidence was recorded a cell's is the highest score of the boxes centred in it, 0 without one.
         """
         s = self.columns_a_side
-        if by == "norm":
-            power = (self.features(frame, drone).astype(np.float64) ** 2).sum(axis=0)
-            return np.asarray(np.sqrt(power.reshape(CELLS, s, CELLS, s).sum(axis=(1, 3))))
         if "confidence" in self.large:
             plane = self._read("confidence", frame, drone).astype(np.float64)
             return np.asarray(plane.reshape(CELLS, s, CELLS, s).max(axis=(1, 3)))
