@@ -10,7 +10,7 @@ NOTEBOOKS ?= notebooks
 # compiled files are kept: otherwise each of hundreds of processes compiles what it imports, and each worker all tests
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help sortie screenshot test test-all nightly lint check format bench bench-all figures validate-ns3 ns3 mavproxy mutate clean scenarios scenarios-short notebooks outputs fuzz docs test-lowest
+.PHONY: help sortie screenshot test test-all nightly lint check format bench bench-all research figures validate-ns3 ns3 mavproxy mutate clean scenarios scenarios-short notebooks outputs fuzz docs test-lowest
 
 help: ## show this list
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -92,10 +92,13 @@ format: $(STAMP) ## format and fix what can be fixed
 	$(BIN)/ruff format .
 
 bench: $(STAMP) ## print what Sortie costs on one page, beside its peers and the last release (BENCH="--gradys PYTHON")
-	$(BIN)/python tests/benchmarks/bench_page.py $(BENCH)
+	$(BIN)/python -m research.validation.bench_page $(BENCH)
 
 bench-all: $(STAMP) ## run every benchmark, ten minutes
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only
+
+research: $(STAMP) ## run the laboratory's commands: make research RUN='paper --frames 3'
+	$(BIN)/python -m research $(RUN)
 
 figures: $(STAMP) ## measure the pages' figures again, hours in all (FIGURE=name for one; FIGURE=--list, FIGURE=--render)
 	$(BIN)/python -m research.validation.figures $(FIGURE)

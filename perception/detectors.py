@@ -251,7 +251,7 @@ DETECTORS: dict[str, DetectorKind] = {
         _recorded,
     ),
     "surrogate": DetectorKind(
-        "a fast model fitted to the torch detector by `sortie calibrate`; nothing is rendered", _surrogate
+        "a fast model fitted to the torch detector by `python -m research calibrate`; nothing is rendered", _surrogate
     ),
     "none": DetectorKind("traffic alone; boxes are counted from the scene", None),
 }

@@ -95,7 +95,7 @@ def load_errors(path: Path, weights: str) -> BoxErrors:
     """
     if not path.is_file():
         raise InputError(
-            f"{path}: nobody fitted how uncertain the boxes of {weights} are; `sortie fit errors` does, or send detections"
+            f"{path}: nobody fitted how uncertain the boxes of {weights} are; `python -m research fit errors` does, or send detections"
         )
     try:
         read = json.loads(path.read_text("utf-8"))

@@ -40,8 +40,6 @@ HOMES = {
 """Third-party libraries with one home each."""
 
 NOT_IMPORTED = {"pickle", "dill", "cloudpickle", "shelve", "marshal"}
-RESTRICTED_UNPICKLER = "research/uav3d/unpickle.py"
-"""The one file that imports pickle: it looks names up in a table of its own and refuses the rest."""
 NOT_CALLED = {"print", "eval", "exec"}
 
 
@@ -65,7 +63,9 @@ def violations(source: str, path: str) -> list[str]:
                 found.append((node, f"{room} must not import tests"))
             if top in HOMES and not any(fnmatch(path, home) for home in HOMES[top]):
                 found.append((node, f"{top} is at home in {', '.join(HOMES[top])}"))
-            if top in NOT_IMPORTED and (top, path) != ("pickle", RESTRICTED_UNPICKLER):
+            if top == "research":
+                found.append((node, f"{room} must not import research, which stands outside the product"))
+            if top in NOT_IMPORTED:
                 found.append((node, f"{top} is not used: it runs what it reads"))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in NOT_CALLED:
             found.append((node, f"{node.func.id}() is not called in a room"))
@@ -134,9 +134,44 @@ def test_a_room_keeps_to_the_rules(room: str) -> None:
     assert [line for path in files for line in violations((ROOT / path).read_text("utf-8"), path)] == []
 
 
+def internals_of(source: str) -> set[str]:
+    """The modules of `sortie` that a file imports beyond the public API."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        names = list(_imported(node))
+        if isinstance(node, ast.ImportFrom):
+            modules = [f"{node.module}.{alias.name}" for alias in node.names]
+            inner = [name for name in modules if _is_module(name)]
+            names = inner + (names if len(inner) < len(modules) else [])
+        found |= {name for name in names if name.startswith("sortie.") and _is_module(name)}
+    return found
+
+
+def _is_module(name: str) -> bool:
+    path = ROOT.joinpath(*name.split("."))
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def test_the_laboratory_uses_the_internals_that_it_lists() -> None:
+    """`research/internals.txt` has a module a line: whoever changes one of them looks into `research` as well."""
+    files = [path for path in (ROOT / "research").rglob("*.py") if path.relative_to(ROOT).parts[1] != "tests"]
+    used = set[str]().union(*(internals_of(path.read_text("utf-8")) for path in files))
+    listed = (ROOT / "research" / "internals.txt").read_text("utf-8").splitlines()
+    assert listed == sorted(listed)
+    assert used == set(listed)
+
+
+def test_internals_are_found_wherever_they_are_imported() -> None:
+    source = (
+        "import sortie\nfrom sortie import Scenario\nfrom sortie.fleet import coverage\nfrom sortie.radio import Air"
+    )
+    assert internals_of(source) == {"sortie.fleet.coverage", "sortie.radio"}
+    assert internals_of("def f():\n    from sortie.sim.folders import RunError") == {"sortie.sim.folders"}
+
+
 def test_every_package_at_the_root_is_a_room() -> None:
     packages = {path.parent.name for path in ROOT.glob("*/__init__.py")}
-    assert packages == {*MAY_IMPORT, "sortie"}
+    assert packages == {*MAY_IMPORT, "sortie", "research"}
     assert {path.name: str(path.readlink()) for path in (ROOT / "sortie").iterdir() if path.is_symlink()} == {
         room: f"../{room}" for room in MAY_IMPORT
     }
@@ -183,9 +218,13 @@ def test_every_package_at_the_root_is_a_room() -> None:
             "import yaml",
             "yaml is at home in scenarios/reading/strict_yaml.py, scenarios/reading/top_keys.py",
         ),
-        ("research/uav3d/uav3d.py", "import pickle", "pickle is not used: it runs what it reads"),
-        ("research/uav3d/unpickle.py", "import dill", "dill is not used: it runs what it reads"),
         ("sim/campaign.py", "import pickle", "pickle is not used: it runs what it reads"),
+        ("perception/recordings/recording.py", "import dill", "dill is not used: it runs what it reads"),
+        (
+            "sim/cli/recording.py",
+            "def f():\n    from research.uav3d.uav3d import convert",
+            "sim must not import research, which stands outside the product",
+        ),
         ("sim/cli/app.py", "print('done')", "print() is not called in a room"),
         ("policies/registry.py", "f = eval(name)", "eval() is not called in a room"),
         ("policies/registry.py", "exec(text)", "exec() is not called in a room"),

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import typer
+from fields_page import fields_markdown
 
 import sortie
 from sortie.scenarios.reading.load import campaigns, condition_sets, library
-from sortie.scenarios.reference import fields_markdown
 from sortie.scenarios.report_text import table
 from sortie.sim.cli.app import app as command_line
 

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from fields_page import BEGIN, END
 from pages_from_code import PAGES
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 import sortie
-from sortie.scenarios.reference import BEGIN, END
 
 NAVIGATION = """
 ```{toctree}

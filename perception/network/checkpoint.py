@@ -116,7 +116,7 @@ def read_facts(path: Path) -> dict[str, Any]:
 
 def _metadata(path: Path) -> dict[str, dict[str, Any]]:
     if not path.is_file():
-        raise InputError(f"{path}: no such weights file; `sortie train` makes one")
+        raise InputError(f"{path}: no such weights file; `python -m research train` makes one")
     try:
         with safe_open(path, framework="pt") as file:
             return {k: json.loads(v) for k, v in (file.metadata() or {}).items() if k in ("model", "sortie")}

@@ -107,7 +107,7 @@ def load_codebook(path: Path, net: CarNet) -> Codebook:
         InputError: no such file, not a codebook, or one of another network.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such codebook; `sortie fit codebook` makes one for a weights file")
+        raise InputError(f"{path}: no such codebook; `python -m research fit codebook` makes one for a weights file")
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {})["codebook"])
@@ -122,6 +122,6 @@ def load_codebook(path: Path, net: CarNet) -> Codebook:
         raise InputError(f"{path}: stages hold values that are not finite")
     if found.encoder != encoder_digest(net):
         raise InputError(
-            f"{path}: fitted to another encoder than the weights'; `sortie fit codebook` makes one for them"
+            f"{path}: fitted to another encoder than the weights'; `python -m research fit codebook` makes one for them"
         )
     return found

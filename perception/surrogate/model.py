@@ -249,7 +249,7 @@ def load(path: Path) -> Parameters:
         InputError: naming the file, and what is missing, of another shape, or not finite.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such calibration; `sortie calibrate` makes one")
+        raise InputError(f"{path}: no such calibration; `python -m research calibrate` makes one")
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
@@ -258,7 +258,7 @@ def load(path: Path) -> Parameters:
         raise InputError(f"{path}: no safetensors file: {error}") from error
     if "surrogate" not in metadata:
         raise InputError(
-            f"{path}: holds no calibration, and {path.stem}{CALIBRATION} is not beside it; `sortie calibrate` makes one"
+            f"{path}: holds no calibration, and {path.stem}{CALIBRATION} is not beside it; `python -m research calibrate` makes one"
         )
     try:
         card = json.loads(metadata["surrogate"])

@@ -2,7 +2,7 @@
 
 Each decision chooses an arm, which is a way to spend the budget: how many peers get features, who gets boxes, and
 whether maps hold everything or the mission region alone. `adaptive` chooses by rules that read mission, coverage,
-budget and links. `learned` chooses by a linear model that was fitted on simulated sorties (`sortie learn`).
+budget and links. `learned` chooses by a linear model that was fitted on simulated sorties (`python -m research learn`).
 
 `sent_budget` is the number of cells that a drone sends over all its links, as a share of full sharing. At the same
 number, no arm sends more bytes than a fixed policy.
@@ -119,7 +119,7 @@ def carried(me: Descriptor, peers: Sequence[int]) -> float:
 @among_attached
 @boxes_across_networks
 def arm(view: FleetView, *, index: int = 0, sent_budget: float = 0.25) -> list[Directive]:
-    """Always the same arm, for `sortie learn` and comparisons."""
+    """Always the same arm, for `python -m research learn` and comparisons."""
     return spend(view, ARMS[index % len(ARMS)], sent_budget, "fixed arm")
 
 
@@ -150,7 +150,7 @@ def adaptive(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
     """Rules over mission, coverage, budget and links: feature cells of a tracked region that it sees, otherwise boxes.
 
     A region is small, so even a small budget carries its important cells. Of the whole scene, boxes find more under every
-    budget (by the torch detector, `sortie learn --by-torch`). A drone that sees nothing of the region has no cells of it
+    budget (by the torch detector, `python -m research learn --by-torch`). A drone that sees nothing of the region has no cells of it
     to send. The rules are older than the moving and averaging of boxes; since then boxes are ahead in a region as
     well (docs/results/policies.md).
     """
@@ -170,7 +170,7 @@ def adaptive(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
 @among_attached
 @boxes_across_networks
 def learned(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
-    """The arm with the largest predicted gain, by a model of simulated sorties (`sortie learn`); ties go to the earlier arm."""
+    """The arm with the largest predicted gain, by a model of simulated sorties (`python -m research learn`); ties go to the earlier arm."""
     seen = features(view, sent_budget)
     z = [(x - m) / s for x, m, s in zip(seen, _MODEL.mean, _MODEL.scale, strict=True)]
     gains = [w[0] + plain_sum(a * b for a, b in zip(w[1:], z, strict=True)) for w in _MODEL.weights]
@@ -179,7 +179,7 @@ def learned(view: FleetView, *, sent_budget: float = 0.25) -> list[Directive]:
 
 
 class Model(NamedTuple):
-    """The model that `sortie learn` stores: for each arm, the AP gained over the first arm, linear in `FEATURES`."""
+    """The model that `python -m research learn` stores: for each arm, the AP gained over the first arm, linear in `FEATURES`."""
 
     mean: tuple[float, ...]
     scale: tuple[float, ...]

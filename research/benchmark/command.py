@@ -1,4 +1,4 @@
-"""`sortie bench`: make the benchmark's scenes, draw a frame, verify the files, count what the scenes contain."""
+"""`python -m research bench`: make the benchmark's scenes, draw a frame, verify the files, count what the scenes contain."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def make(
     for name, files in read(folder)["splits"].items():
         table.add_row(name, f"{len(files)}", f"{sum(f['frames'] for f in files.values())}")
     out.print(table)
-    print_written("kept in", folder, f", see a frame with: sortie bench show {folder} test 0")
+    print_written("kept in", folder, f", see a frame with: python -m research bench show {folder} test 0")
 
 
 @app.command()

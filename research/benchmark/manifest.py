@@ -64,7 +64,7 @@ def read(folder: Path) -> dict[str, Any]:
     try:
         data = json.loads(path.read_text("utf-8"))
     except FileNotFoundError:
-        raise BenchmarkError(f"{path}: missing, make the benchmark with sortie bench make") from None
+        raise BenchmarkError(f"{path}: missing, make the benchmark with python -m research bench make") from None
     except (OSError, ValueError) as error:
         raise BenchmarkError(f"{path}: cannot be read: {error}") from error
     if not isinstance(data, dict) or not {"format", "key", "benchmark", "splits"} <= data.keys():

@@ -181,7 +181,7 @@ def card(parameters: Parameters, verdict: CalibrationVerdict) -> str:
     kept = [o.kept for o in verdict.orders if o.significant]
     return f"""# Calibration {f["id"]}
 
-Made by `sortie calibrate --weights {f["file"]} --scenes {f["scenes"]} --held-out {f["held_out"]} --seed {f["seed"]}` from the torch detector's own runs
+Made by `python -m research calibrate --weights {f["file"]} --scenes {f["scenes"]} --held-out {f["held_out"]} --seed {f["seed"]}` from the torch detector's own runs
 with fusion {f["fusion"]}, weights {f["weights"]}. Boxes below a score of {parameters.floor:g} are left out: AP loses at most {LOST:g} by it.
 
 ## AP@0.5 on held-out scenes

@@ -1,4 +1,4 @@
-"""`sortie calibrate`: fit the surrogate to the torch detector, and compare both on whole sorties."""
+"""`python -m research calibrate`: fit the surrogate to the torch detector, and compare both on whole sorties."""
 
 from __future__ import annotations
 

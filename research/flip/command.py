@@ -1,4 +1,4 @@
-"""`sortie study`: train, measure and report the study of why the flip exists."""
+"""`python -m research study`: train, measure and report the study of why the flip exists."""
 
 from __future__ import annotations
 
@@ -71,15 +71,15 @@ def study_run(
             rows += some
             out.print(f"{job} measured")
     if not rows:
-        raise RunError(f"{work}: no network of the study has weights yet; `sortie study train` makes them")
+        raise RunError(f"{work}: no network of the study has weights yet; `python -m research study train` makes them")
     path = work / TABLE
     _write_table(to_table(rows), path)
-    print_written("kept in", path, f", write the report with: sortie study report {path}")
+    print_written("kept in", path, f", write the report with: python -m research study report {path}")
 
 
 @study.command("report")
 def study_report(
-    table: Annotated[Path, typer.Argument(help="Rows of `sortie study run`.")] = Path("runs/study") / TABLE,
+    table: Annotated[Path, typer.Argument(help="Rows of `python -m research study run`.")] = Path("runs/study") / TABLE,
     out_dir: Annotated[Path, typer.Option("--out", help="Folder for README.md, figures and the rows.")] = Path(
         "research/pages/study"
     ),

@@ -85,7 +85,7 @@ def report(plan: StudyPlan, rows: Sequence[StudyRow], figures: Sequence[tuple[st
     if missing:
         lines += [
             "",
-            f"Not trained yet, so not in these tables: {', '.join(missing)}. `sortie study train` trains them.",
+            f"Not trained yet, so not in these tables: {', '.join(missing)}. `python -m research study train` trains them.",
         ]
     return "\n".join(lines) + "\n"
 

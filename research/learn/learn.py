@@ -194,6 +194,8 @@ def _falls_through_zero(lessons: list[Lesson]) -> float:
 def save(path: Path, lessons: list[Lesson], seed: int, *, by_torch: bool = False, sets: Sequence[str] = ()) -> None:
     """Write the fit, with how it was made."""
     fitted = fit(lessons)
-    command = shlex.join(["sortie", "learn", *["--by-torch"] * by_torch, *(w for one in sets for w in ("--set", one))])
+    command = shlex.join(
+        ["python", "-m", "research", "learn", *["--by-torch"] * by_torch, *(w for one in sets for w in ("--set", one))]
+    )
     about = f"{command}, {len(lessons)} conditions of seed {seed}, each under {len(ARMS)} arms, {SECONDS} s"
     write_text(path, json.dumps({"about": about, **fitted}, indent=1) + "\n")

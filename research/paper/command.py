@@ -1,4 +1,4 @@
-"""`sortie paper`: the command."""
+"""`python -m research paper`: the command."""
 
 from __future__ import annotations
 
@@ -238,7 +238,7 @@ def _command(context: typer.Context) -> str:
         ):
             shown = value.name if isinstance(value, Path) else value
             given.append(parameter.opts[0] if value is True else f"{parameter.opts[0]} {shown}")
-    return " ".join(["sortie paper", *given])
+    return " ".join(["python -m research paper", *given])
 
 
 def _relative(path: Path, folder: Path) -> str:

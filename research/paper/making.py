@@ -1,4 +1,4 @@
-"""`sortie paper`: measure the paper's claims on the benchmark and on a flown sortie, and write the verdicts."""
+"""`python -m research paper`: measure the paper's claims on the benchmark and on a flown sortie, and write the verdicts."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class PaperSettings:
     """The benchmark's."""
     workers: int = 1
     """Frames worked on side by side; nothing but time depends on it."""
-    command: str = "sortie paper"
+    command: str = "python -m research paper"
     """As it was given, for the report."""
     live: Path | None = None
     """What `sortie live --out` wrote: it answers two claims that a simulated flight cannot."""

@@ -121,7 +121,7 @@ def card(name: str, facts: dict[str, Any]) -> str:
     """The codebook's card, Markdown."""
     bench = facts["benchmark"]
     command = (
-        f"sortie fit codebook --weights {facts['weights']} --out {name} --stages {facts['stages']} "
+        f"python -m research fit codebook --weights {facts['weights']} --out {name} --stages {facts['stages']} "
         f"--scenes {facts['scenes']} --iterations {facts['iterations']} --seed {facts['seed']}"
         + (f" --bench-seed {bench['seed']}" if bench["seed"] else "")
     )

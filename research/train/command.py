@@ -1,4 +1,4 @@
-"""`sortie train`: the command."""
+"""`python -m research train`: the command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sortie fit`: what representations need beside a network's weights: a codebook, and how uncertain boxes are."""
+"""`python -m research fit`: what representations need beside a network's weights: a codebook, and how uncertain boxes are."""
 
 from __future__ import annotations
 
@@ -84,9 +84,9 @@ def fit_errors(
 ) -> None:
     """Fit how uncertain the places of boxes are, by score and distance, so that drones can send covariances."""
     if boxes is Boxes.surrogate:
-        refuse(context, ("bench_seed", "bench_dir"), "sortie fit errors torch")
+        refuse(context, ("bench_seed", "bench_dir"), "python -m research fit errors torch")
     else:
-        refuse(context, ("towns",), "sortie fit errors surrogate")
+        refuse(context, ("towns",), "python -m research fit errors surrogate")
     from research.train import box_errors
     from sortie.perception.uncertainty import errors_text
     from sortie.scenarios.shipped import ERRORS, beside
@@ -122,7 +122,7 @@ def fit_errors(
     fitted = box_errors.calibration(model, found)
     given = {"weights": weights, "out": out_file} | drawn
     flags = [part for k, v in given.items() if v is not None for part in (f"--{k}", str(v))]
-    command = shlex.join(["sortie", "fit", "errors", boxes.value, *flags])
+    command = shlex.join(["python", "-m", "research", "fit", "errors", boxes.value, *flags])
     made = {"command": command, "boxes_of": path.name, "boxes": fitted.boxes}
     write_text(target, errors_text(model, made))
     out.print(

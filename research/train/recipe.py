@@ -86,7 +86,7 @@ def command(recipe: dict[str, Any], model: dict[str, Any], bench_seed: int, out:
     names = {"half_extent_m": "range", "image_px": "image-px"}
     flags += [f"--{names.get(n, n)} {v}" for n, v in model.items() if v != usual.get(n, v)]
     flags += [f"--bench-seed {bench_seed}"] if bench_seed else []
-    return " ".join(["sortie train", *flags, "--out", out])
+    return " ".join(["python -m research train", *flags, "--out", out])
 
 
 def benchmark_root() -> Path:

@@ -1,4 +1,4 @@
-"""Train the detector: what `sortie train` runs.
+"""Train the detector: what `python -m research train` runs.
 
 Encoder, fusion and head learn together on the benchmark's train split; a third of the supervised outputs are
 single-drone, so that the head works without peers. Every batch follows from (seed, step), checkpoints are

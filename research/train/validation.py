@@ -160,7 +160,7 @@ Weights of `perception/network/model.py`, float32: {", ".join(f"{k} {v}" for k, 
 {made}
 
 **Data**: {last["scenes"] * SIZES["train"][1]} fleet-frames of five drones in {last["scenes"]} scenes, the train split of benchmark
-`{bench["key"]}` (seed {bench["seed"]}, {bench["density"]} density, ±{bench["half_extent_m"]:g} m; `sortie bench make{asked}`); no outside data.{varied}
+`{bench["key"]}` (seed {bench["seed"]}, {bench["density"]} density, ±{bench["half_extent_m"]:g} m; `python -m research bench make{asked}`); no outside data.{varied}
 **Learning**: {last["batch"]} frames a step, AdamW, one cycle; mirrored and turned by quarters. In each frame {EGOS} drones fuse everyone
 present (two to five) and one is alone, so a third of the supervised outputs are single-drone: the head works without peers.
 {dropped}

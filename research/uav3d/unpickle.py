@@ -2,7 +2,7 @@
 
 A pickle is a program: it may name any function and call it. Here a name is looked up in a short table of stand-ins,
 never imported, and the stand-ins build arrays of numbers and text only, with sizes that their bytes confirm. It is
-the one file of the project that imports `pickle` (a test holds it to that).
+the one file of the project that imports `pickle`; a test refuses it in every room.
 
 A few bytes can still ask for gigabytes, or for nesting that no stack holds. So a file is first read in a process of its
 own, with limits of memory, time and depth. It is read here only if that went well.
@@ -38,7 +38,6 @@ MEMORY_BYTES, MEMORY_A_BYTE = 512 * 2**20, 40
 """Memory for a file's objects: a part of its own, and a share of the file's size."""
 TIME_S, TIME_A_MEGABYTE_S = 30, 1
 """Processor time for a file, in the same way."""
-_BEGIN = "from research.uav3d.unpickle import try_out; try_out()"
 
 
 class UnpickleError(SortieError):
@@ -89,7 +88,7 @@ def try_out() -> None:
 
 def _ensure_within_limits(data: bytes) -> None:
     """Refuse a pickle that takes too much memory, time or depth, before it is read in this process."""
-    done = subprocess.run([sys.executable, "-P", "-c", _BEGIN], input=data, capture_output=True, check=False)
+    done = subprocess.run([sys.executable, "-P", __file__], input=data, capture_output=True, check=False)
     if done.returncode == -signal.SIGXCPU:
         raise UnpickleError(f"takes more than {_seconds_for(data)} s to read, is damaged or no recording")
     if done.returncode < 0:  # a stack that is too small, or memory
@@ -277,3 +276,7 @@ _TABLE: dict[tuple[str, str], _StandIn] = {
     ("builtins", "frozenset"): _listed(frozenset),
     ("collections", "OrderedDict"): _listed(dict),
 }
+
+
+if __name__ == "__main__":
+    try_out()

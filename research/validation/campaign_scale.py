@@ -1,8 +1,8 @@
 """What campaigns cost by their number of runs: time, the driver's memory, the store's size; and what a million would cost.
 
-    python research/validation/campaign_scale.py                           campaigns of 100, 300, 1,000, 3,000 and 10,000 runs
-    python research/validation/campaign_scale.py --runs 100 300 1000       of these
-    python research/validation/campaign_scale.py --rows 100000             a driver that stores this many rows without flights
+    python -m research.validation.campaign_scale                           campaigns of 100, 300, 1,000, 3,000 and 10,000 runs
+    python -m research.validation.campaign_scale --runs 100 300 1000       of these
+    python -m research.validation.campaign_scale --rows 100000             a driver that stores this many rows without flights
 
 Each campaign flies sorties of one second with two drones and no detector, by `workers=1`, in a process of its own. A line
 a + b × runs is fitted to every quantity, with errors relative to it, and printed at a million runs. The driver alone is
@@ -137,7 +137,14 @@ def drive(runs: int, flown: bool) -> Cost:
 
 def measure(runs: int, flown: bool = True) -> Cost:
     """One campaign, in a process of its own."""
-    command = [sys.executable, __file__, "--drive", str(runs), *([] if flown else ["--made-up"])]
+    command = [
+        sys.executable,
+        "-m",
+        "research.validation.campaign_scale",
+        "--drive",
+        str(runs),
+        *([] if flown else ["--made-up"]),
+    ]
     cost = Cost(**json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout))
     sys.stderr.write(f"{cost}\n")
     return cost

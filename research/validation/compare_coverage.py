@@ -1,6 +1,6 @@
 """How often the 95 % interval of `sortie compare --seeds 8` covers the difference that it estimates.
 
-    python research/validation/compare_coverage.py [WORKERS]    # flies what compare_coverage.csv lacks
+    python -m research.validation.compare_coverage [WORKERS]    # flies what compare_coverage.csv lacks
     make figures FIGURE=coverage                             # counts, for research/pages/coverage.md
 
 The plan, written before anything was flown:

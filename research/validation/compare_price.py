@@ -1,7 +1,7 @@
 """What ±1 AP point between three policies costs by the torch detector, with and without the surrogate as control variate.
 
-    python research/validation/compare_price.py torch [K N]   # flies what compare_price.csv lacks, seeds K, K + N, … of the plan
-    python research/validation/compare_price.py surrogate     # the same for the surrogate's sorties
+    python -m research.validation.compare_price torch [K N]   # flies what compare_price.csv lacks, seeds K, K + N, … of the plan
+    python -m research.validation.compare_price surrogate     # the same for the surrogate's sorties
     make figures FIGURE=price                              # works the figures out, for research/pages/price.md
 
 The plan, written before anything of it was flown:

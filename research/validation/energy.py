@@ -13,12 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from research.validation.stored import Column, Table
-from sortie.fleet.energy.battery import CAUSES, FleetBatteries
-from sortie.fleet.flight.rotor import figure_of_merit, momentum_power_w, rotor_power_w
-from sortie.fleet.logs.dataflash import read_dataflash
-from sortie.fleet.logs.flightlog import FlightLog, read_log
-from sortie.fleet.logs.identify import (
+from research.validation.identify import (
     electric_power_w,
     hovering,
     identify_pack,
@@ -26,6 +21,11 @@ from sortie.fleet.logs.identify import (
     stated_pack,
     voltage_error,
 )
+from research.validation.stored import Column, Table
+from sortie.fleet.energy.battery import CAUSES, FleetBatteries
+from sortie.fleet.flight.rotor import figure_of_merit, momentum_power_w, rotor_power_w
+from sortie.fleet.logs.dataflash import read_dataflash
+from sortie.fleet.logs.flightlog import FlightLog, read_log
 from sortie.scenarios.schema import Airframe, Battery, Polarisation
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,8 +1,8 @@
 """Every measured figure of the pages: the list, and the command that measures and renders them (`make figures`).
 
-    python research/validation/figures.py [NAME …]     measure these, or all of them, cheapest first, and render the pages
-    python research/validation/figures.py --list       names, and how many minutes each takes on two cores
-    python research/validation/figures.py --render     write the stored tables into the pages; measures nothing
+    python -m research.validation.figures [NAME …]     measure these, or all of them, cheapest first, and render the pages
+    python -m research.validation.figures --list       names, and how many minutes each takes on two cores
+    python -m research.validation.figures --render     write the stored tables into the pages; measures nothing
 
 What is measured goes to research/tables/NAME.json (`stored.py`). A page shows a table where it has its markers.
 """
@@ -133,7 +133,7 @@ def _fusion_methods() -> Tables:
 
 
 def _representations() -> Tables:
-    """Needs the codebook and the box errors that lie beside the shipped weights (`sortie fit`)."""
+    """Needs the codebook and the box errors that lie beside the shipped weights (`python -m research fit`)."""
     from research.validation import representations
 
     return representations.tables(ROOT / "research/pages/representations.png", ROOT / "runs/bench")
@@ -183,14 +183,12 @@ def _radio_scale() -> Tables:
 
 
 def _ns3() -> Tables:
-    sys.path.insert(0, str(ROOT / "research/validation/ns3"))
     from research.validation.ns3 import wifi_compare
 
     return wifi_compare.tables()
 
 
 def _ns3_drawn() -> Tables:
-    sys.path.insert(0, str(ROOT / "research/validation/ns3"))
     from research.validation.ns3 import wifi_drawn
 
     return {"ns3_drawn": wifi_drawn.table(seed=20261124, plans=12)}
@@ -383,7 +381,7 @@ def _learned_example() -> Tables:
 
 
 def _arms() -> Tables:
-    """The training conditions of `sortie learn --by-torch`, which fits the policy `learned`.
+    """The training conditions of `python -m research learn --by-torch`, which fits the policy `learned`.
 
     Planned before they were flown with averaged boxes, the default now: the same 100 conditions of seed 0. Expected: boxes to
     all gain more than with suppressed boxes at every budget and in both phases, with whole intervals above zero in each of the
@@ -412,7 +410,7 @@ def _arms() -> Tables:
 
 
 def _surrogate_in_flight() -> Tables:
-    """As `sortie calibrate --fly conditions_fourth --towns 10`; a run that was cut off goes on after its last condition."""
+    """As `python -m research calibrate --fly conditions_fourth --towns 10`; a run that was cut off goes on after its last condition."""
     from research.calibrate.in_flight import REGIONS, ConditionAp, flights, means
     from sortie.perception.surrogate.model import SHIPPED
     from sortie.sim.identity import codes_here
@@ -550,7 +548,7 @@ def _fine_flights() -> Tables:
 
 
 def _survey() -> Tables:
-    """As `sortie bench survey --scenes 40`."""
+    """As `python -m research bench survey --scenes 40`."""
     from research.benchmark.dataset import SIZES, Benchmark
     from research.benchmark.survey import by_style, survey
 
@@ -595,7 +593,7 @@ def _doses() -> Tables:
 
 
 def _paper_seeds() -> Tables:
-    """`sortie paper` on other benchmarks and with other weights, beside research/pages/paper."""
+    """`python -m research paper` on other benchmarks and with other weights, beside research/pages/paper."""
     from research.paper import rows
 
     weights = ROOT / "research/flip/weights"
@@ -644,7 +642,7 @@ def _compare() -> Tables:
 
 
 def _coverage() -> Tables:
-    """From the stored sorties; `python research/validation/compare_coverage.py` flies those that are missing."""
+    """From the stored sorties; `python -m research.validation.compare_coverage` flies those that are missing."""
     from research.validation import compare_coverage
 
     return {"coverage": compare_coverage.table()}
@@ -673,7 +671,7 @@ def _hysteresis() -> Tables:
 
 
 def _overhead() -> Tables:
-    """As `sortie overhead`."""
+    """As `python -m research overhead`."""
     from research.overhead.overhead import FLEETS, SCENARIO, SECONDS, measure
 
     rows = []
@@ -871,7 +869,8 @@ def _study_section() -> str:
 
 
 def _fields_section() -> str:
-    from sortie.scenarios.reference import fields_markdown
+    sys.path.insert(0, str(ROOT / "docs/site"))
+    from fields_page import fields_markdown
 
     return fields_markdown().strip()
 

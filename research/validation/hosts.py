@@ -1,7 +1,7 @@
 """Fly a campaign on a cluster of hosts with addresses of their own; cut hosts off, let others join, and compare the tables.
 
-    python research/validation/hosts.py                  every trial below, by dask's own time-outs
-    python research/validation/hosts.py cut blip         these trials
+    python -m research.validation.hosts                  every trial below, by dask's own time-outs
+    python -m research.validation.hosts cut blip         these trials
 
 Four network namespaces are the hosts. Each has an address on a bridge, and they share the file system: `head` has the
 scheduler, `desk` the command `sortie campaign --scheduler`, `first` and `second` have workers. A trial passes when

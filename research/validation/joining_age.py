@@ -17,7 +17,7 @@ One thing was changed after the first fit. `sigma0` cannot be read from boxes th
 likelihood fell to zero and was flat), so it is measured: the root mean square, over both axes, of how far off right boxes
 lie at age 0. `speed` and `moving` are fitted with it.
 
-    python research/validation/joining_age.py     # prints the fit, half a minute
+    python -m research.validation.joining_age     # prints the fit, half a minute
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Kill a campaign's processes at random moments, start-up included, and see that nothing is lost.
 
-    python research/validation/kill_campaign.py --kills 40
+    python -m research.validation.kill_campaign --kills 40
 
 Each trial starts a campaign in a new folder: with one worker, with two, or on a dask cluster that is joined. It kills the
 driver, a worker or the scheduler with SIGKILL or SIGTERM. Then the same command runs to the end. A trial passes when

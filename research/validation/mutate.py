@@ -1,7 +1,7 @@
 """Mutation testing of the files that decide figures: small changes of code, one at a time, that a test must notice.
 
     make mutate                                       a sample of every room, in a quarter of an hour or two
-    python research/validation/mutate.py --room fleet --sample 0        every change of one room, hours
+    python -m research.validation.mutate --room fleet --sample 0        every change of one room, hours
 
 The changes are those of cosmic-ray's operators: another operator, comparison or number, a condition turned round, a loop
 that ends at once. cosmic-ray's own runner changes the files in place and gives all of them one test command. Here the

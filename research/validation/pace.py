@@ -1,8 +1,8 @@
 """How fast sorties fly: by the number of drones, for an hour of a small fleet, and in a campaign on two cores.
 
-    python research/validation/pace.py                 measure and print everything (`make figures FIGURE=pace` for the page)
-    python research/validation/pace.py fleet 100 0.2 worked    one fleet: 100 drones on a square of 0.2 km, policy `worked`
-    python research/validation/pace.py hour            one of the other parts: hour, parts, campaign RUNS
+    python -m research.validation.pace                 measure and print everything (`make figures FIGURE=pace` for the page)
+    python -m research.validation.pace fleet 100 0.2 worked    one fleet: 100 drones on a square of 0.2 km, policy `worked`
+    python -m research.validation.pace hour            one of the other parts: hour, parts, campaign RUNS
 
 Each fleet flies `track_target` without a detector in a process of its own. Its first simulated second is left out, because
 drones meet in it. Times are processor times, but for the campaign's.
@@ -143,7 +143,7 @@ def campaign(runs: int) -> dict[str, float]:
 
 def elsewhere(*words: object) -> dict[str, float]:
     """What this script finds in a process of its own."""
-    command = [sys.executable, __file__, "--json", *map(str, words)]
+    command = [sys.executable, "-m", "research.validation.pace", "--json", *map(str, words)]
     found: dict[str, float] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
     sys.stderr.write(f"{' '.join(map(str, words))}: {found}\n")
     return found

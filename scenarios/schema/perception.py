@@ -79,7 +79,7 @@ class Perception(Section):
     )
     codebook: str | None = Field(
         None,
-        description="A safetensors file by which features become codes (`sortie fit codebook`); left out, the one that lies beside the weights.",
+        description="A safetensors file by which features become codes (`python -m research fit codebook`); left out, the one that lies beside the weights.",
     )
     code_bytes: int = Field(10, ge=1, le=20, description="Bytes of a feature cell that is sent as a code.")
     recording: str | None = Field(

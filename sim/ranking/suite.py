@@ -99,7 +99,7 @@ def draw_conditions(version: int, draw: int = 0) -> list[Condition]:
     budgets = _spread(rng, count, *np.log(BUDGETS))
     charges, radii, spacings = (_spread(rng, count, *ends) for ends in (CHARGED, (20, 50), (15, 25)))
     sizes, shapes, styles = (_shared_out(rng, count, values) for values in (SIZES, SHAPES, STYLES))
-    towns = rng.choice(10**6, count, replace=False) + 2 * 10**6  # beyond what `sortie learn` draws
+    towns = rng.choice(10**6, count, replace=False) + 2 * 10**6  # beyond what `python -m research learn` draws
     found = []
     for k, (mission, trouble) in enumerate(kinds):
         changed = [

@@ -16,6 +16,8 @@ from places import ROOT
 
 from sortie.sim.identity import code_version
 
+pytestmark = pytest.mark.slow
+
 NOT_SOURCES = shutil.ignore_patterns(
     ".git", ".venv*", ".*_cache", "__pycache__", "runs", "build", "dist", "*.egg-info", ".hypothesis"
 )
@@ -86,12 +88,10 @@ def test_it_is_the_wheel_that_is_imported_and_its_code_is_this_code(project: Pat
     assert told.split()[-1] == code_version()
 
 
-@pytest.mark.slow
 def test_the_projects_own_tests_run_and_so_do_its_scenarios(project: Path) -> None:
     assert "2 passed" in run(project, "-m", "pytest", "-p", "no:cacheprovider")
 
 
-@pytest.mark.slow
 def test_a_policy_that_imports_the_projects_own_package_flies(project: Path) -> None:
     done = run(
         project, "-m", "sortie", "fly", "mine.yaml", "--policy", "mine.py:decide", "--no-recording", "--out", "runs/a"

@@ -13,6 +13,8 @@ from missing_libraries import path_without
 
 from sortie.sim.export.foxglove import LAYOUT
 
+pytestmark = pytest.mark.slow
+
 RUN = """
 import sys
 
@@ -74,7 +76,6 @@ NEEDY = {
     ("import", "flown.tlog"): MAVLINK,
     ("export", "a", "--mcap", "--replace"): ROS,
     ("live", "track_target", "--mavlink", "udpin:127.0.0.1:14550"): MAVLINK,
-    ("paper",): "error: torch is missing: pip install 'sortie-sim[torch]'\n",
     ("fly", "track_target", "--out", "b"): "error: perception.detector is torch, which is not installed: "
     "pip install 'sortie-sim[torch]', or take surrogate\n",
 }

@@ -20,6 +20,8 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Share
 from sortie.scenarios.schema import Perception, Scene
 
+pytestmark = pytest.mark.slow
+
 ROI = (10.0, 20.0, 32.0)
 QUESTIONS: dict[str, tuple[float, tuple[float, float, float] | None] | None] = {
     "alone": None,

@@ -16,6 +16,8 @@ from sortie.fleet.peers import PeerTable
 from sortie.fleet.plane import DroneStatus, PlaneRules
 from sortie.scenarios.schema import Battery, Fleet, Route
 
+pytestmark = pytest.mark.slow
+
 KEY = bytes(range(32))
 ROUTE = Route(waypoints_m=((0, 0), (200, 0), (200, 150), (0, 150)))
 

@@ -27,6 +27,8 @@ from sortie.perception.network.warp import warp
 from sortie.perception.types import Boxes
 from sortie.scenarios.intervals import resamples
 
+pytestmark = pytest.mark.slow
+
 EGOS = [e for e in range(5) for p in range(5) if p != e]
 PEERS = [p for e in range(5) for p in range(5) if p != e]
 POSES = torch.tensor([(0.0, 0.0, 0.1), (20.0, 1.0, 0.12), (0.0, 20.0, 0.1), (-20.0, 0.5, 0.09), (1.0, -20.0, 0.1)])

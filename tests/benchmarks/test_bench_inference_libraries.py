@@ -25,6 +25,8 @@ from sortie.perception.network.model import CarNet, colours
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Perception, Scene
 
+pytestmark = pytest.mark.slow
+
 Forward = Callable[[Tensor], Tensor]
 Parts = tuple[Forward, Forward]
 """Encoder, uint8 [1, 4, 256, 256] → [1, 80, 64, 64], and head, → [1, 8, 128, 128]: apart, as the exchange lies between them."""
@@ -182,7 +184,6 @@ def threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # torch's compiler warns of its own calls
 @pytest.mark.parametrize("way", WAYS)
 def test_five_forward_passes(benchmark: Any, tmp_path: Path, way: str) -> None:

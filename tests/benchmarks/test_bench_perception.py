@@ -23,6 +23,8 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Share
 from sortie.scenarios.schema import Perception, Scene
 
+pytestmark = pytest.mark.slow
+
 FLEET = cross(10.0, 20.0, 0.3)
 
 

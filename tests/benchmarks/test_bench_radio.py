@@ -12,6 +12,8 @@ import simpy
 from sortie.radio import Air
 from sortie.radio.settings import AirSettings
 
+pytestmark = pytest.mark.slow
+
 CROSS_M = np.array([[0, 0, 60], [20, 0, 60], [-20, 0, 60], [0, 20, 60], [0, -20, 60]], float)
 FRAMES = 1200
 

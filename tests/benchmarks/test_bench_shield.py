@@ -21,6 +21,8 @@ from sortie.policies.verification.enforced import put_right
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.shield import enforce
 
+pytestmark = pytest.mark.slow
+
 LINES = {
     "ten lines": """
         when battery < 0.9: rate_hz <= 5

@@ -19,6 +19,8 @@ from sortie.scenarios.reading.load import load
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build, fly, run_sortie
 
+pytestmark = pytest.mark.slow
+
 JAMMED = "events=[{kind: jam, at_s: 0, position_m: [0, 0, 2000], power_dbm: 0}]"
 
 
@@ -98,7 +100,6 @@ def test_importing(benchmark: BenchmarkFixture, what: str) -> None:
     assert done.returncode == 0
 
 
-@pytest.mark.slow
 @pytest.mark.benchmark(group="sortie of 120 s, five drones, torch detector at 2 Hz")
 @pytest.mark.parametrize("policy", ["worked", "silence"])
 def test_with_the_detector(benchmark: BenchmarkFixture, policy: str, request: pytest.FixtureRequest) -> None:

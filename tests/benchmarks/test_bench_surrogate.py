@@ -15,6 +15,8 @@ from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Perception, Scene
 from sortie.sim.engine.sortie import run_sortie
 
+pytestmark = pytest.mark.slow
+
 Moments = list[list[tuple[Capture, list[Share]]]]
 
 

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from research.benchmark.visibility import in_a_camera, past_houses, past_trees
 from sortie.fleet import coverage_loops
 from sortie.fleet.chart import Chart
 from sortie.fleet.coverage import (
@@ -25,7 +24,7 @@ from sortie.fleet.coverage import (
     unpack_grid,
     views,
 )
-from sortie.perception.geometry import FOCAL_PX, FULL, USUAL, Cameras
+from sortie.perception.geometry import FOCAL_PX, FULL, HALF_H, HALF_V, USUAL, Cameras
 from sortie.perception.scene import height_field, sight_loops
 from sortie.perception.scene.height_field import CAR_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
@@ -100,8 +99,40 @@ def test_pixels_on_the_ground_decide_how_well() -> None:
     assert (seen(PLAIN, (5.0, 3.0, 1.2 * finest_m)) == Coverage.POOR).any()
 
 
+def in_a_camera(capture: Capture, point: np.ndarray) -> bool:
+    """Whether one of the drone's five pinholes, four around it and one downwards, shows a point."""
+    body = Rotation.from_quat(capture.orientation_xyzw).inv().apply(point - np.array(capture.position_m))
+    pitch, shown = math.radians(USUAL.pitch_deg), False
+    for turn in (*np.arange(4) * np.pi / 2, None):
+        ahead = (
+            np.array([0, 0, -1.0])
+            if turn is None
+            else np.array([math.cos(turn) * math.cos(pitch), math.sin(turn) * math.cos(pitch), -math.sin(pitch)])
+        )
+        side = np.array([0, 1.0, 0]) if turn is None else np.array([-math.sin(turn), math.cos(turn), 0])
+        away, right, up = body @ ahead, body @ side, body @ np.cross(ahead, side)
+        shown |= bool(away > 0 and abs(right) < HALF_H * away and abs(up) < HALF_V * away)
+    return shown
+
+
+def past_something(at: np.ndarray, eye: np.ndarray, houses: np.ndarray, trees: np.ndarray) -> np.ndarray:
+    """[n]: whether the line from each point [n, 3] to the eye meets a house or a crown, by 400 points on each line."""
+    low, high = np.minimum(at.min(0), eye), np.maximum(at.max(0), eye)
+    houses = houses[(houses[:, :2] < high[:2]).all(1) & (houses[:, 2:4] > low[:2]).all(1)]
+    trees = trees[(trees[:, :2] - trees[:, 2:3] < high[:2]).all(1) & (trees[:, :2] + trees[:, 2:3] > low[:2]).all(1)]
+    line = at[:, None] + np.linspace(0.0, 1.0, 400)[None, :, None] * (eye - at)[:, None]
+    x, y, z = (line[..., k, None] for k in range(3))
+    x0, y0, x1, y1, height, _ = houses.T
+    tx, ty, radius, top, _ = trees.T
+    part = ((x - tx) ** 2 + (y - ty) ** 2) / radius**2
+    in_house = (x > x0) & (x < x1) & (y > y0) & (y < y1) & (z < height)
+    in_crown = (part < 1) & (z < top * (1 - 0.35 * part))
+    hit: np.ndarray = in_house.any(axis=(1, 2)) | in_crown.any(axis=(1, 2))
+    return hit
+
+
 def test_against_single_rays() -> None:
-    """Each cell by closed forms: boxes and domes for the scene, axes for the cameras. No code is shared."""
+    """Each cell by points on lines: boxes and domes for the scene, pinholes for the cameras. No code is shared."""
     scene = SceneModel(Scene(), None, BOUNDS)
     blocks = scene.town.blocks(-260, -260, 260, 260)
     houses, trees = (np.concatenate([getattr(b, of) for b in blocks]) for of in ("buildings", "trees"))
@@ -117,7 +148,7 @@ def test_against_single_rays() -> None:
             for column in range(16):
                 east, north = (view.column + column) * CELL_M, (view.row + row) * CELL_M
                 middle = np.array([[east + CELL_M / 2, north + CELL_M / 2, 0.0]])
-                if np.hypot(*(middle[0, :2] - eye[:2])) > RANGE_M or not in_a_camera(capture, middle)[0]:
+                if np.hypot(*(middle[0, :2] - eye[:2])) > RANGE_M or not in_a_camera(capture, middle[0]):
                     continue
                 at = np.array(
                     [(east + a * CELL_M, north + b * CELL_M, CAR_TOP_M) for a in (0.25, 0.75) for b in (0.25, 0.75)]
@@ -126,7 +157,7 @@ def test_against_single_rays() -> None:
                 roofed = ((px > houses[:, 0]) & (px < houses[:, 2]) & (py > houses[:, 1]) & (py < houses[:, 3])).any(
                     axis=1
                 )
-                free = ~roofed & ~past_houses(at, eye, houses) & ~past_trees(at, eye, trees)
+                free = ~roofed & ~past_something(at, eye, houses, trees)
                 expected[row, column] = (~roofed).any() and 2 * free.sum() >= (~roofed).sum()
         agree += int(((unpack_grid(view.grid) > 0) == expected).sum())
         cells += 256

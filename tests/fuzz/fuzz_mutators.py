@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import pickletools
 import re
 import struct
 import zipfile
@@ -290,32 +289,6 @@ def in_archive(draw: Random, data: bytes, corpus: Sequence[bytes]) -> bytes:
         begin = draw.randrange(30, len(packed) - 60)
         packed = packed[:begin] + flip(draw, packed[begin : begin + 40], corpus) + packed[begin + 40 :]
     return packed
-
-
-def in_opcodes(draw: Random, data: bytes, corpus: Sequence[bytes]) -> bytes:
-    """Opcodes of a pickle dropped, doubled, moved, nested or with another argument."""
-    try:
-        starts = [at for _, _, at in pickletools.genops(data)]
-    except Exception:
-        return flip(draw, data, corpus)
-    ops = [data[a:b] for a, b in zip(starts, [*starts[1:], len(data)], strict=True)]
-    at = draw.randrange(len(ops))
-    match draw.randrange(6):
-        case 0:
-            del ops[at]
-        case 1:
-            ops[at:at] = ops[at : at + draw.randint(1, 20)] * draw.choice((1, 2, 50))
-        case 2:
-            ops[at:at] = [bytes([draw.choice(pickletools.opcodes).code.encode("latin-1")[0]])]
-        case 3:
-            n = draw.choice((1, 50, 3000, 60_000))
-            ops[at:at] = [b"(" * n + b"t" * n]
-        case 4:
-            ops[at] = ops[at][:1] + number(draw, ops[at][1:], corpus)
-        case 5:
-            other = draw.randrange(len(ops))
-            ops[at], ops[other] = ops[other], ops[at]
-    return b"".join(ops)
 
 
 def in_json(draw: Random, data: bytes, corpus: Sequence[bytes]) -> bytes:

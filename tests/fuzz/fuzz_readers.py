@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import pickle
 import struct
-import subprocess
-import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import fuzz_mutators as m
 import log_examples
@@ -239,52 +233,7 @@ def _recording(path: Path) -> None:
     rec = open_recording(path)
     rec.boxes(0, 0), rec.truth(0), rec.rank(0, 0, "confidence"), rec.geometry
     if "features" in rec.large:
-        rec.features(0, 0), rec.rank(0, 0, "norm")
-
-
-def _pickles() -> list[bytes]:
-    from research.uav3d.uav3d import CAMERAS
-
-    camera = {"data_path": "a.png", "sensor2ego_translation": [1.0, 2.0, 3.0], "sensor2ego_rotation": [1.0, 0, 0, 0],
-              "cam_intrinsic": np.eye(3)}  # fmt: skip
-    info = {"token": "t", "timestamp": 1701498620885503488, "ego2global_translation": [1.0, 2.0, 0], "cams": dict.fromkeys(CAMERAS, camera),
-            "gt_boxes": np.ones((2, 7)), "gt_names": np.array(["car"] * 2), "valid_flag": np.full(2, True)}  # fmt: skip
-    whole = {"infos": [info], "metadata": {"version": "v1.0-trainval"}}
-    return [pickle.dumps(whole, protocol) for protocol in (0, 2, 4, 5)]
-
-
-def _pickle(path: Path) -> None:
-    """As the reader does it, but that the process of its own is a fork: starting Python would take nearly all the time."""
-    from research.uav3d import unpickle
-    from research.uav3d.uav3d import read_infos
-
-    with mock.patch.object(unpickle.subprocess, "run", _forked):
-        read_infos(path)
-
-
-def _forked(command: list[str], *, input: bytes, **_: object) -> subprocess.CompletedProcess[bytes]:
-    from research.uav3d import unpickle
-
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        child = os.fork()
-        if not child:
-            code = 1
-            try:
-                warnings.simplefilter("default")
-                sys.stdin = io.TextIOWrapper(io.BytesIO(input))
-                sys.stdout = io.TextIOWrapper(out, encoding="utf-8")
-                unpickle.try_out()
-                sys.stdout.flush()
-                code = 0
-            except BaseException as error:
-                err.write(f"{type(error).__name__}: {error}".encode(errors="replace"))
-                err.flush()
-            finally:
-                os._exit(code)
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        out.seek(0)
-        err.seek(0)
-        return subprocess.CompletedProcess(command, code, out.read(), err.read())
+        rec.features(0, 0), rec.rank(0, 0)
 
 
 # --- flight logs -----------------------------------------------------------------------------------
@@ -411,5 +360,4 @@ READERS: dict[str, Reader] = {
     "dataflash": _of_log("bin", _dataflashes, _odd_dataflash, m.in_messages(m.dataflash_messages)),
     "tlog": _of_log("tlog", _tlogs, list, m.in_messages(m.tlog_messages, m.tlog_joined)),
     "mcap": Reader(_log, list, _bags, suffix=".mcap"),
-    "pickle": Reader(_pickle, _pickles, list, (*[m.in_opcodes] * 5, *m.BINARY), ".pkl", limit_s=4.0),
 }

@@ -18,6 +18,8 @@ from places import ROOT
 
 from sortie.scenarios.errors import SortieError
 
+pytestmark = pytest.mark.slow
+
 DRIVER = ROOT / "tests" / "fuzz"
 
 

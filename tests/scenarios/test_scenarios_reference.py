@@ -5,48 +5,48 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import fields_page
 import pytest
 
-from sortie.scenarios import reference
 from sortie.scenarios.reading.load import library, loads
 from sortie.scenarios.schema import Scenario
 
-REMEDY = "run python -m sortie.scenarios.reference"
+REMEDY = "run python docs/site/fields_page.py"
 
 
 def test_schema_json_is_current() -> None:
-    assert (reference.HERE / "schema.json").read_text("utf-8") == reference.schema_text(), REMEDY
+    assert (fields_page.SCENARIOS / "schema.json").read_text("utf-8") == fields_page.schema_text(), REMEDY
 
 
 def test_the_readmes_tables_are_current() -> None:
-    readme = (reference.HERE / "README.md").read_text("utf-8")
-    assert readme == reference.readme_text(readme), REMEDY
-    assert reference.fields_markdown() in readme
+    readme = (fields_page.SCENARIOS / "README.md").read_text("utf-8")
+    assert readme == fields_page.readme_text(readme), REMEDY
+    assert fields_page.fields_markdown() in readme
 
 
 def test_the_readmes_example_is_a_scenario() -> None:
-    readme = (reference.HERE / "README.md").read_text("utf-8")
+    readme = (fields_page.SCENARIOS / "README.md").read_text("utf-8")
     example = readme.partition("```yaml\n")[2].partition("```")[0]
     assert loads(example).name == "over_the_valley"
 
 
 def test_every_field_of_the_schema_is_described() -> None:
-    schema = json.loads(reference.schema_text())
+    schema = json.loads(fields_page.schema_text())
     for section in (schema, *schema["$defs"].values()):
         for name, field in section["properties"].items():
             assert "description" in field or "$ref" in field or name == "kind", f"{section['title']}.{name}"
 
 
 def test_the_tables_show_bounds_and_defaults() -> None:
-    tables = reference.fields_markdown()
+    tables = fields_page.fields_markdown()
     assert "| `initial_soc` | number, > 0, ≤ 1 | 0.95 |" in tables
     assert "| `waypoints_m` | list of (2 × number, ≥ -5000, ≤ 5000) | must be given |" in tables
 
 
 def test_write_makes_both_files_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "README.md").write_text(f"# before\n{reference.BEGIN}\nstale table\n{reference.END}\nafter\n")
-    monkeypatch.setattr(reference, "HERE", tmp_path)
-    reference.write()
+    (tmp_path / "README.md").write_text(f"# before\n{fields_page.BEGIN}\nstale table\n{fields_page.END}\nafter\n")
+    monkeypatch.setattr(fields_page, "SCENARIOS", tmp_path)
+    fields_page.write()
     readme = (tmp_path / "README.md").read_text("utf-8")
     assert readme.startswith("# before\n")
     assert readme.endswith("\nafter\n")
@@ -60,7 +60,7 @@ def test_write_makes_both_files_anew(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_library_files_point_editors_to_the_schema(name: str) -> None:
     first = library()[name].read_text("utf-8").split("\n", 1)[0]
     assert first == "# yaml-language-server: $schema=../schema.json"
-    assert (library()[name].parent / "../schema.json").samefile(reference.HERE / "schema.json")
+    assert (library()[name].parent / "../schema.json").samefile(fields_page.SCENARIOS / "schema.json")
 
 
 def test_units_stand_in_names() -> None:

@@ -149,7 +149,7 @@ def fault(words: list[str]) -> str | None:
 
 
 @pytest.mark.parametrize(
-    "words", [["soar"], ["fly", "track_target", "--speed", "3"], ["bench", "break"], ["live", "--loss", "lots"]]
+    "words", [["soar"], ["fly", "track_target", "--speed", "3"], ["recording", "break"], ["live", "--loss", "lots"]]
 )
 def test_a_command_that_is_none_is_found(words: list[str]) -> None:
     assert fault(words) is not None

@@ -6,15 +6,13 @@ import base64
 import io
 import json
 import re
-import sys
 from typing import Any
 
 import pytest
 from PIL import Image
-from places import ROOT
-
-sys.path.insert(0, str(ROOT / "docs" / "site"))
 from run_notebooks import NOTEBOOKS, code_hash
+
+pytestmark = pytest.mark.slow
 
 AGAIN = "run `make outputs`"
 

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import re
 import runpy
-import sys
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
 
+import pages_from_code
 import pytest
 from places import ROOT
 
 import sortie
 from sortie.sim.cli.app import COMMANDS
 
+pytestmark = pytest.mark.slow
+
 SITE = ROOT / "docs" / "site"
-sys.path.insert(0, str(SITE))
-import pages_from_code  # noqa: E402
 
 
 def listed(text: str, folder: Path) -> Iterator[Path]:

@@ -1,7 +1,6 @@
 """Prior sharing methods as policies: each is one file here and one line in `METHODS`.
 
-A method reads only the context that the paper's table names (`sortie.policies.verification.axes` checks it). For
-everything else it does what full sharing does. A method that lacks a part of the published one is a stand-in: its name
+A method reads only the context that the paper's table names (`research/paper/axes.py` checks it). For everything else it does what full sharing does. A method that lacks a part of the published one is a stand-in: its name
 ends in `-style`, and `Method.missing` says what it lacks. Fusions of their own are values of `perception.fusion`.
 """
 

@@ -184,7 +184,9 @@ def test_a_manifest_that_does_not_fit_is_refused(copy: Path, tmp_path: Path) -> 
     assert message() == "not a benchmark's manifest, format, key, benchmark or splits is missing"
     path.write_text("{")
     assert message().startswith("cannot be read: ")
-    with pytest.raises(BenchmarkError, match=r"manifest\.json: missing, make the benchmark with sortie bench make"):
+    with pytest.raises(
+        BenchmarkError, match=r"manifest\.json: missing, make the benchmark with python -m research bench make"
+    ):
         Benchmark.at(tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""`sortie bench`, as a user meets it."""
+"""`python -m research bench`, as a user meets it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from research.__main__ import app
 from research.benchmark.command import DensityName, RangeName, SplitName
 from research.benchmark.dataset import Benchmark
 from research.benchmark.difficulty import DENSITIES, Split
 from sortie.perception.geometry import FULL, SMALL
 from sortie.scenarios.errors import SortieError
-from sortie.sim.cli.app import app
 
 run = CliRunner()
 
@@ -50,7 +50,10 @@ def test_a_frame_is_drawn(folder: Path, tmp_path: Path) -> None:
     [
         (("show", "FOLDER", "tau", "40"), "scene is 40, must be 0 to 39 in the tau split"),
         (("show", "FOLDER", "tau", "0", "--frame", "1"), "frame is 1, must be 0 to 0 in the tau split"),
-        (("verify", "nowhere"), "nowhere/manifest.json: missing, make the benchmark with sortie bench make"),
+        (
+            ("verify", "nowhere"),
+            "nowhere/manifest.json: missing, make the benchmark with python -m research bench make",
+        ),
         (("difficulty", "--weights", "nowhere"), "nowhere"),
     ],
 )

@@ -66,7 +66,7 @@ ELSEWHERE = {
     "x86_policy_ms_p50": MeasuredValue(0.08, note="a machine"),
 }
 FACTS = {
-    "command": "sortie paper", "frames": 3, "scenes": 3, "seed": 0, "weights": "made", "fingerprint": "0123456789abcdef",
+    "command": "python -m research paper", "frames": 3, "scenes": 3, "seed": 0, "weights": "made", "fingerprint": "0123456789abcdef",
     "cells_by": "confidence", "tau": 0.1, "draws": DRAWS, "version": "0", "cpu_s": 1.0, "machine": "a machine",
 }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""`sortie paper`: the plane's measures, the report's folder, the README, a frame in Rerun, the command."""
+"""`python -m research paper`: the plane's measures, the report's folder, the README, a frame in Rerun, the command."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from cli_examples import command
+from laboratory import command
 from paper_examples import ELSEWHERE, FACTS, Made, papers_world
 from rerun.chunk import RrdReader
 from sim_examples import example
@@ -298,7 +298,7 @@ def test_two_frames_from_nothing_to_a_report_and_a_recording(
     assert command("paper", "--frames", "2", "--work", "work", "--out", "out", "--readme", "R.md") == 0
     first, facts = rows.read(Path("out/paper.parquet"))
     assert {r.verdict for r in first} > {"reproduced", "not comparable", "not measurable here"}
-    assert facts["command"] == "sortie paper --frames 2"
+    assert facts["command"] == "python -m research paper --frames 2"
     assert "[out/README.md](out/README.md)" in Path("R.md").read_text()
     printed = capsys.readouterr().out
     assert "Cooperation gains" in printed

@@ -158,10 +158,13 @@ def test_the_command_repeats_the_run() -> None:
     recipe = Recipe(steps=150, seed=2, cell_dropout=0.8, unsent="zero", warm_start="full-2.safetensors")
     model = asdict(StudyConfig(decoder="deep", half_extent_m=51.2))
     assert command({**asdict(recipe), "done": 150}, model, 3, "w.safetensors") == (
-        "sortie train --steps 150 --seed 2 --cell-dropout 0.8 --unsent zero --warm-start full-2.safetensors "
+        "python -m research train --steps 150 --seed 2 --cell-dropout 0.8 --unsent zero --warm-start full-2.safetensors "
         "--range 51.2 --decoder deep --bench-seed 3 --out w.safetensors"
     )
-    assert command(asdict(Recipe()), asdict(ModelConfig()), 0, "w.safetensors") == "sortie train --out w.safetensors"
+    assert (
+        command(asdict(Recipe()), asdict(ModelConfig()), 0, "w.safetensors")
+        == "python -m research train --out w.safetensors"
+    )
 
 
 @pytest.mark.slow
@@ -187,7 +190,10 @@ def test_a_run_cut_off_and_resumed_ends_where_the_whole_one_does(tmp_path: Path)
     facts = read_facts(path)
     assert facts["runs"][0]["done"] == 2
     assert path.with_suffix(".md").read_text() == card("w.safetensors", asdict(ModelConfig()), facts)
-    assert "`sortie train --steps 2 --cell-dropout 0.5 --out w.safetensors`" in path.with_suffix(".md").read_text()
+    assert (
+        "`python -m research train --steps 2 --cell-dropout 0.5 --out w.safetensors`"
+        in path.with_suffix(".md").read_text()
+    )
     assert (path.parent / "loss.csv").read_text().startswith("step,loss,lr,ap_single,ap_full\n2,")
     assert not list(tmp_path.glob("**/*.part"))
     json.dumps(facts)
@@ -204,9 +210,9 @@ def test_a_card_names_each_run_with_the_network_that_it_made(tmp_path: Path) -> 
     publish(net, tmp_path / "third.safetensors", bench, runs, [])
     told = (tmp_path / "third.md").read_text()
     flags = "--steps 7 --warm-start first.safetensors --fusion fcooper --decoder deep"
-    assert "`sortie train --steps 5 --out first.safetensors`" in told
-    assert f"`sortie train {flags} --out second.safetensors`" in told
-    assert "`sortie train --warm-start second.safetensors --out third.safetensors`" in told
+    assert "`python -m research train --steps 5 --out first.safetensors`" in told
+    assert f"`python -m research train {flags} --out second.safetensors`" in told
+    assert "`python -m research train --warm-start second.safetensors --out third.safetensors`" in told
 
 
 def test_a_warm_start_takes_what_fits_and_names_the_rest(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

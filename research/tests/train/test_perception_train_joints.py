@@ -218,5 +218,8 @@ def test_a_box_lies_on_the_car_that_it_overlaps_most_and_its_error_is_from_that_
 def test_what_a_weights_file_says_of_its_data_is_that_benchmark_s() -> None:
     facts = of_benchmark(Benchmark(1, geometry=HALF))
     assert (facts["seed"], facts["half_extent_m"], facts["key"]) == (1, 51.2, Benchmark(1, geometry=HALF).key())
-    assert command({"steps": 500, "seed": 3}, {}, 1, "x") == "sortie train --seed 3 --bench-seed 1 --out x"
-    assert command({}, {"half_extent_m": 51.2, "fusion": "disconet"}, 0, "x") == "sortie train --range 51.2 --out x"
+    assert command({"steps": 500, "seed": 3}, {}, 1, "x") == "python -m research train --seed 3 --bench-seed 1 --out x"
+    assert (
+        command({}, {"half_extent_m": 51.2, "fusion": "disconet"}, 0, "x")
+        == "python -m research train --range 51.2 --out x"
+    )

@@ -184,7 +184,8 @@ def test_what_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
     path, slow = tmp_path / "x.pkl", "while True: pass"
     path.write_bytes(pickle.dumps(1))
     limit = "import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 2))\n"
-    monkeypatch.setattr(unpickle, "_BEGIN", limit + slow)
+    (tmp_path / "slow.py").write_text(limit + slow)
+    monkeypatch.setattr(unpickle, "__file__", str(tmp_path / "slow.py"))
     with pytest.raises(UnpickleError, match=r"x\.pkl: takes more than 30 s to read, is damaged or no recording$"):
         load_data(path)
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from research.validation import energy
+from research.validation.identify import hovering, identify_pack, stated_pack, voltage_error
 from research.validation.stored import FOLDER
 from sortie.fleet.logs.flightlog import FlightLog, read_log
-from sortie.fleet.logs.identify import hovering, identify_pack, stated_pack, voltage_error
 from sortie.scenarios.schema import Airframe
 
 needs_log = pytest.mark.skipif(not energy.LOG.is_file(), reason=f"{energy.LOG} is not here")

@@ -1,7 +1,7 @@
 """Fits the curves of `sortie.radio.rates` to the packet error rates of ns-3's tables, and stores points to test them by.
 
-    python research/validation/ns3/per_fit.py            print CURVES and LEGACY_CURVES, and the largest error of each
-    python research/validation/ns3/per_fit.py --points   write per_points.csv as well
+    python -m research.validation.ns3.per_fit            print CURVES and LEGACY_CURVES, and the largest error of each
+    python -m research.validation.ns3.per_fit --points   write per_points.csv as well
 
 The driver `per_table` prints the tables. The fit makes the largest difference in PER as small as it gets.
 """

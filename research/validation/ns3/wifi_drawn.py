@@ -1,6 +1,6 @@
 """Plans that nobody chose: drawn from a seed, and run through ns-3 and through the Air.
 
-    python research/validation/ns3/wifi_drawn.py --seed 7 --plans 12      prints the table; the seed is yours
+    python -m research.validation.ns3.wifi_drawn --seed 7 --plans 12      prints the table; the seed is yours
 
 `make figures FIGURE=ns3_drawn` stores the plans of one seed.
 """
@@ -9,13 +9,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-if __name__ == "__main__":
-    sys.path[:0] = [str(Path(__file__).parents[1])]
 
 from research.validation.ns3.wifi_compare import SEEDS, loads_table
 from research.validation.ns3.wifi_plan import FRAME_S, Case, pairs_of

@@ -1,6 +1,6 @@
 """Where the Air's processor time goes in plans that send little: each part measured with the others taken out.
 
-python research/validation/ns3/wifi_parts.py
+python -m research.validation.ns3.wifi_parts
 """
 
 from __future__ import annotations
@@ -8,15 +8,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from math import nan
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import numpy as np
 import simpy
-
-if __name__ == "__main__":
-    sys.path[:0] = [str(Path(__file__).parents[1])]
 
 from research.validation.ns3 import wifi_air
 from research.validation.ns3.wifi_compare import LOADS, QUIET

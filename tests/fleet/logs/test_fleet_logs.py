@@ -17,12 +17,10 @@ from sortie.fleet.logs.dataflash import RawLog, read_dataflash
 from sortie.fleet.logs.fields import from_dataflash, from_tlog, from_ulog
 from sortie.fleet.logs.flightlog import FlightLog, LogError, _assemble, read_log
 from sortie.fleet.logs.geodesy import geodetic
-from sortie.fleet.logs.identify import predicted_voltage
 from sortie.fleet.logs.mavlink import Transmitter, messages
 from sortie.fleet.logs.sources import local_m
 from sortie.fleet.logs.tlog import read_tlog
 from sortie.fleet.logs.ulog import read_ulog
-from sortie.scenarios.schema import Battery
 
 LOGS = Path(os.environ.get("SORTIE_FLIGHT_LOGS", Path(__file__).resolve().parents[4] / "shared/flightlogs"))
 needs_logs = pytest.mark.skipif(not (LOGS / "log171.bin").is_file(), reason=f"{LOGS} has no flight logs")
@@ -156,12 +154,6 @@ def test_what_an_autopilot_does_not_know_is_no_value() -> None:
     assert log.battery is not None
     assert log.battery.values.tolist() == [[16.0, 0.0]] * 2
     assert log.charge is None
-
-
-def test_a_pack_is_not_identified_without_a_current() -> None:
-    unmeasured = {"voltage_v": [16.0] * 3, "current_a": [-1.0] * 3, "remaining": [0.9, 0.8, 0.7]}
-    with pytest.raises(LogError, match=r"^a\.log: its current was not measured$"):
-        predicted_voltage(assembled("ULog", battery_status=unmeasured), Battery())  # type: ignore[arg-type]
 
 
 @given(st.tuples(st.floats(-3000, 3000), st.floats(-3000, 3000), st.floats(-100, 500)))

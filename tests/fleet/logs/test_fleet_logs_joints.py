@@ -19,16 +19,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink2
 
-from sortie.fleet.energy.cell import terminal_voltage_v
 from sortie.fleet.logs.dataflash import RawLog
 from sortie.fleet.logs.fields import from_dataflash, from_tlog, from_ulog, utc_at_zero_s
 from sortie.fleet.logs.flightlog import FlightLog, Series, _assemble
 from sortie.fleet.logs.ground_station import answers
-from sortie.fleet.logs.identify import hovering, predicted_voltage, voltage_error
 from sortie.fleet.logs.logtrace import _resampled, beside, context_trace, on_one_clock
 from sortie.fleet.logs.mavlink import Transmitter, messages
 from sortie.fleet.logs.vehicle import VehicleState, after
-from sortie.scenarios.schema import Battery
 
 KINDS = {"ULog": ("timestamp", from_ulog), "DataFlash": ("TimeUS", from_dataflash), "MAVLink": ("timestamp", from_tlog)}
 
@@ -224,31 +221,6 @@ def test_a_pause_is_one_by_the_usual_interval_of_its_series() -> None:
     log = flight(charge=series(time_s, np.linspace(0.9, 0.8, 8)), duration_s=22.0)
     known = ~np.isnan(context_trace(log, 1.0)["soc"])
     assert known.tolist() == [not 12 < t < 20 for t in range(23)]
-
-
-MEASURED = flight(
-    battery=series(np.arange(0.0, 10.0), [16.0, 15.8, 15.6, 15.5, 15.4, 15.3, 15.2, 15.1, 15.0, 14.9], [np.nan, *[10.0] * 9]),
-    charge=series([0.0, 10.0], [0.9, 0.7]),
-    velocity=series(np.arange(0.0, 10.0), [0, 0, 0, 3, 0, 0, 0, 0, 0, 0], [0.0] * 10, [0, 0, 0, 0, 0, -2, 0, 2, 0, 0]),
-)  # fmt: skip
-
-
-def test_a_drone_hovers_where_it_neither_moves_nor_climbs_nor_descends() -> None:
-    """Of the rows with a current, from the first time on and before the last."""
-    assert np.flatnonzero(hovering(MEASURED, 0.0, 9.0)).tolist() == [k - 1 for k in (1, 2, 4, 6, 8)]
-    assert np.flatnonzero(hovering(MEASURED, 2.0, 6.0)).tolist() == [1, 3]
-
-
-def test_a_voltage_is_predicted_from_the_charge_at_its_first_row() -> None:
-    """That is the first with a current, one second in: a tenth of the fall from 0.9 to 0.7 is over by then."""
-    pack = Battery(cells=4, capacity_wh=60)
-    predicted = predicted_voltage(MEASURED, pack)
-    time_s = np.arange(1.0, 10.0)
-    np.testing.assert_array_equal(predicted.time_s, time_s)
-    np.testing.assert_allclose(predicted.values, terminal_voltage_v(time_s, np.full(9, 10.0), pack, 0.88))
-    volts = np.array([15.6, 15.5, 15.4])
-    wanted = np.sqrt(np.mean(((predicted.values[1:4] - volts) / volts) ** 2))
-    assert voltage_error(MEASURED, pack, 2.0, 5.0) == pytest.approx(float(wanted))
 
 
 # --- vehicles ------------------------------------------------------------------------------------------

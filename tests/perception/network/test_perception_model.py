@@ -3,12 +3,10 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from research.train.learn import loss_of, targets
 from sortie.perception.geometry import CELLS, CHANNELS, FULL
 from sortie.perception.network.checkpoint import load_weights, save_weights
 from sortie.perception.network.decode import decode
@@ -134,16 +132,6 @@ def test_features_survive_the_radio_unchanged(net: CarNet) -> None:
     assert torch.equal(out, out.half().float())
 
 
-def perfect(cars: np.ndarray) -> torch.Tensor:
-    """The head output that says exactly what `targets` asks for."""
-    labels = targets([cars])
-    out = torch.zeros(7, 128, 128)
-    out[0] = torch.logit(labels.heat[0].clamp(1e-4, 1 - 1e-4))
-    order = labels.weight.argsort(stable=True)  # where two cars claim a cell the nearer one has it
-    out[1:].flatten(1)[:, labels.cell[order]] = labels.values[order].T
-    return out
-
-
 @pytest.mark.parametrize("threshold", [0.0, 0.05, 0.5])
 def test_peaks_are_the_maxima_of_their_neighbourhood(threshold: float) -> None:
     """By its definition over the whole map: at the border, where neighbours tie, and in plateaus."""
@@ -160,27 +148,6 @@ def test_peaks_are_the_maxima_of_their_neighbourhood(threshold: float) -> None:
     assert torch.allclose(
         found[:, 1], (column + 0.5 + out[2][row, column]) * FULL.head_m - FULL.half_extent_m, atol=1e-4
     )
-
-
-def test_decoding_inverts_the_targets() -> None:
-    cars = np.array([(10.3, -20.1, 4.4, 1.8, 0.3), (-99.0, 60.0, 5.5, 2.0, 1.5), (50.0, 50.0, 4.0, 1.7, -0.8)])
-    found = decode(perfect(cars), 0.5).numpy()
-    assert len(found) == 3
-    for car in cars:
-        nearest = found[np.argmin(np.hypot(*(found[:, :2] - car[:2]).T))]
-        assert nearest[:4] == pytest.approx(car[:4], abs=1e-3)
-        assert math.sin(nearest[4] - car[4]) == pytest.approx(0, abs=1e-3)
-    assert len(decode(perfect(cars), 1.0)) == 0
-
-
-def test_the_loss_knows_right_from_wrong() -> None:
-    cars = np.array([(10.3, -20.1, 4.4, 1.8, 0.3), (-60.0, 60.0, 5.5, 2.0, 1.5)])
-    right = loss_of(perfect(cars)[None], targets([cars]))
-    shifted = cars + np.array([1.6, 0, 0, 0, 0])
-    assert right < 0.6
-    assert loss_of(perfect(shifted)[None], targets([cars])) > right + 1
-    assert loss_of(perfect(cars * [1, 1, 1.2, 1, 1])[None], targets([cars])) > right + 0.03
-    assert torch.isfinite(loss_of(torch.zeros(1, 7, 128, 128), targets([cars[:0]])))
 
 
 def test_weights_come_back_as_they_went(net: CarNet, tmp_path: Path) -> None:
@@ -201,7 +168,7 @@ def test_broken_weights_name_the_file_and_the_tensor(net: CarNet, tmp_path: Path
             load_weights(path)
         return str(caught.value).replace(str(path), "PATH")
 
-    assert refusal() == "PATH: no such weights file; `sortie train` makes one"
+    assert refusal() == "PATH: no such weights file; `python -m research train` makes one"
     path.write_bytes(b"\x80\x04K\x01.")
     assert refusal().startswith("PATH: not a weights file of this project (")
     save_weights(net, path, {})

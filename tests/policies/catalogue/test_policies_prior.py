@@ -20,33 +20,15 @@ from sortie.policies.contract import (
     COVERAGE_CELL_M,
     FEATURE_MAP_MEGABITS,
     Coverage,
-    Descriptor,
     Directive,
-    Disc,
     FleetView,
     PolicyError,
     Representation,
 )
 from sortie.policies.registry import POLICIES, handshake_bytes, missing_parts, own_fusion, resolve
-from sortie.policies.verification.axes import FIELDS, Axis, decisions_of, method_table, observe
 from sortie.policies.verification.invariants import just_heard
 from sortie.policies.verification.views import draw_views
 from sortie.scenarios.link_state import SILENT_MBPS
-
-PAPER = """\
-| method | Mis. | Scene | Plat. | Geom. | decides |
-|---|---|---|---|---|---|
-| Where2comm | – | ● | – | – | ROI |
-| When2com | – | ● | – | – | topology |
-| Who2com | – | ● | – | – | topology |
-| V2VNet | – | – | – | – | fusion wts |
-| DiscoNet | – | – | – | – | fusion wts |
-| SyncNet | – | – | ● | – | fusion wts |
-| HydraCollab | – | ● | – | – | fidelity + ROI |
-| Fixed compression | – | – | – | – | fidelity |
-| Context plane | ● | ● | ● | ● | all six |
-"""
-"""The paper's table of methods, its columns read and decided (what a method ignores is the rest)."""
 
 VIEWS = list(draw_views(0, 200))
 
@@ -74,40 +56,6 @@ def served(directives: list[Directive]) -> set[int]:
 
 
 # --- the table -----------------------------------------------------------------------------------
-
-
-def test_the_generated_table_is_the_papers() -> None:
-    """The paper's rows are the published methods'; ours are named as they fly."""
-    expected = PAPER
-    for method in METHODS.values():
-        expected = expected.replace(f"| {method.title} |", f"| {method.name} |")
-    assert method_table(VIEWS, [deputies]) == expected
-
-
-def test_the_watch_sees_a_policy_that_reads_more() -> None:
-    def nosy(view: FleetView) -> list[Directive]:
-        me = view.me
-        if me is None or me.battery_soc < 0.5:
-            return []
-        return where2comm(view)
-
-    assert observe(nosy, VIEWS).axes == {Axis.SCENE, Axis.PLATFORM}
-
-
-def test_every_field_of_a_descriptor_belongs_somewhere() -> None:
-    assert set(Descriptor._fields) <= set(FIELDS)
-    assert {a for a in FIELDS.values() if a} == set(Axis)
-
-
-def test_a_decision_is_what_differs_from_full_sharing() -> None:
-    full = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0)
-    assert decisions_of(full) == set()
-    assert decisions_of(full._replace(duty_percent=90)) == {"duty"}
-    assert decisions_of(full._replace(representation=Representation.NONE, rho=0.0)) == {"topology"}
-    assert decisions_of(full._replace(rho=0.5)) == {"fidelity"}
-    assert decisions_of(full._replace(roi=Disc(0, 0, 1))) == {"ROI"}
-    assert decisions_of(full._replace(deadline_s=1.0)) == {"rate"}
-    assert decisions_of(full._replace(fusion_weight=0.5)) == {"fusion wts"}
 
 
 def test_every_method_is_registered() -> None:

@@ -12,6 +12,8 @@ from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import PROVED, ProofVerdict, prove
 
+pytestmark = pytest.mark.slow
+
 Verify = Callable[..., list[ProofVerdict]]
 FOUND = ("whole: ", "sliver: ", "returns: ")
 """Kinds in which the search itself finds a view, not only declines to prove."""

@@ -6,6 +6,7 @@ import math
 import tempfile
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from policies_corpus import LINE, source
@@ -14,6 +15,8 @@ from policies_examples import fleet_of
 from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import PROVED, prove
+
+pytestmark = pytest.mark.slow
 
 WHOLE = st.sampled_from([0, 1, 2, 3, 5, 7, 30, 99])
 FLOAT = st.sampled_from([0.0, 0.1, 0.25, 0.3, 0.5, 0.7, 1.0, 2.5, 4.99, 5.0, 77.25])

@@ -19,7 +19,7 @@ from sortie.policies.verification.proof import ProofVerdict, prove
 from sortie.scenarios.plugins.user_calls import ProgramExitError, watched
 from sortie.scenarios.plugins.user_code import load
 
-pytestmark = pytest.mark.filterwarnings("ignore::SyntaxWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::SyntaxWarning")]
 
 
 def outcome(folder: Path, text: str) -> str:

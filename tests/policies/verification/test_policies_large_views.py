@@ -24,6 +24,8 @@ from sortie.scenarios.disc import LISTED_IDS, LISTED_MEMBERS
 from sortie.scenarios.plugins.user_calls import watched
 from sortie.scenarios.schema.base import MOST_DRONES
 
+pytestmark = pytest.mark.slow
+
 ALL = draw_view(3, 0, LARGEST, 1.0)
 FEW = draw_view(3, 1, LARGEST, 0.02)
 

@@ -32,7 +32,6 @@ from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.registry import resolve
 from sortie.policies.verification import pure
 from sortie.policies.verification.age_rule import older_views, raised_part, without_detached
-from sortie.policies.verification.axes import decisions_of, observe
 from sortie.policies.verification.confine import Reached, confined
 from sortie.policies.verification.invariants import WORDS, Scope
 from sortie.policies.verification.kept import fingerprint
@@ -449,33 +448,6 @@ def test_a_confined_copy_decides_with_all_its_defaults() -> None:
         return helper(view)
 
     assert confined(decide)(VIEW) == _stranger(VIEW, rate_hz=5.0)
-
-
-def test_decisions_differ_from_full_sharing_each_in_its_own_fields() -> None:
-    full = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0)
-    changes: list[tuple[dict[str, Any], set[str]]] = [
-        ({}, set()),
-        ({"rho": 0.5}, {"fidelity"}),
-        ({"representation": Representation.CODES}, {"fidelity"}),
-        ({"rate_hz": 5.0}, {"rate"}),
-        ({"rate_hz": 0.0}, {"rate"}),
-        ({"deadline_s": 0.2}, {"rate"}),
-        ({"roi": Disc(0, 0, 1)}, {"ROI"}),
-        ({"fusion_weight": 0.5}, {"fusion wts"}),
-        ({"duty_percent": 50}, {"duty"}),
-        ({"representation": Representation.NONE, "rate_hz": 0.0, "rho": 0.0}, {"topology"}),
-    ]
-    for fields, decided in changes:
-        assert decisions_of(full._replace(**fields)) == decided
-
-
-def test_what_a_policy_does_for_who_is_gone_is_no_decision_of_its_own() -> None:
-    def to_all(view: Any) -> list[Directive]:
-        return [Directive(view.ego, p, Representation.FEATURES, 1.0, None, 10.0 - 5.0 * (p == 2)) for p in view.peers]
-
-    gone = VIEW._replace(age_s={0: 0.0, 1: 0.0, 2: 9.0})
-    assert observe(to_all, [gone]).decisions == frozenset()
-    assert observe(to_all, [VIEW]).decisions == {"rate"}
 
 
 def _one(**fields: Any) -> Callable[[Any], list[Directive]]:

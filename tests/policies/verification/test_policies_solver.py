@@ -11,6 +11,8 @@ from sortie.policies.verification import call_checks
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import ProofVerdict, prove
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("z3")
 
 HEAD = """

@@ -16,6 +16,8 @@ from sortie.policies.verification.proof import prove
 from sortie.policies.verification.search import Budget
 from sortie.policies.verification.views import draw_views
 
+pytestmark = pytest.mark.slow
+
 LINES = parse("rate_hz <= 10\nrate_hz <= fresh.rate_hz")
 Decide = Callable[[FleetView], Sequence[Directive]]
 

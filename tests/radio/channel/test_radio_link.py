@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import link
 import numpy as np
 import pytest
-from radio_examples import CROSS_M, still
+from radio_examples import CROSS_M, fades_db, still
 from scipy import integrate, stats
 
 from sortie.radio.channel.pathloss import free_space_loss_db, log_distance_loss_db
@@ -95,7 +94,7 @@ def test_shadowing_is_symmetric_and_has_its_deviation_and_autocorrelation() -> N
 
 
 def test_fading_is_rician_in_mean_and_outage() -> None:
-    gains = 10 ** (link.fades_db(AirSettings(rician_k_db=8.0), 6, 4000)[:, ~np.eye(6, dtype=bool)] / 10)
+    gains = 10 ** (fades_db(AirSettings(rician_k_db=8.0), 6, 4000)[:, ~np.eye(6, dtype=bool)] / 10)
     envelope = np.sqrt(gains.ravel())  # 120,000 values
     k = 10**0.8
     rice = stats.rice(b=np.sqrt(2 * k), scale=np.sqrt(1 / (2 * (k + 1))))
@@ -110,7 +109,7 @@ def test_fading_is_rician_in_mean_and_outage() -> None:
 
 
 def test_a_fade_is_of_a_direction_and_of_an_exchange_or_a_frame() -> None:
-    own, frame = (link.fades_db(AirSettings(fading=name), 3, 400, per_frame=2) for name in ("exchange", "frame"))
+    own, frame = (fades_db(AirSettings(fading=name), 3, 400, per_frame=2) for name in ("exchange", "frame"))
     off = ~np.eye(3, dtype=bool)
     for fades in (own, frame):
         assert (fades != fades.transpose(0, 2, 1))[:, off].mean() > 0.99
@@ -126,10 +125,10 @@ def test_a_sixth_drone_leaves_the_links_of_the_first_five_as_they_were() -> None
         np.testing.assert_array_equal(a, b[:5, :5])
     other = Channel(AirSettings(), still(CROSS_M[:5]), 9, 3, 0.1)
     assert not np.array_equal(step(other), a, equal_nan=True)
-    fades = link.fades_db(AirSettings(), 5, 50, seed=9)
+    fades = fades_db(AirSettings(), 5, 50, seed=9)
     off = ~np.eye(5, dtype=bool)
-    np.testing.assert_array_equal(fades[:, off], link.fades_db(AirSettings(), 6, 50, seed=9)[:, :5, :5][:, off])
-    assert (fades != link.fades_db(AirSettings(), 5, 50, seed=10))[:, off].mean() > 0.99
+    np.testing.assert_array_equal(fades[:, off], fades_db(AirSettings(), 6, 50, seed=9)[:, :5, :5][:, off])
+    assert (fades != fades_db(AirSettings(), 5, 50, seed=10))[:, off].mean() > 0.99
 
 
 def test_what_interferes_in_one_frame_leaves_the_others_as_they_were() -> None:

@@ -25,6 +25,8 @@ from sortie.sim.campaign.store import CampaignStore
 from sortie.sim.campaign.work import RunResult, Task, task_key
 from sortie.sim.folders import RunError
 
+pytestmark = pytest.mark.slow
+
 SCORED = BASE.replace("detector: none", "detector: surrogate")
 METRICS = CAMPAIGN.replace("[bytes.data_sent, energy_j.total]", "[ap50.full_scene, energy_j.total]")
 

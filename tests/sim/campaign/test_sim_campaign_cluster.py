@@ -22,6 +22,8 @@ from sortie.sim.campaign.engine import open_engine
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("distributed")
 
 GONE = "--scheduler tcp://head:8786: the scheduler is gone; what is finished is kept, the same command goes on"
@@ -275,7 +277,6 @@ def tls_scheduler(certificates: Callable[[str], tuple[Path, Path, Path]]) -> Ite
 
 
 @CLUSTER
-@pytest.mark.slow
 def test_a_cluster_with_tls_flies_the_same_rows_and_lets_nobody_else_in(
     tmp_path: Path,
     tls_scheduler: str,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import multiprocessing
 import os
@@ -12,9 +13,9 @@ import threading
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 from campaign_examples import CAMPAIGN, CLUSTER, plan, rows_on_disk, write
-from kill_campaign import of_session
 
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.signals import EndedError, ended_by_sigterm, undisturbed
@@ -29,6 +30,16 @@ if __name__ == "__main__":
     sys.argv[:2] = ["sortie", "campaign"]
     main()
 """
+
+
+def of_session(session: int) -> list[int]:
+    """A session's processes, but for those that have ended and wait to be asked how."""
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error, ProcessLookupError):
+            if os.getsid(process.pid) == session and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process.pid)
+    return found
 
 
 @pytest.mark.slow

@@ -11,6 +11,8 @@ from campaign_examples import BASE, CAMPAIGN, CLUSTER, table_bytes, write
 
 import sortie
 
+pytestmark = pytest.mark.slow
+
 POLICY = """
 import hashlib, os, sys, time
 from sortie.policies.contract import Directive
@@ -59,7 +61,6 @@ def test_what_a_policy_does_is_one_failed_run(
 
 
 @CLUSTER
-@pytest.mark.slow
 def test_a_cluster_gives_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
     monkeypatch.chdir(tmp_path)

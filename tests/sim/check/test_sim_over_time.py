@@ -24,6 +24,8 @@ from sortie.sim.check.over_time import Subject, course_scenario, flights_of, jud
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.record import SortieRecord
 
+pytestmark = pytest.mark.slow
+
 TIMES = PlaneTimes(0.1, 0.1, 0.4, 3.0, 10.0, shielded=False)
 STILL = Course(3, 30, 0.1, 0.1, 10.0, {}, {})
 POLICIES = """

@@ -498,13 +498,20 @@ def test_another_policy_flies_to_the_end_and_says_so(scenario: Path, tmp_path: P
 def test_weights_that_are_not_there_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     missing = tmp_path / "none.safetensors"
     asked = ("fly", "track_target", "--set", f"perception.weights={missing}", "--set", "duration_s=1")
-    assert refusal(tmp_path, asked, capsys) == f"error: {missing}: no such weights file; `sortie train` makes one\n"
+    assert (
+        refusal(tmp_path, asked, capsys)
+        == f"error: {missing}: no such weights file; `python -m research train` makes one\n"
+    )
 
 
 @pytest.mark.parametrize(
     ("field", "value", "told"),
     [
-        ("weights", "none.safetensors", "none.safetensors: no such calibration; `sortie calibrate` makes one"),
+        (
+            "weights",
+            "none.safetensors",
+            "none.safetensors: no such calibration; `python -m research calibrate` makes one",
+        ),
         (
             "fusion",
             "late",

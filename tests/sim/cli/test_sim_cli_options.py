@@ -108,17 +108,7 @@ def scenario(tmp_path: Path) -> Path:
         ),
         (("compare", "example.yaml", "--policies", "silence", "--readme", "c.md"), "c.md: No such file or directory"),
         (("compare", "example.yaml", "--policies", "silence", "--readme", "example.yaml"), "must hold <!-- compare"),
-        (("learn", "--out", "."), ".: is a folder, must be a file"),
-        (("learn", "--set", "perception.jion=nms"), "perception.jion: unknown key, did you mean join?"),
-        (("fit", "errors", "--weights", "w.safetensors", "--out", "."), ".: is a folder, must be a file"),
         (("live", "example.yaml", "--out", "."), ".: is a folder, must be a file"),
-        (("train", "--fusion", "mean"), "unknown fusion 'mean', known: none, late,"),
-        (("train", "--peak-lr", "nan"), "peak_lr is nan, must be above 0 and at most 1"),
-        (("train", "--device", "tpu"), "device is 'tpu', must be one of auto, cpu"),
-        (("train", "--device", "cuda:99"), "device is 'cuda:99', must be one of auto, cpu"),
-        (("calibrate", "--out", "."), ".: is a folder, must be a file"),
-        (("train", "--warm-start", "w.safetensors"), "w.safetensors: no such weights"),
-        (("train", "--out", "."), ".: is a folder, must be a file"),
         (("fly", "--from-campaign", ".", "--run", "0", "--seed", "0"), "name nothing else"),
         (("fly", "--from-campaign", ".", "--run", "0", "--replication", "0"), "name nothing else"),
         (("fly", "link_battery"), "link_battery.yaml: is a campaign, not a scenario; its command is: sortie campaign"),
@@ -126,30 +116,14 @@ def scenario(tmp_path: Path) -> Path:
             ("check", "conditions"),
             "conditions.yaml: is a set of conditions, not a scenario; its command is: sortie compare",
         ),
-        (
-            ("paper", "--frame", "0", "--readme", "example.yaml"),
-            "--readme goes with the whole report, not with --frame",
-        ),
-        (("paper", "--frame", "0", "--against", "."), "--against goes with the whole report, not with --frame"),
-        (("paper", "--ego", "1"), "--ego goes with --frame"),
-        (("paper", "--view"), "--view goes with --frame"),
         (("fly", "example.yaml", "--pace", "1.0"), "--pace goes with --mavlink"),
         (("fly", "example.yaml", "--mavlink-key", "key"), "--mavlink-key goes with --mavlink"),
         (("live", "example.yaml", "--origin", "47,8"), "--origin goes with --mavlink"),
-        (("calibrate", "--policies", "boxes"), "--policies goes with --fly"),
-        (("calibrate", "--rate-hz", "1"), "--rate-hz goes with --fly"),
-        (("calibrate", "--towns", "1"), "--towns goes with --fly"),
-        (("calibrate", "--made", "m"), "--made goes with --fly"),
-        (("fit", "errors", "--towns", "5"), "--towns goes with sortie fit errors surrogate"),
-        (("fit", "errors", "surrogate", "--bench-seed", "0"), "--bench-seed goes with sortie fit errors torch"),
-        (("fit", "errors", "surrogate", "--bench", "b"), "--bench goes with sortie fit errors torch"),
         (("campaign", "link_battery", "--wait-for-workers", "7"), "--wait-for-workers goes with --scheduler"),
         (("campaign", "run", "link_battery", "--security", "a", "b", "c"), "--security goes with --scheduler"),
         (("verify", "link", "own.py:L", "--views", "20"), "--views goes with policies"),
         (("verify", "link", "own.py:L", "--out", "o"), "--out goes with policies"),
         (("verify", "link", "own.py:L", "--scenario", "example.yaml"), "--scenario goes with policies"),
-        (("paper", "--readme", "example.yaml"), "must hold <!-- paper"),
-        (("study", "report", "--readme", "example.yaml"), "must hold <!-- study"),
     ],
 )
 def test_what_cannot_be_honoured_is_refused_before_anything_flies(
@@ -189,28 +163,6 @@ def test_a_comparison_in_a_readme_says_how_it_was_made(scenario: Path, tmp_path:
     said = f"sortie compare {shlex.quote(str(scenario))} --policies 'silence,all-4(received_budget=0.1)' --seed 3 --set duration_s=1 --set fleet.drones=2"
     assert f"`{said}`: 1 s, 2 drones, seed 3, in this town, this flight." in readme.read_text()
     assert (tmp_path / "new" / "c.rrd").is_file()
-
-
-def test_a_study_replaces_no_file_that_it_did_not_write(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "study"
-    out.mkdir()
-    for name in ("study.parquet", "README.md", "contrasts.png", "notes.txt"):
-        (out / name).write_text(name)
-    assert command("study", "report", out / "study.parquet", "--out", out) == 2
-    said = capsys.readouterr().err
-    assert said == f"error: {out}: holds notes.txt, which no report wrote; choose another folder or move it\n"
-    assert (out / "notes.txt").read_text() == "notes.txt"
-
-
-def test_the_overhead_of_a_policy_with_parameters(capsys: pytest.CaptureFixture[str]) -> None:
-    """It was split at the comma within the brackets, and parameters were no part of a policy."""
-    assert (
-        command("overhead", "--policies", "best-2(received_budget=0.1, k=1),silence", "--drones", "2", "--seconds", "1")
-        == 0
-    )
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "best-2" in printed
-    assert "silence" in printed
 
 
 def test_a_name_between_colons_is_printed_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,6 +20,8 @@ from sortie.scenarios.streams import stream
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 
+pytestmark = pytest.mark.slow
+
 EVENTS = (
     knobs.JAM, knobs.DROP, knobs.SPOOF, knobs.LIE, knobs.LOST, knobs.JOINS, knobs.LEAVES, knobs.FAULT, knobs.CELL, knobs.SKEW,
     knobs.DRIFT, knobs.AWAY, knobs.ASTRAY, knobs.SLOW, knobs.BLOCKED, knobs.LOST_GNSS,

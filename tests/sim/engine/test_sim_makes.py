@@ -20,7 +20,7 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Coverage, Descriptor, Directive, FleetView, Representation
 from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Scenario
-from sortie.scenarios.shipped import located
+from sortie.scenarios.shipped import NETWORKS, located
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.bag import descriptors
 from sortie.sim.results.outcome import outcome
@@ -203,14 +203,13 @@ def test_boxes_of_another_network_are_what_that_network_found(weaker: Path) -> N
 
 # --- detectors -----------------------------------------------------------------------------------
 
-STUDY = Path(__file__).parents[3] / "perception" / "study" / "weights"
 TORCH = ("perception.detector=torch", "duration_s=1.5", "perception.scene.moving_cars_per_km=30")
 
 
 @pytest.mark.slow
 def test_two_torch_networks_in_one_flight() -> None:
     """Each drone's boxes are its own network's; maps stay within a network, and boxes of the other one are joined."""
-    net = STUDY / "full-2.safetensors"
+    net = NETWORKS / "disconet.safetensors"
     ours, theirs = (
         run_sortie(fleet("", *TORCH), "silence"),
         run_sortie(fleet("", *TORCH, f"perception.weights={net}"), "silence"),

@@ -14,6 +14,8 @@ from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
+pytestmark = pytest.mark.slow
+
 SEEING = ("perception.detector=surrogate", "perception.max_age_s=2", "duration_s=20", "mission={}")
 SETTLED_S = 2.0
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import repositions
 from sim_examples import example
 
 from sortie.fleet.coverage import unpack_grid
@@ -229,16 +228,3 @@ def test_nearer_the_region_more_is_found_in_it() -> None:
     settings = (*LONG, "duration_s=30", "perception.detector=surrogate", "fleet.viewpoints.speed_mps=8")
     stays, moves = (outcome(run_sortie(example(*settings), policy)) for policy in (share, vantage))
     assert moves["ap50"]["mission"] > stays["ap50"]["mission"]
-
-
-@pytest.mark.parametrize(
-    ("seeds", "duration_s", "message"),
-    [
-        (1, 60.0, "1 seeds, must be at least 2"),
-        (2, 5.0, "duration_s is 5, must be above 5, when tracking begins"),
-    ],
-)
-def test_gains_that_cannot_be_measured_are_refused(seeds: int, duration_s: float, message: str) -> None:
-    """One sortie has no interval, and one that ends before it tracks has no accuracy: it was NaN."""
-    with pytest.raises(ValueError, match=f"^{message}$"):
-        list(repositions.measure(range(seeds), duration_s))

@@ -22,6 +22,8 @@ from sortie.sim.live.seals import Seals
 from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
 
+pytestmark = pytest.mark.slow
+
 POLICY = "policy={name: all-4, params: {received_budget: 0.03125}, dwell_s: 0.3}"
 
 
@@ -39,7 +41,6 @@ def test_a_drone_that_starts_late_is_shared_with_and_shares() -> None:
     assert "drone 1: its process started" in "\n".join(describe_changes(result))
 
 
-@pytest.mark.slow
 def test_a_drone_that_was_killed_comes_back_and_is_believed() -> None:
     """Its counters begin above those that it used before."""
     result = fly_until(

@@ -26,6 +26,8 @@ from sortie.sim.live.sentences import describe_changes
 from sortie.sim.live.session import fly_live
 from sortie.sim.live.watchdog import DETECTIONS, Fallback, Watchdog, parse_fallback
 
+pytestmark = pytest.mark.slow
+
 POLICY = """
 import os, time
 from pathlib import Path
@@ -221,7 +223,6 @@ def test_the_fallback_is_a_safe_rung() -> None:
         fly_live(example(), decide_within_s=2.0)
 
 
-@pytest.mark.slow
 def test_a_drone_flies_on_as_its_policy_dies(tmp_path: Path) -> None:
     """Drone 0's policy dies at its eleventh decision of the live flight; the flight in simulation has another process."""
     (tmp_path / "mine.py").write_text(

@@ -31,6 +31,8 @@ from sortie.sim.ranking.suite import MISSIONS, NEWEST, TROUBLES, digest_of, furt
 from sortie.sim.ranking.verdict import Verified
 from sortie.sim.studies.conditions import scenario_of
 
+pytestmark = pytest.mark.slow
+
 SMALL = """
 base: track_target
 set: [perception.detector=surrogate, duration_s=1, fleet.drones=3, "mission.phases=[{at_s: 0, phase: search}]"]

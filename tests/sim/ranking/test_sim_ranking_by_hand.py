@@ -21,6 +21,8 @@ from sortie.sim.ranking.rank import Ranked
 from sortie.sim.ranking.stored import made_now, read_results, save_results
 from sortie.sim.ranking.verdict import WORDS, Verified
 
+pytestmark = pytest.mark.slow
+
 FIGURES = {
     "ap50.mission": 0.31, "ap50.full_scene": 0.42, "tracking.hota": 0.53, "bytes.data_sent": 4.5e6, "bytes.context_sent": 6.5e3,
     "energy_j.total": 9000.0, "energy_j.fault": 1500.0, "energy_j.radio": 77.0, "deadline_miss_rate": 0.08,

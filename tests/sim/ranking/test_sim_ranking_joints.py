@@ -8,6 +8,8 @@ from sortie.sim.folders import RunError
 from sortie.sim.ranking.board import _spread
 from sortie.sim.ranking.rank import FURTHER, SUITE, _further
 
+pytestmark = pytest.mark.slow
+
 
 def test_as_many_draws_are_further_ones_as_are_asked_for_also_none() -> None:
     assert _further(SUITE, 0) == []

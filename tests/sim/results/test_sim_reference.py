@@ -7,6 +7,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hints, is_typeddict
 
+import outcome_page
 import pytest
 from sim_examples import example
 
@@ -14,7 +15,6 @@ from sortie import radio
 from sortie.sim.check.golden import figures
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.engine.transport import OTHER_SPACE
-from sortie.sim.results import reference
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.outcome_fields import REASONS, WALL, Outcome, check_number, open_keys
 from sortie.sim.results.record import ABOUT, TABLES
@@ -87,8 +87,8 @@ def test_every_number_of_an_outcome_may_be_named() -> None:
 
 
 def test_what_may_be_keyed_is_known_of_every_object_that_is_open() -> None:
-    found = {path for path, value, _ in reference.fields(Outcome) if value.startswith("object of")}
-    found |= {path.partition(".*")[0] for path, _, _ in reference.fields(Outcome) if ".*" in path}
+    found = {path for path, value, _ in outcome_page.fields(Outcome) if value.startswith("object of")}
+    found |= {path.partition(".*")[0] for path, _, _ in outcome_page.fields(Outcome) if ".*" in path}
     assert open_keys(1, 1, (), traced=False).keys() == found | {"phases"}
 
 
@@ -115,18 +115,18 @@ def test_a_field_of_another_name_or_kind_is_found(change: dict[str, Any], fault:
 
 
 def test_the_page_is_current() -> None:
-    assert reference.PAGE.read_text("utf-8") == reference.page(), "run python -m sortie.sim.results.reference"
+    assert outcome_page.PAGE.read_text("utf-8") == outcome_page.page(), "run python docs/site/outcome_page.py"
 
 
 def test_every_table_is_told() -> None:
     assert list(ABOUT) == list(TABLES)
     assert all(ABOUT.values())
     for name, columns in TABLES.items():
-        assert all(f"`{column}`" in reference.page() for column in columns), name
+        assert all(f"`{column}`" in outcome_page.page() for column in columns), name
 
 
 def test_paths_lead_into_objects_keys_and_lists() -> None:
-    assert list(reference.fields(Tree)) == [
+    assert list(outcome_page.fields(Tree)) == [
         ("one", "object", "One."),
         ("one.x", "number, null", "A number."),
         ("named", "object", "By name."),

@@ -10,6 +10,8 @@ import pytest
 from sortie.perception.metrics.ap import Matched
 from sortie.sim.studies import compare
 
+pytestmark = pytest.mark.slow
+
 
 def scored(name: float, *keys: tuple[float, int]) -> dict[tuple[float, int], Matched]:
     """Fusions of a sortie, each with a score that says which it is."""

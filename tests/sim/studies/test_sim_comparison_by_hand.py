@@ -28,6 +28,8 @@ from sortie.sim.studies.comparison_text import (
 )
 from sortie.sim.studies.multifidelity import Contrast, Precision
 
+pytestmark = pytest.mark.slow
+
 
 def flown(seeds: tuple[int, ...] = (3, 4)) -> Flown:
     """Policies `a` and `b` on these seeds, every figure of every sortie another one; each mean lies half-way."""

@@ -13,6 +13,8 @@ import sortie
 from sortie.sim.studies.compare import Flown
 from sortie.sim.studies.comparison_text import side_by_side
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def compared() -> sortie.Comparison:

@@ -36,6 +36,8 @@ from sortie.sim.studies.multifidelity import (
 )
 from sortie.sim.studies.surrogate_draws import fly_with_draws
 
+pytestmark = pytest.mark.slow
+
 METRIC = "ap50.full_scene"
 SHORT = {
     "duration_s": 3,

@@ -17,6 +17,8 @@ from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.accuracy import matched
 from sortie.sim.results.record import SortieRecord
 
+pytestmark = pytest.mark.slow
+
 FLIGHT = (
     "duration_s=6",
     "mission.phases=[{at_s: 0, phase: search}]",

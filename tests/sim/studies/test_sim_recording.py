@@ -15,6 +15,8 @@ from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.studies.compare import Contender, compare
 
+pytestmark = pytest.mark.slow
+
 RECORDED = "perception.detector=recorded"
 SHORT = ("duration_s=2", "mission.phases=[{at_s: 0, phase: search}]", "policy.dwell_s=0.2")
 

@@ -16,6 +16,8 @@ from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import POLICIES
 from sortie.sim.studies.replayed import NO_PEER
 
+pytestmark = pytest.mark.slow
+
 SHORT = {"duration_s": 4, "perception.detector": "none", "record.views": True}
 DROP = {"events": [{"kind": "link_drop", "at_s": 1, "drone": 1, "loss_db": 40, "until_s": 3}]}
 

@@ -25,6 +25,8 @@ from sortie.sim.studies.conditions import Cell
 from sortie.sim.studies.replay import compare
 from sortie.sim.studies.replayed import NO_PEER, Difference, Replay
 
+pytestmark = pytest.mark.slow
+
 # --- conditions -----------------------------------------------------------------------------------------------------
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import get_args
 
-import late_shares
 import numpy as np
 import pytest
-from late_shares import RUNGS, Case
 from scipy.stats import ttest_1samp
 
+from research.validation import late_shares
+from research.validation.late_shares import RUNGS, Case
 from sortie.perception.joining import Rule
 
 TOWNS = 20

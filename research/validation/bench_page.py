@@ -1,6 +1,6 @@
 """What Sortie costs, on one page (`make bench`): each figure beside its peer's, and beside the last release's.
 
-    python tests/benchmarks/bench_page.py [--gradys PYTHON] [--release]
+    python -m research.validation.bench_page [--gradys PYTHON] [--release]
 
 All figures are processor seconds, the least of several runs in one process. A peer runs in the same call, so that their
 ratio holds for this machine: ns-3 where its wheel and g++ are installed (`make ns3`), GrADyS-SIM where `gradysim` is
@@ -20,13 +20,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from research.validation.stored import ROOT, Cell, Column, Table
+
 HERE = Path(__file__).resolve().parent
 RELEASE = HERE / "release.json"
-TESTS = HERE.parent
-for folder in ("validation/ns3", "validation", "benchmarks", "helpers"):
-    sys.path.insert(0, str(TESTS / folder))
-
-from stored import Cell, Column, Table  # noqa: E402 (beside the folders above)
 
 RUNS = 3
 GRADYS_DRONES, GRADYS_FRAMES = 100, 50
@@ -50,10 +47,11 @@ def items(gradys: str | None) -> list[Item]:
     Args:
         gradys: a Python that has GrADyS-SIM; None leaves it out.
     """
+    sys.path[:0] = [str(ROOT / "tests" / folder) for folder in ("benchmarks", "helpers")]
     from test_bench_radio import _descriptors
     from test_bench_surrogate import moments
-    from wifi_compare import LOADS, through_air
 
+    from research.validation.ns3.wifi_compare import LOADS, through_air
     from sortie.perception.network.detector import TorchDetector
     from sortie.perception.scene.scene_model import SceneModel
     from sortie.radio import AirSettings
@@ -88,8 +86,8 @@ def items(gradys: str | None) -> list[Item]:
 
 
 def _ns3(case: Any) -> float | None:
-    from wifi_compare import through_ns3
-    from wifi_ns3 import Ns3Missing
+    from research.validation.ns3.wifi_compare import through_ns3
+    from research.validation.ns3.wifi_ns3 import Ns3Missing
 
     try:
         return through_ns3(case, 1)["cpu_s"]

@@ -1,6 +1,6 @@
-"""The schema for people and editors: the tables of README.md and schema.json, both made from schema.py.
+"""The schema for people and editors: the tables of `scenarios/README.md` and `scenarios/schema.json`, both made from the schema.
 
-`python -m sortie.scenarios.reference` writes them anew; a test holds them to the schema.
+`python docs/site/fields_page.py` writes them anew; a test holds them to the schema.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sortie.scenarios.report_text import replace_section, table
 from sortie.scenarios.schema import Scenario, json_schema
 from sortie.scenarios.schema.base import ModelName, PresetSection
 
-HERE = Path(__file__).parent
+SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 BEGIN, END = "<!-- fields:begin -->", "<!-- fields:end -->"
 _SIGNS = {Ge: ("ge", "≥"), Gt: ("gt", ">"), Le: ("le", "≤"), Lt: ("lt", "<")}
 _NAMES = {float: "number", int: "whole number", bool: "true, false", str: "text", NoneType: "nothing"}
@@ -123,9 +123,9 @@ def _default(field: FieldInfo) -> str:
 
 
 def write() -> None:
-    """Write schema.json and the README's tables anew, beside this file."""
-    readme = HERE / "README.md"
-    for path, text in ((HERE / "schema.json", schema_text()), (readme, readme_text(readme.read_text("utf-8")))):
+    """Write schema.json and the README's tables anew."""
+    readme = SCENARIOS / "README.md"
+    for path, text in ((SCENARIOS / "schema.json", schema_text()), (readme, readme_text(readme.read_text("utf-8")))):
         fresh = path.with_name(f".{path.name}.new")
         fresh.write_text(text, "utf-8")
         fresh.replace(path)

@@ -1,6 +1,6 @@
-"""Make `outcome.md`, the reference of outcome and record, from `sortie.sim.results.outcome_fields` and `.record`.
+"""Make `sim/results/outcome.md`, the reference of outcome and record, from `sortie.sim.results.outcome_fields` and `.record`.
 
-`python -m sortie.sim.results.reference` writes it anew; a test holds it to the code, and the code to what a sortie gives.
+`python docs/site/outcome_page.py` writes it anew; a test holds it to the code, and the code to what a sortie gives.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sortie.sim.results import beliefs, disagreement, rosters, views
 from sortie.sim.results.outcome_fields import Outcome
 from sortie.sim.results.record import ABOUT, TABLES
 
-PAGE = Path(__file__).parent / "outcome.md"
+PAGE = Path(__file__).resolve().parents[2] / "sim" / "results" / "outcome.md"
 _NAMES = {float: "number", int: "whole number", bool: "true, false", str: "text", NoneType: "null"}
 _COLUMNS = {
     pa.float64(): "",
@@ -35,7 +35,7 @@ def page() -> str:
     lines = [
         "# What a run leaves behind",
         "",
-        "Made by `python -m sortie.sim.results.reference`; do not edit.",
+        "Made by `python docs/site/outcome_page.py`; do not edit.",
         "",
         "A run's folder holds `outcome.json`, the record's tables as Parquet, `scenario.yaml` (what was flown, every default "
         "written out), `record.json` (totals and wall clock) and `sortie.rrd` (the recording for Rerun; `sortie view` makes "

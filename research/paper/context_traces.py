@@ -1,6 +1,6 @@
 """The paper's 120 s context traces as files: what they hold, and how they are made.
 
-    python -m sortie.scenarios.context_traces [FOLDER]     writes drones.csv, links.csv and mission.csv
+    python -m research.paper.context_traces [FOLDER]     writes drones.csv, links.csv and mission.csv
 
 The paper replays traces that hold a mission's phase change, a battery's decay and a drop of link quality; its text
 gives when they happen and what policies do then, and its own files are not to be had. These are made from that text;

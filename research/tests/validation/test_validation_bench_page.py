@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench_page import Item, measure, page
+from research.validation.bench_page import Item, measure, page
 
 
 def test_ratios_are_over_the_peer_real_time_and_the_scaled_release() -> None:

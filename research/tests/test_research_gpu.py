@@ -1,6 +1,6 @@
 """What a GPU computes, where there is one: the harness as on a processor, to rounding; training, cut off and resumed.
 
-`python -m pytest tests/perception/test_perception_gpu.py` on a machine with CUDA; elsewhere all of it is skipped.
+`python -m pytest research/tests/test_research_gpu.py` on a machine with CUDA; elsewhere all of it is skipped.
 """
 
 from __future__ import annotations
