@@ -29,7 +29,7 @@ def test_the_fit_finds_clusters_stage_by_stage_and_repeats() -> None:
     cells = (coarse[rng.integers(12, size=900)] + fine[rng.integers(9, size=900)]).astype(np.float32)
     recipe = CodebookRecipe(stages=2, iterations=10)
     stages = fit(cells, recipe)
-    codebook = Codebook(torch.from_numpy(stages), "of none", rectified=False)
+    codebook = Codebook(torch.from_numpy(stages), "of none")
     read = codebook.decode(codebook.encode(torch.from_numpy(cells), 2)).numpy()
     assert ((cells - read) ** 2).sum() < 0.01 * ((cells - cells.mean(axis=0)) ** 2).sum()
     np.testing.assert_array_equal(fit(cells, recipe), stages)

@@ -56,7 +56,7 @@ def test_zarr_reads_only_what_is_asked_for(tmp_path: Path) -> None:
 
 
 def test_confidence_left_out_is_the_score_of_the_boxes(path: Path) -> None:
-    rank = open_recording(path).rank(0, 1, "confidence")
+    rank = open_recording(path).rank(0, 1)
     assert np.argwhere(rank).tolist() == [[32, 38]]  # the car 20 m to the left, 0 m ahead
     assert rank.max() == pytest.approx(0.8)
 
@@ -302,4 +302,4 @@ def test_a_box_may_be_anywhere(path: Path) -> None:
     arrays["boxes"][:, :2] = 1e300
     del arrays["features"]
     np.savez(path, **arrays)
-    assert not open_recording(path).rank(0, 0, "confidence").any()
+    assert not open_recording(path).rank(0, 0).any()

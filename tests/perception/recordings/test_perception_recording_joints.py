@@ -231,7 +231,7 @@ def test_of_two_frames_as_near_the_earlier_is_taken_and_a_gap_is_not_flown_over(
 def test_a_cell_ranks_by_its_best_box_whichever_comes_last(tmp_path: Path) -> None:
     for order in ([0, 1, 2], [2, 1, 0]):
         boxes = np.concatenate([box(8.0, 1.0, 0.9), box(8.5, 1.5, 0.3), box(500.0, 0.0, 1.0)])[order]
-        rank = open_recording(recorded(tmp_path / "r.npz", [[boxes, NONE, NONE]] * 3)).rank(0, 0, "confidence")
+        rank = open_recording(recorded(tmp_path / "r.npz", [[boxes, NONE, NONE]] * 3)).rank(0, 0)
         assert (rank[34, 32], rank.sum()) == (0.9, 0.9)
 
 
