@@ -62,17 +62,16 @@ def test_confidence_left_out_is_the_score_of_the_boxes(path: Path) -> None:
 
 
 def test_finer_grids_are_exchanged_in_blocks(tmp_path: Path) -> None:
-    """128 × 128 columns of 1.6 m: an exchanged cell of 3.2 m holds four, its norm is that of all four."""
+    """128 × 128 columns of 1.6 m: an exchanged cell of 3.2 m holds four."""
     fine = np.zeros((2, 2, 3, 128, 128), np.float16)
     fine[:, :, 0, 10:12, 20:22] = 2
     confidence = np.zeros((2, 2, 128, 128))
     confidence[:, :, 11, 20] = 0.7
     rec = open_recording(small(tmp_path / "x.npz", features=fine, confidence=confidence, cell_m=1.6))
     assert (rec.geometry.half_extent_m, rec.cell_bytes) == (102.4, 24)
-    for by, value in (("norm", 4.0), ("confidence", 0.7)):
-        rank = rec.rank(0, 0, by)
-        assert np.argwhere(rank).tolist() == [[5, 10]]
-        assert rank.max() == pytest.approx(value, rel=1e-3)
+    rank = rec.rank(0, 0)
+    assert np.argwhere(rank).tolist() == [[5, 10]]
+    assert rank.max() == pytest.approx(0.7, rel=1e-3)
 
 
 def spoiled(path: Path, **changes: Any) -> Path:
