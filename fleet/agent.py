@@ -48,7 +48,7 @@ from sortie.policies.contract import (
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
 from sortie.policies.geometry import rank_loop
 from sortie.policies.verification.enforced import Steps
-from sortie.policies.verification.shield_together import Ceilings
+from sortie.policies.verification.shield import Ceilings
 
 _FRESH = LinkHealth.FRESH
 _NOTHING = nothing(0, 1, "")[2:8]

@@ -6,11 +6,10 @@ A descriptor older than 3 periods degrades the link to its peer, one older than 
 
 from __future__ import annotations
 
-import operator
 from enum import IntEnum
 
 from sortie.policies.contract import ROUNDING_PERIODS, Directive, Representation
-from sortie.policies.verification.links import LEVEL, RATE_HZ, Ceiling, nothing_but_duty
+from sortie.policies.verification.shield import Ceiling, nothing_but_duty
 
 DEGRADED_RATE_HZ = 2.0
 """A degraded link carries detections at most this often, as the worked policy's lowest rung does."""
@@ -39,8 +38,8 @@ def health(
 CEILING: dict[LinkHealth, Ceiling] = {
     LinkHealth.FRESH: (),
     LinkHealth.DEGRADED: (
-        (LEVEL, (operator.le, Representation.DETECTIONS.level)),
-        (RATE_HZ, (operator.le, DEGRADED_RATE_HZ)),
+        ("representation", "<=", Representation.DETECTIONS.level),
+        ("rate_hz", "<=", DEGRADED_RATE_HZ),
     ),
     LinkHealth.DETACHED: nothing_but_duty(),
 }

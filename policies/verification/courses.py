@@ -6,13 +6,8 @@ views follow from them as in flight: charge never rises, a descriptor that is lo
 
 from __future__ import annotations
 
-import contextlib
-import math
-import types
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
-from itertools import islice
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,10 +19,6 @@ from sortie.policies.contract import (
     FleetView,
     TaskPhase,
 )
-from sortie.policies.verification.invariants import Invariant, Number
-from sortie.policies.verification.shield import Shielded
-from sortie.scenarios.plugins.user_calls import Guarded
-from sortie.scenarios.plugins.user_code import is_users
 from sortie.scenarios.streams import stream
 
 Steps = tuple[tuple[int, float], ...]
@@ -125,57 +116,6 @@ class Values(NamedTuple):
         shares = [x for c in known if 0 <= c <= 1 for x in (c - 1e-4, c, c + 1e-4) if 0 <= x <= 1]
         rates = [x for c in known if 0 < c <= 1e5 for x in (0.9 * c, c, 1.2 * c)]
         return cls((*_SOC, *shares), (*_GOODPUT_MBPS, *rates))
-
-
-def constants_of(policy: Any, rules: Sequence[Invariant] = ()) -> set[float]:
-    """The numbers in a policy's code and in lines, at which decisions may change."""
-    found = {float(n.value) for rule in rules for n in rule.nodes if isinstance(n, Number)}
-    waiting, met = [policy], set[int]()
-    while waiting and len(met) < 1000:
-        one = waiting.pop()
-        if id(one) in met:
-            continue
-        met.add(id(one))
-        if type(one) in (int, float):
-            with contextlib.suppress(OverflowError):  # no number of a view is as large
-                found.add(float(one))
-        else:
-            with contextlib.suppress(Exception):  # a user's own class may answer in any way
-                waiting += _parts(one)
-    return {x for x in found if math.isfinite(x)}
-
-
-def _parts(one: Any) -> Iterable[Any]:
-    """What an object has inside that may hold numbers of its code."""
-    if isinstance(one, types.CodeType):
-        return one.co_consts
-    if isinstance(one, tuple | list | set | frozenset):
-        return islice(one, 100)
-    if isinstance(one, dict):
-        return [*islice(one, 100), *islice(one.values(), 100)]
-    if isinstance(one, types.FunctionType):
-        cells = [c.cell_contents for c in one.__closure__ or () if _is_full(c)]
-        known = [one.__globals__[n] for n in one.__code__.co_names if n in one.__globals__]
-        return [one.__code__, *(one.__defaults__ or ()), *(one.__kwdefaults__ or {}).values(), *cells, *known]
-    if isinstance(one, types.MethodType):
-        return [one.__func__, one.__self__]
-    if isinstance(one, Guarded):
-        return [one.__wrapped__]
-    if isinstance(one, partial):
-        return [one.func, *one.args, *one.keywords.values()]
-    if isinstance(one, Shielded):
-        return [one.policy]
-    if isinstance(one, type):
-        return [*vars(one).values()] if is_users(one.__module__) else []
-    return [*getattr(one, "__dict__", {}).values(), type(one)] if is_users(type(one).__module__) else []
-
-
-def _is_full(cell: types.CellType) -> bool:
-    try:
-        cell.cell_contents  # noqa: B018
-    except ValueError:
-        return False
-    return True
 
 
 def draw_course(seed: int, number: int, still: Course, values: Values) -> Course:

@@ -25,8 +25,7 @@ from typing import NamedTuple
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.verification.invariants import Invariant, describe_directives, violations
 from sortie.policies.verification.past import Past
-from sortie.policies.verification.shield import enforce
-from sortie.policies.verification.shield_together import Ceilings
+from sortie.policies.verification.shield import Ceilings, enforce
 
 POLICY, STALENESS, DAMPING, NO_PEER = "policy", "staleness", "damping", "no peer"
 CAUSES = (POLICY, STALENESS, DAMPING, NO_PEER)

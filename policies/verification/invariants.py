@@ -113,7 +113,7 @@ class Recent:
 
 Node = Number | Name | Fresh | Binary | Logic | LinksTerm | Recent
 
-_COMPARE: dict[str, Callable[[Any, Any], Any]] = {
+COMPARE: dict[str, Callable[[Any, Any], Any]] = {
     "<": lambda a, b: a < b,
     "<=": lambda a, b: a <= b,
     ">": lambda a, b: a > b,
@@ -161,12 +161,27 @@ class Invariant:
     @property
     def of_link(self) -> bool:
         """Whether it must hold for each link separately."""
-        return any(_needs_link(n) for n in (self.when, self.then) if n is not None)
+        return _is_of_link(self)
+
+    @property
+    def when_of_link(self) -> bool:
+        """Whether its condition is one of each link."""
+        return _is_when_of_link(self)
 
     @property
     def needs_fresh(self) -> bool:
         """Whether it compares with the policy's decision at age 0."""
         return any(isinstance(n, Fresh) for n in self.nodes)
+
+
+@lru_cache(maxsize=1024)
+def _is_of_link(rule: Invariant) -> bool:
+    return any(_needs_link(n) for n in (rule.when, rule.then) if n is not None)
+
+
+@lru_cache(maxsize=1024)
+def _is_when_of_link(rule: Invariant) -> bool:
+    return rule.when is not None and _needs_link(rule.when)
 
 
 def walk(node: Node) -> Iterator[Node]:
@@ -322,7 +337,7 @@ def _kind(node: Node) -> Kind:
         case Name() | Fresh():
             return WORDS[node.word].kind
         case Binary():
-            return "truth" if node.sign in _COMPARE else "number"
+            return "truth" if node.sign in COMPARE else "number"
         case Logic():
             return "truth"
         case LinksTerm():
@@ -352,6 +367,8 @@ def violations(
     if me is None:
         return []
     scope = Scope(view, me, directives, {d.destination: d for d in fresh}, None, past)
+    if invariant.when is not None and not invariant.when_of_link and not evaluate(invariant.when, scope):
+        return []
     broken: list[Directive | None] = []
     for link in directives if invariant.of_link else (None,):
         here = scope._replace(link=link)
@@ -382,8 +399,8 @@ def evaluate(node: Node, scope: Scope) -> Any:
             return all(values) if node.word == "and" else any(values)
         case Binary():
             left, right = evaluate(node.left, scope), evaluate(node.right, scope)
-            if node.sign in _COMPARE:
-                return _COMPARE[node.sign](left, right)
+            if node.sign in COMPARE:
+                return COMPARE[node.sign](left, right)
             if node.sign == "/" and right == 0:
                 return float("inf")
             return _ARITHMETIC[node.sign](left, right)

@@ -15,14 +15,13 @@ heard, every order of the drones in the view, and
 
 | verdict | what was covered |
 |---|---|
-| `proved` | every view of fleets of up to so many drones, float by float |
-| `proved over the reals` | the same, but sums and products of inputs were followed without rounding |
+| `proved` | every view of fleets of up to so many drones; only of policies in plain Python (`allowed`) |
 | `refuted` | a view of plain numbers on which the policy itself was run and failed |
-| `searched` | cells that the time allowed, or of a policy that cannot be proved; none fails |
-| `drawn` | random views alone, because the policy cannot be followed; none fails |
+| `tried` | drawn views, some of them at the policy's own constants; none fails |
 
 Drawn views are tried after every proof too, up to the largest fleet that a scenario may have. A proof covers neither
-rosters (`context.roster`, and fleets of more than 200 drones), nor another period than the one given, nor another `detached_after_periods`, nor NaN.
+rosters (`context.roster`, and fleets of more than 200 drones), nor another period than the one given, nor another
+`detached_after_periods`, nor NaN. Sums and products of inputs are followed over the reals, without rounding; the verdict says so.
 """
 
 from __future__ import annotations
@@ -32,22 +31,22 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sortie.policies.contract import DETACHED_AFTER_PERIODS, FleetView, Policy
-from sortie.policies.verification.advice import advise
-from sortie.policies.verification.confine import Reached
+from sortie.policies.verification.allowed import why_not_provable
 from sortie.policies.verification.drawn import TRIED_VIEWS, Drawn
 from sortie.policies.verification.invariants import Invariant, InvariantError
-from sortie.policies.verification.search import BUDGET_S, Budget, Found, Searched, Stopped, search_size
+from sortie.policies.verification.search import Budget, Found, Searched, Stopped, search_size
 from sortie.policies.verification.single_view import PLANE, Property, check_property, property_of
 from sortie.policies.verification.solver import solver_paths
-from sortie.policies.verification.subject import searchable, with_notes
 from sortie.policies.verification.symbols import Combined, Refused
-from sortie.scenarios.plugins.user_calls import text_of
 
 DRONES = 5
 """The largest fleet that a proof covers if nothing else is asked for."""
+PLANE_S, SEARCH_S = 4.0, 7.0
+"""Processor time for the search of the plane's properties, and of each invariant, if nothing else is asked for."""
+WITH_FAULT_S = 6.0
+"""Processor time for the whole search once it has found a fault."""
 
-Outcome = Literal["proved", "proved over the reals", "refuted", "searched", "drawn"]
-PROVED = ("proved", "proved over the reals")
+Outcome = Literal["proved", "refuted", "tried"]
 _NOT_REPEATED = "not the same for the same view: it fails on this view only sometimes"
 
 
@@ -63,16 +62,13 @@ class ProofVerdict:
     """The raised ages of the counterexample, if the property is about raised ages."""
 
 
-# --- proving -------------------------------------------------------------------------------------
-
-
 def prove(
     policy: Policy,
     invariants: Sequence[Invariant] = (),
     *,
     max_drones: int = DRONES,
     period_s: float = 0.1,
-    budget_s: float = BUDGET_S,
+    budget_s: float | None = None,
     seed: int = 0,
     views: int = TRIED_VIEWS,
 ) -> list[ProofVerdict]:
@@ -83,8 +79,8 @@ def prove(
         invariants: what it must keep too.
         max_drones: fleets of 1 to this many drones are searched; each drone multiplies the cells by about ten.
         period_s: the plane's period.
-        budget_s: wall-clock time for the search of all properties together. What it did not reach is not proved. Drawn
-            views of all properties get as much again, and at least `search.LEAST_DRAWN_S`.
+        budget_s: processor time for the search of all properties together; None: `PLANE_S`, and `SEARCH_S` for each
+            invariant. Drawn views of all properties get as much again, and at least `drawn.LEAST_S`.
         seed: of the drawn views on which every property is tried that no search refuted.
         views: how many of them, besides a few of large fleets; 0 for none at all.
 
@@ -98,83 +94,74 @@ def prove(
         if rule.over_time:
             raise InvariantError(f"{rule.text!r} is about time: a single view does not decide it")
     properties = [*PLANE, *(property_of(i) for i in invariants)]
-    searched = [Searched(p.name) for p in properties]
-    coverage = _search(policy, list(zip(searched, properties, strict=True)), max_drones, period_s, Budget(budget_s))
-    tried = Drawn(policy, invariants, seed, views)
-    drawn = tried.first_faults([p for f, p in zip(searched, properties, strict=True) if f.fault is None], budget_s)
+    budget_s = PLANE_S + SEARCH_S * len(invariants) if budget_s is None else budget_s
+    drawn = Drawn(policy, invariants, seed, views)
+    searched = {prop: Searched(prop.name) for prop in properties}
+    coverage = _search(policy, searched, max_drones, period_s, budget_s)
+    left = [prop for prop in properties if searched[prop].fault is None]
+    faults = drawn.first_faults(left, budget_s)
     verdicts = []
-    for found, prop in zip(searched, properties, strict=True):
-        if found.fault is not None:
-            said = check_property(prop, policy, found.fault.view, found.fault.raised_age_s) or _NOT_REPEATED
-            verdicts.append(ProofVerdict(prop.name, "refuted", said, found.fault.view, found.fault.raised_age_s))
+    for prop, found in searched.items():
+        shown = None if found.fault is not None else faults[prop].view
+        fault = found.fault if shown is None else Found(shown, None)
+        if fault is not None:
+            said = check_property(prop, policy, fault.view, fault.raised_age_s) or _NOT_REPEATED
+            verdicts.append(ProofVerdict(prop.name, "refuted", said, fault.view, fault.raised_age_s))
             continue
-        view, keep_it = drawn[prop]
-        if view is not None:
-            verdicts.append(
-                ProofVerdict(prop.name, "refuted", check_property(prop, policy, view) or _NOT_REPEATED, view)
-            )
-            continue
-        outcome, text = coverage.verdict(found)
-        verdicts.append(ProofVerdict(prop.name, outcome, f"{text}; {keep_it}"))
+        why = found.unclear or coverage.why
+        text = f"{faults[prop].text}; not proved: it {why}" if why else f"{coverage.text(found)}; {faults[prop].text}"
+        verdicts.append(ProofVerdict(prop.name, "tried" if why else "proved", text))
     return verdicts
 
 
 class _Coverage:
     """What the search of a policy covered."""
 
-    def __init__(self, asked: int, period_s: float, budget: Budget) -> None:
-        self.asked, self.drones, self.period_s, self.budget = asked, 0, period_s, budget
+    def __init__(self, asked: int, period_s: float) -> None:
+        self.asked, self.drones, self.period_s = asked, 0, period_s
         self.exact = True
-        self.cannot = ""
-        """Why no search can follow the policy."""
-        self.unsound = ""
-        """Why a complete search proves nothing."""
-        self.stopped = False
+        self.why = ""
+        """Why nothing is proved."""
 
-    def verdict(self, found: Searched) -> tuple[Outcome, str]:
-        why = found.unclear or self.cannot
-        if why:
-            return "drawn", advise(why)
-        if self.unsound:
-            return "searched", f"{found.cells} cells; it {self.unsound}"
-        spent = f"the time of {self.budget.budget_s:g} s ended in fleets of {self.drones + 1}" if self.stopped else ""
-        if self.drones < min(2, self.asked):
-            return "searched", f"{found.cells} cells; {spent}"
-        gone = f"detached after {DETACHED_AFTER_PERIODS:g} periods"
-        cells = (
-            f"all views of up to {self.drones} drones, at a period of {self.period_s:g} s, {gone}, {found.cells} cells"
+    def text(self, found: Searched) -> str:
+        ended = "" if self.drones == self.asked else f"; the time ended in fleets of {self.drones + 1}"
+        reals = "" if self.exact else ", sums and products without rounding"
+        return (
+            f"all views of up to {self.drones} drones, at a period of {self.period_s:g} s, detached after "
+            f"{DETACHED_AFTER_PERIODS:g} periods, {found.cells} cells{reals}{ended}"
         )
-        cells += f"; {spent}" if spent else ""
-        return ("proved" if self.exact else "proved over the reals"), cells
 
 
 def _search(
-    policy: Policy, properties: list[tuple[Searched, Property]], max_drones: int, period_s: float, budget: Budget
+    policy: Policy, properties: Mapping[Property, Searched], max_drones: int, period_s: float, budget_s: float
 ) -> _Coverage:
     """Search fleet by fleet until all is covered, the time is over, or the policy cannot be followed."""
-    coverage = _Coverage(max_drones, period_s, budget)
+    coverage = _Coverage(max_drones, period_s)
+    coverage.why = why_not_provable(policy)
+    if coverage.why:
+        return coverage
+    looked_for = [(searched, prop.complaint) for prop, searched in properties.items()]
 
     def confirm(searched: Searched, fault: Found) -> bool:
-        prop = next(p for s, p in properties if s is searched)
-        return check_property(prop, policy, fault.view, fault.raised_age_s) is not None
+        prop = next(p for p, s in properties.items() if s is searched)
+        shows = check_property(prop, policy, fault.view, fault.raised_age_s) is not None
+        if shows:  # a faulty policy will be searched again
+            budget.budget_s = min(budget.budget_s, WITH_FAULT_S)
+        return shows
 
-    looked_for = [(s, p.complaint) for s, p in properties]
-    make = None
+    make, budget = None, Budget(budget_s)
     try:
-        follows, coverage.unsound = searchable(policy)
-        plain = with_notes(policy)
         for drones in range(1, max_drones + 1):
             try:
-                exact = search_size(follows, plain, looked_for, confirm, drones, period_s, budget, make)
+                exact = search_size(policy, looked_for, confirm, drones, period_s, budget, make)
             except Combined as combined:
                 make = solver_paths(str(combined))
-                exact = search_size(follows, plain, looked_for, confirm, drones, period_s, budget, make)
+                exact = search_size(policy, looked_for, confirm, drones, period_s, budget, make)
             coverage.exact = coverage.exact and exact
             coverage.drones = drones
     except Stopped:
-        coverage.stopped = True
-    except (Refused, Reached) as refused:
-        coverage.cannot = str(refused)
-    except Exception as error:  # its file does not load with the checks
-        coverage.cannot = f"raises {type(error).__name__}: {text_of(error, str)}"
+        if coverage.drones < min(2, max_drones):
+            coverage.why = f"has more cells than {budget_s:g} s of processor time reach"
+    except Refused as refused:
+        coverage.why = str(refused)
     return coverage

@@ -30,7 +30,6 @@ from sortie.policies.verification.stand_ins import (
 )
 from sortie.policies.verification.symbols import Path, Ranged
 from sortie.policies.verification.views import LONGEST_S, OTHER_CODEBOOK
-from sortie.policies.verification.watch import WATCH
 from sortie.scenarios.disc import disc_overlap
 from sortie.scenarios.link_state import state_of
 
@@ -64,7 +63,6 @@ class FleetOfRanges:
     def _view(self, age_s: dict[int, Any]) -> FleetView:
         if self._descriptors is None:
             self._descriptors = _in_any_order(self, {i: DescriptorOfRanges(self, i) for i in self.heard})
-        WATCH.path = self.path
         return ViewOfRanges(self.ego, self.period_s, self._descriptors, _in_any_order(self, age_s))
 
     def _age(self, i: int) -> Ranged:
@@ -340,12 +338,8 @@ class ViewOfRanges(FleetView):
     __slots__ = ()
 
     def _replace(self, **fields: Any) -> Any:
-        if is_blind(sys._getframe(1)):  # mappings that a user's code made have the order that it gave them
-            system = self.descriptors[self.ego]._origin.system  # type: ignore[attr-defined]
-            fields = {
-                name: _in_any_order(system, value) if name in ("descriptors", "age_s") else value
-                for name, value in fields.items()
-            }
+        if not is_blind(sys._getframe(1)):
+            self.descriptors[self.ego]._origin.system.path.refuse("makes a view of its own")  # type: ignore[attr-defined]
         return FleetView._replace(self, **fields)
 
     @property

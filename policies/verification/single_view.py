@@ -9,11 +9,12 @@ from typing import Any
 from sortie.policies.checks import check_directives, find_inexact, find_wrong_type
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError
 from sortie.policies.verification.age_rule import listed, older_views, raised_part, without_detached
+from sortie.policies.verification.conformance import missing_links
 from sortie.policies.verification.invariants import Invariant, describe_directives, just_heard, violations
-from sortie.policies.verification.policy_rules import missing_links
-from sortie.policies.verification.search import Stopped
-from sortie.policies.verification.views import MAX_DRONES
 from sortie.scenarios.plugins.user_calls import text_of
+
+ONE_BY_ONE = 8
+"""Ages are raised drone by drone in views of up to so many; the kit does it in all of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +40,10 @@ class RepeatableView:
         return just_heard(self._plain).frozen
 
     def older(self) -> Iterator[FleetView]:
-        """The view with some raises of its ages: of each drone by itself and of all at once; above `MAX_DRONES`, of all at once alone."""
+        """The view with some raises of its ages: of each drone by itself and of all at once; above `ONE_BY_ONE`, of all at once alone."""
         if self._raised is not None:
             yield self._plain._replace(age_s=dict(self._raised)).frozen
-        for _, _, older in older_views(self._plain, one_by_one=len(self._plain.age_s) <= MAX_DRONES):
+        for _, _, older in older_views(self._plain, one_by_one=len(self._plain.age_s) <= ONE_BY_ONE):
             yield older.frozen
 
 
@@ -57,7 +58,7 @@ def keeps_contract(policy: Policy, view: Any) -> str | None:
 
 
 def only_falls_with_age(policy: Policy, view: Any) -> str | None:
-    """Raising any ages raises no directive's representation, budget or rate (`policy_rules.age_monotone`)."""
+    """Raising any ages raises no directive's representation, budget or rate (the kit's rule `age-monotone`)."""
     before = _exactly(policy(view.now()))
     for older in view.older():
         after = policy(older)
@@ -110,11 +111,9 @@ def check_property(
 
 
 def complaint_of(prop: Property, policy: Policy, view: RepeatableView) -> str | None:
-    """The complaint of a property about a policy on a view. An exception is a complaint too, except `Stopped`: it says that the time is over."""
+    """The complaint of a property about a policy on a view. An exception is a complaint too."""
     try:
         return prop.complaint(policy, view)
-    except Stopped:
-        raise
     except Exception as error:
         return _invalid_directive(policy, view.now()) or f"raises {type(error).__name__}: {text_of(error, str)}"
 

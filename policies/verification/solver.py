@@ -16,10 +16,10 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from sortie.policies.verification.symbols import MARK, Path, Ranged, Refused, Text
+from sortie.policies.verification.symbols import LONGEST_TEXT, MARK, Path, Ranged, Refused
 
-STEP_MS = 2000
-"""The longest time for one question to the solver."""
+STEP = 3_000_000
+"""The most steps of the solver, as it counts them (`rlimit`), for one question."""
 _EXAMPLES = 60
 """How many examples of a run are tried before none is found that floats do not round out of it."""
 _LEAST_MARGIN = 1e-13
@@ -44,7 +44,7 @@ def solver_paths(why: str = "combines inputs") -> Callable[[Sequence[int]], Path
     except ImportError:
         raise Refused(f"{why}, and z3 is not installed (pip install sortie-sim[verify])") from None
     solver = z3.Solver()
-    solver.set("timeout", STEP_MS)
+    solver.set("rlimit", STEP)
     return lambda script: SolvedPath(script, z3, solver)
 
 
@@ -55,7 +55,7 @@ class SolvedPath(Path):
         super().__init__(script)
         self.z3, self._solver = z3, solver
         solver.reset()
-        solver.set("timeout", STEP_MS)
+        solver.set("rlimit", STEP)
         self.facts: list[Any] = []
         self._terms: dict[str, Any] = {}
         self._model: Any = None
@@ -98,7 +98,7 @@ class SolvedPath(Path):
         model = self._solver.model() if answer == self.z3.sat else None
         self._solver.pop()
         if answer == self.z3.unknown:
-            self.refuse(f"combines inputs in a way that the solver does not decide within {STEP_MS / 1e3:g} s")
+            self.refuse("combines inputs in a way that the solver does not decide")
         if model is not None:
             self._model = model
         return model is not None
@@ -140,7 +140,7 @@ class SolvedPath(Path):
         super()._restore(tuple(rest))
         self.facts = list(facts)
         self._solver.reset()
-        self._solver.set("timeout", STEP_MS)
+        self._solver.set("rlimit", STEP)
         self._solver.add(*facts)
         self._model = None
 
@@ -352,15 +352,16 @@ class Solved(Ranged):
     def __floordiv__(self, other: object) -> Any:
         return self._cannot()
 
-    def _rounded(self, how: str) -> Any:
+    def _whole(self, *_: object) -> Any:
         return self._cannot()
+
+    __int__ = __floor__ = __ceil__ = __trunc__ = __round__ = _whole  # type: ignore[assignment]
 
     def __abs__(self) -> Any:
         return self if self >= 0 else -self
 
-    def _text(self, spec: str = "") -> str:
-        format(0.0 if isinstance(self, float) else 0, spec)  # a wrong spec must raise
-        return Text(self._path, self._axis, f"{MARK}{self._axis}{MARK}")
+    def __format__(self, spec: str) -> str:
+        return format(0.0 if isinstance(self, float) else 0, spec).rjust(LONGEST_TEXT, MARK)
 
     def _value_in(self, values: Mapping[str, float]) -> float:
         path: Any = self._path

@@ -79,18 +79,9 @@ class InAnyOrder(dict[int, Any]):
 
 
 def is_blind(frame: Any) -> bool:
-    """Whether the code that iterates is Sortie's own, and does not do so on behalf of a user's."""
+    """Whether the code that iterates is Sortie's own. A copy has the order of its original, which whoever gets it can see."""
     home = str(frame.f_globals.get("__name__", ""))
-    if home in _CHECKS:
-        return bool(frame.f_code.co_name == SORTS)
-    # a copy has the order of its original, which whoever gets the copy can see
     return home.startswith("sortie.") and frame.f_code is not plain_copy.__code__
-
-
-_CHECKS = {f"sortie.policies.verification.{m}" for m in ("call_checks", "value_checks", "watch")}
-"""What acts on behalf of a policy's code."""
-SORTS = "_sorted_ids"
-"""The function there that sees ids in no order."""
 
 
 class Flags:

@@ -1,61 +1,22 @@
-"""A policy as verification needs it: the plain one, one that runs on stand-ins with checks, and its own invariants."""
+"""A policy as verification needs it: its function loaded anew, its own invariants, and the numbers in its code."""
 
 from __future__ import annotations
 
+import ast
 import functools
-from collections.abc import Callable
+import inspect
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from sortie.policies.contract import Policy, PolicyError
-from sortie.policies.verification.instrument import instrumented
-from sortie.policies.verification.notes import load_with_notes
+from sortie.policies.verification.invariants import Invariant, Number
 from sortie.policies.verification.shield import Shielded
 from sortie.scenarios.plugins.reference import describe_error
-from sortie.scenarios.plugins.user_calls import Guarded, Source, guarded
+from sortie.scenarios.plugins.user_calls import Guarded
 
 OWN_INVARIANTS = "INVARIANTS"
 """The name under which a policy's file keeps its own invariants, as text."""
-NO_FILE = "is not a policy of Sortie's nor a function in a file that was named as file.py:function"
-
-
-def searchable(policy: Policy) -> tuple[Policy, str]:
-    """The policy that runs on stand-ins, and why a search of it cannot prove anything (empty: it can).
-
-    Raises:
-        Reached: loading its file used something that is not in a view.
-        Refused: its file cannot be checked.
-    """
-    found: Any = policy
-    if isinstance(found, functools.partial):
-        inner, why = searchable(found.func)
-        return functools.partial(inner, *found.args, **found.keywords), why
-    if isinstance(found, Guarded):
-        return (policy, NO_FILE) if found.source is None else (_with_checks(found.source), "")
-    if isinstance(found, Shielded):
-        inner, why = searchable(found.policy)
-        return Shielded(inner, found.rules), why
-    return policy, "" if _is_sorties(found) else NO_FILE
-
-
-def with_notes(policy: Policy) -> Policy:
-    """The policy as it is, with notes of what the code in its file computes.
-
-    Raises:
-        Exception: what its file raises.
-    """
-
-    def noted(function: Guarded) -> Policy:
-        if function.source is None:
-            return function
-        loaded = getattr(load_with_notes(function.source.file), function.source.name)
-        return Guarded(loaded, function.source)
-
-    return with_function(policy, noted)
-
-
-def apart(policy: Policy) -> Policy:
-    """The policy with a limit of time of its own: where it is late, the policy itself does not count as late."""
-    return Guarded(with_function(policy, lambda function: function.__wrapped__))
 
 
 def with_function(policy: Policy, change: Callable[[Guarded], Policy]) -> Policy:
@@ -73,8 +34,11 @@ def with_function(policy: Policy, change: Callable[[Guarded], Policy]) -> Policy
     return change(found) if isinstance(found, Guarded) else policy
 
 
-def _with_checks(source: Source) -> Policy:
-    found: Policy = Guarded(instrumented(source.file, source.name), source)
+def function_of(policy: Policy) -> Any:
+    """The policy without its bound parameters and its shield."""
+    found: Any = policy
+    while isinstance(found, functools.partial | Shielded):
+        found = found.func if isinstance(found, functools.partial) else found.policy
     return found
 
 
@@ -84,16 +48,14 @@ def own_invariants(policy: Policy) -> object:
     Raises:
         PolicyError: the file is asked for them, and fails.
     """
-    found: Any = policy
-    while isinstance(found, functools.partial):
-        found = found.func
+    found = function_of(policy)
     if not isinstance(found, Guarded) or found.source is None:
         return ""
     names = found.source.names
     if OWN_INVARIANTS in names or "__getattr__" not in names:
         return names.get(OWN_INVARIANTS, "")
     try:
-        return guarded(names["__getattr__"])(OWN_INVARIANTS)  # type: ignore[arg-type]  # as Python asks a module for any name
+        return names["__getattr__"](OWN_INVARIANTS)  # type: ignore[operator]  # as Python asks a module for any name
     except AttributeError:
         return ""
     except Exception as error:
@@ -102,12 +64,23 @@ def own_invariants(policy: Policy) -> object:
         ) from error
 
 
-def _is_sorties(function: Callable[..., Any]) -> bool:
-    """Whether a function, and all that it wraps, is at home in Sortie's policies."""
-    found: Any = function
-    while found is not None:
-        space = getattr(found, "__globals__", {})
-        if not str(space.get("__name__")).startswith("sortie.policies."):
-            return False
-        found = getattr(found, "__wrapped__", None)
-    return True
+def constants_of(policy: Policy, rules: Sequence[Invariant] = ()) -> set[float]:
+    """The numbers in a policy's file, among its parameters and in invariants, at which decisions may change."""
+    found: list[object] = [n.value for rule in rules for n in rule.nodes if isinstance(n, Number)]
+    bound: Any = policy
+    while isinstance(bound, functools.partial | Shielded):
+        found += bound.keywords.values() if isinstance(bound, functools.partial) else ()
+        bound = bound.func if isinstance(bound, functools.partial) else bound.policy
+    if isinstance(bound, Guarded) and bound.source is not None:
+        found += [value for value in bound.source.names.values() if type(value) in (int, float)]
+        path: Any = bound.source.file
+    else:
+        try:
+            path = inspect.getsourcefile(inspect.unwrap(bound))
+        except TypeError:  # an object that is called
+            path = inspect.getsourcefile(type(bound))
+    if path is not None:
+        with open(path, "rb") as file:
+            found += [node.value for node in ast.walk(ast.parse(file.read())) if isinstance(node, ast.Constant)]
+    limits = [float(x) for x in found if type(x) in (int, float) and abs(x) < 1e300]  # type: ignore[arg-type]
+    return {x for x in limits if math.isfinite(x)}

@@ -13,14 +13,11 @@ finite. So a bisection over the floats finds the last float below a boundary.
 from __future__ import annotations
 
 import math
-import numbers
 import struct
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NoReturn, TypeVar
-
-from sortie.scenarios.plugins.user_code import is_users
 
 T = TypeVar("T")
 
@@ -206,10 +203,8 @@ class Ranged:
             if low == high:
                 return other._at(low)
             raise Combined(self._path, self._axis, other._axis)
-        if isinstance(other, IntEnum) and computes_as_int(kind):
+        if isinstance(other, IntEnum):
             return int(other)
-        if issubclass(kind, int | float) or isinstance(other, numbers.Number):  # rounded, or compared, in another way
-            self._path.refuse(f"compares or combines {self._axis} with a {kind.__name__}")
         return None
 
     def _same(self, other: object) -> bool:
@@ -314,16 +309,12 @@ class Ranged:
     def _cannot(self, *_: object) -> NoReturn:
         self._path.refuse(f"uses {self._axis} for more than arithmetic with constants and comparisons")
 
-    __float__ = __int__ = __index__ = __round__ = __trunc__ = __floor__ = __ceil__ = __complex__ = _cannot
+    __float__ = __index__ = __complex__ = _cannot
     __pow__ = __rpow__ = __mod__ = __rmod__ = __rfloordiv__ = __rtruediv__ = __divmod__ = __rdivmod__ = _cannot
     __and__ = __rand__ = __or__ = __ror__ = __xor__ = __rxor__ = __lshift__ = __rlshift__ = __rshift__ = _cannot
     __rrshift__ = __invert__ = __reduce__ = __reduce_ex__ = __copy__ = __deepcopy__ = __sizeof__ = __dir__ = _cannot
     __array_ufunc__ = __array_function__ = _cannot  # numpy would raise TypeError, which the policy may catch
     __hash__ = _cannot
-
-    def _rounded(self, how: str) -> Ranged:
-        """The number after `int`, `math.floor`, `math.ceil`, `round` or `math.sqrt`: monotone functions of one argument."""
-        return self._then(how)
 
     def _value_in(self, values: Mapping[str, float]) -> float:
         """The number's value where `values` gives the value of its axis."""
@@ -332,22 +323,38 @@ class Ranged:
     def __getattr__(self, name: str) -> NoReturn:
         self._cannot()
 
-    def _text(self, spec: str = "") -> str:
-        """The number's text if the range is a single number; otherwise a text that can only be used as a reason."""
-        low, high = self._path.ranges[self._axis]
-        written = format(self._at(low), spec)  # also for a wide range, because a wrong spec must raise
-        if low == high and (self._at(low) != 0 or type(low) is int):  # a zero may be -0.0
-            return written
-        return Text(self._path, self._axis, f"{MARK}{self._axis}{MARK}")
-
     def __format__(self, spec: str) -> str:
-        return self._cannot() if for_policy(sys._getframe(1)) else self._text(spec)
+        """A text as long as the number's can be; `allowed` sees to it that it is used for nothing but a reason."""
+        low, high = self._path.ranges[self._axis]
+        return max(format(self._at(low), spec), format(self._at(high), spec), key=len).rjust(LONGEST_TEXT, MARK)
 
     def __str__(self) -> str:
-        return self._cannot() if for_policy(sys._getframe(1)) else self._text()
+        """For Sortie's errors alone: a policy could read the number in it."""
+        if not str(sys._getframe(1).f_globals.get("__name__")).startswith("sortie."):
+            self._cannot()
+        return format(self, "")
 
-    def __repr__(self) -> str:
-        return self._cannot() if for_policy(sys._getframe(1)) else self._text()
+    __repr__ = __str__
+
+    def __int__(self) -> int:
+        """The whole part. The run forks for each, if they are few."""
+        whole = self._then("int")
+        low, high = sorted(int(whole._at(x)) for x in self._path.ranges[self._axis])
+        if high - low > _MOST_WHOLE:
+            self._cannot()
+        return next((n for n in range(low, high) if whole <= n), high)
+
+    def __floor__(self) -> Any:
+        return self._then("floor")
+
+    def __ceil__(self) -> Any:
+        return self._then("ceil")
+
+    def __trunc__(self) -> Any:
+        return self._then("int")
+
+    def __round__(self, digits: int | None = None) -> Any:
+        return self._then("round") if digits is None else self._cannot()
 
     @property  # type: ignore[misc]
     def __class__(self) -> Any:
@@ -355,82 +362,11 @@ class Ranged:
         return type(self._at(self._path.ranges[self._axis][0]))
 
 
-def computes_as_int(kind: type) -> bool:
-    """Whether a class of whole numbers has the operators of `int`. A plain number lets others answer first."""
-    return all(getattr(kind, name, None) is found for name, found in _OF_INT.items())
-
-
-_NOT_OPERATORS = {
-    "__new__", "__repr__", "__str__", "__format__", "__hash__", "__getattribute__", "__getnewargs__", "__sizeof__", "__doc__",
-}  # fmt: skip
-_OF_INT = {name: getattr(int, name) for name in vars(int) if name[:2] == "__" and name not in _NOT_OPERATORS}
-
-
-def for_policy(frame: Any) -> bool:
-    """Whether a policy wants a text, through compiled code, the checks on it or Python's library.
-
-    The checks ask for `_text`, of which they know what becomes. Sortie's own policies and errors put texts into reasons alone.
-    """
-    home = str(frame.f_globals.get("__name__", ""))
-    return home in _CHECKS or is_users(home) or home.partition(".")[0] in sys.stdlib_module_names
-
-
-_CHECKS = {f"sortie.policies.verification.{m}" for m in ("call_checks", "value_checks")}
-
-
-class Text(str):
-    """The text of a number with a known range. It can be used as a reason; any other use raises `Refused`.
-
-    Sortie's own f-strings and `join` make plain text of it. The plain text has a mark instead of the number, so code that
-    reads a number there fails. The checks keep a policy's text a `Text` (`value_checks`), and refuse compiled code that would
-    read what is stored (`call_checks`).
-    """
-
-    _path: Path
-    _axis: str
-
-    def __new__(cls, path: Path, axis: str, content: str) -> Text:
-        made = super().__new__(cls, content)
-        made._path, made._axis = path, axis
-        return made
-
-    def _plain(self) -> str:
-        return str.__str__(self)
-
-    def __add__(self, other: str) -> Text:
-        return Text(self._path, self._axis, str.__add__(self, other))
-
-    def __radd__(self, other: str) -> Text:
-        return Text(self._path, self._axis, str.__add__(other, self._plain()))
-
-    def _text(self, spec: str = "") -> Text:
-        return Text(self._path, self._axis, str.__format__(self, spec))
-
-    def __format__(self, spec: str) -> str:
-        return self._refused() if for_policy(sys._getframe(1)) else self._text(spec)
-
-    def __str__(self) -> str:
-        return self._refused() if for_policy(sys._getframe(1)) else self
-
-    def __repr__(self) -> str:
-        return self._refused() if for_policy(sys._getframe(1)) else self
-
-    def __bool__(self) -> bool:
-        return True  # the text of a number is never empty, and the checks let no format cut it
-
-    def _refused(self, *_: object, **__: object) -> NoReturn:
-        self._path.refuse(f"uses the text of {self._axis} for more than a reason")
-
-
-_INHERITED = {
-    "__new__", "__init__", "__init_subclass__", "__subclasshook__", "__class__", "__doc__", "__dir__", "__getattribute__",
-    "__setattr__", "__delattr__", *vars(Text),
-}  # fmt: skip
-for _method in {*dir(str), "__float__", "__int__", "__index__", "__complex__"} - _INHERITED:
-    setattr(Text, _method, Text._refused)
-
 MARK = "\ue000"
-"""Stands in a text where Sortie's own code wrote a number with a range."""
+"""Fills texts of numbers with a range."""
+LONGEST_TEXT = 24
+_MOST_WHOLE = 200
+"""Into so many whole parts a run forks."""
 _WHOLE = 2.0**40
 """Up to here Python's `//` of floats is monotone: it rounds a quotient before it takes its whole part."""
 _EXACT = 2.0**53
@@ -447,7 +383,6 @@ _STEPS: dict[str, Callable[[float, float], float]] = {
     "floor": lambda x, _: math.floor(x),
     "ceil": lambda x, _: math.ceil(x),
     "round": lambda x, _: round(x),
-    "sqrt": lambda x, _: math.sqrt(x),
 }
 
 

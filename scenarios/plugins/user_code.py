@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import ast
 import builtins
-import contextlib
 import functools
 import hashlib
 import importlib
@@ -21,13 +20,13 @@ import importlib.util
 import sys
 import sysconfig
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, SourceFileLoader
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 PREFIX = "sortie_user_"
 """The first part of the name of every module that `load` registers."""
@@ -36,37 +35,16 @@ _INSTALLED = {"site-packages", "dist-packages"}
 _LOADING = threading.RLock()
 
 
-Compile = Callable[[bytes, str], CodeType]
-"""From a source and its path to the code that runs."""
-
-
-def load(
-    path: Path, compiled: Compile | None = None, own_builtins: Callable[[Any], dict[str, Any]] | None = None
-) -> ModuleType:
+def load(path: Path) -> ModuleType:
     """Run a file as a new module, with new modules for all that it imports from its folder.
 
     Args:
         path: the file.
-        compiled: compiles its source and those of the modules beside it; left out, as Python does.
-        own_builtins: makes their builtins from the function that finds their imports; left out, Python's.
 
     Raises:
         Exception: what the file, or a module that it imports, raises.
     """
-    return _Folder(path.resolve(), compiled, own_builtins).load()
-
-
-def modules_with(main: ModuleType) -> dict[str, ModuleType]:
-    """The modules of the run that a module belongs to, by name. Those that only a function imports are imported now.
-
-    Args:
-        main: a module that `load` returned.
-
-    Raises:
-        Exception: what such a module raises, but for ImportError.
-    """
-    loader: Any = main.__spec__ and main.__spec__.loader
-    return loader.folder.import_all() if isinstance(loader, _Loader) else {}
+    return _Folder(path.resolve()).load()
 
 
 def is_users(name: object) -> bool:
@@ -97,38 +75,19 @@ def imported_packages(path: Path) -> set[str]:
 class _Folder(MetaPathFinder):
     """The modules of one run of a file, found in the file's folder."""
 
-    def __init__(
-        self,
-        path: Path,
-        compiled: Compile | None = None,
-        own_builtins: Callable[[Any], dict[str, Any]] | None = None,
-    ) -> None:
-        self._path, self.compiled = path, compiled
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._package = PREFIX + hashlib.sha256(str(path).encode()).hexdigest()[:16]
         self._main = f"{self._package}.{path.stem.replace('.', '_')}"
         package = ModuleType(self._package)
         package.__path__ = [str(path.parent)]
         self._modules = {self._package: package}
         self._beside: dict[str, bool] = {}
-        make = own_builtins or (lambda find: vars(builtins) | {"__import__": find})
-        self.builtins = make(self._import)
+        self.builtins = vars(builtins) | {"__import__": self._import}
 
     def load(self) -> ModuleType:
         self._registered(self._main)
         return self._modules[self._main]
-
-    def import_all(self) -> dict[str, ModuleType]:
-        """Every module of this run, with those that its functions import."""
-        read = set[str]()
-        while unread := self._modules.keys() - read:
-            read |= unread
-            for module in [self._modules[name] for name in sorted(unread)]:
-                file = Path(getattr(module, "__file__", None) or "")
-                for name, item, level in _named(_Source(file, None)) if file.suffix == ".py" else ():
-                    if level or self._is_beside(name.partition(".")[0]):
-                        with contextlib.suppress(ImportError):
-                            self._import(name, vars(module), None, [item] if item else [], level)
-        return self._modules
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Where a module of this run is. Python calls this while `_registered` imports."""
@@ -198,8 +157,7 @@ class _Loader(SourceFileLoader):
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
-        code: CodeType = (self.folder.compiled or self.source_to_code)(self.get_data(path), path)
-        return code
+        return self.source_to_code(self.get_data(path), path)
 
     def exec_module(self, module: ModuleType) -> None:
         vars(module)["__builtins__"] = self.folder.builtins

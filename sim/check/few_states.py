@@ -22,13 +22,12 @@ from sortie.fleet.staleness import cap_by_age, health
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import DETACHED_AFTER_PERIODS, Directive, Disc, Policy, PolicyError, nothing
 from sortie.policies.damping import EPSILON_S, DampedLink, damp, is_climb, is_switch, lower_of
-from sortie.policies.verification.confine import Reached
+from sortie.policies.verification.allowed import why_not_provable
 from sortie.policies.verification.enforced import effective
 from sortie.policies.verification.invariants import Invariant, LinksTerm, Recent, violations
 from sortie.policies.verification.past import ROUNDING_S
 from sortie.policies.verification.ranges import FleetOfRanges, region_axes
 from sortie.policies.verification.search import Budget, Run, rosters
-from sortie.policies.verification.subject import searchable, with_notes
 from sortie.policies.verification.symbols import Path, Ranged, Refused, explore
 from sortie.policies.verification.words import DWELL, Span
 from sortie.scenarios.plugins.user_calls import text_of
@@ -79,7 +78,7 @@ def prove_over_time(policy: Policy, rule: Invariant, times: PlaneTimes, drones: 
     for size in range(2, drones + 1):
         try:
             states += _prove_size(policy, rule, times, size, alone, budget, done)
-        except (Refused, Reached) as refused:
+        except Refused as refused:
             raise NotFinite(f"it {refused}") from None
         except NotFinite as error:
             if covered < 2:
@@ -129,10 +128,9 @@ def _letters(
     policy: Policy, rule: Invariant, times: PlaneTimes, size: int, alone: bool, budget: Budget
 ) -> tuple[dict[int, set[Letter]], tuple[Directive, ...]]:
     """By ego, all letters; and all directives that a link may enforce, without their ends."""
-    follows, unsound = searchable(policy)
-    plain = with_notes(policy)
-    if unsound:
-        raise NotFinite(f"it {unsound}")
+    why = why_not_provable(policy)
+    if why:
+        raise NotFinite(f"it {why}")
     known: dict[Directive, None] = {_bare(nothing(0, 0, "")): None}
     while True:
         before = len(known)
@@ -141,10 +139,10 @@ def _letters(
             found: set[Letter] = by_ego.setdefault(ego, set())
 
             def run(path: Path, ego: int = ego, heard: tuple[int, ...] = heard) -> Run:
-                return Run(follows, FleetOfRanges(path, size, ego, heard, times.period_s))
+                return Run(policy, FleetOfRanges(path, size, ego, heard, times.period_s))
 
             for path, decided in explore(run):
-                decided.compare(plain)
+                decided.compare()
                 found.update(_letters_of(path, decided, rule, times, alone, known))
                 if budget.is_spent:
                     raise NotFinite(f"the time of {budget.budget_s:g} s ended")

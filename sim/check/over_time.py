@@ -20,13 +20,13 @@ from sortie.policies.verification.courses import (
     Course,
     Values,
     changed_course,
-    constants_of,
     draw_course,
     shrink_course,
 )
 from sortie.policies.verification.invariants import Invariant, Recent
 from sortie.policies.verification.proof import Outcome
 from sortie.policies.verification.search import Budget, Stopped
+from sortie.policies.verification.subject import constants_of
 from sortie.policies.verification.views import to_json
 from sortie.policies.verification.words import DWELL
 from sortie.scenarios.reading.load import loads
@@ -37,6 +37,8 @@ from sortie.sim.check.counterexample import shows_in_flight, slug
 from sortie.sim.check.few_states import NotFinite, prove_over_time
 from sortie.sim.engine.sortie import run_sortie
 
+BUDGET_S = 60.0
+"""Processor time for the proofs of all lines about time if nothing else is asked for, and again for courses and flights."""
 COURSES = 400
 """How many courses are tried for each line."""
 _FROM_BEST = 0.6
@@ -84,7 +86,7 @@ def judge_over_time(
         subject: the policy.
         rules: lines about time.
         drones: the largest fleet of courses and proofs; two at least, because one drone has no link.
-        budget_s: wall-clock time for the proofs of all lines together, and again for all courses and flights.
+        budget_s: processor time for the proofs of all lines together, and again for all courses and flights.
         scenario: whose dwell time, staleness rules and shield apply, and which is flown too; None takes the defaults.
         courses: how many for each line.
         flights: how many of the scenario.
@@ -110,7 +112,7 @@ def judge_over_time(
             covered = prove_over_time(subject.policy, rule, times, drones, proving)
             verdicts.append(TimeVerdict(rule.text, "proved", f"{covered}; {said}"))
         except NotFinite as why:
-            verdicts.append(TimeVerdict(rule.text, "searched", f"{said}; not proved: {why}"))
+            verdicts.append(TimeVerdict(rule.text, "tried", f"{said}; not proved: {why}"))
     return verdicts
 
 

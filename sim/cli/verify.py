@@ -17,9 +17,8 @@ from sortie.policies.contract import FleetView, Policy
 from sortie.policies.registry import resolve
 from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
 from sortie.policies.verification.invariants import Invariant, InvariantError, parse
-from sortie.policies.verification.proof import DRONES, ProofVerdict, prove
+from sortie.policies.verification.proof import DRONES, PLANE_S, SEARCH_S, ProofVerdict, prove
 from sortie.policies.verification.properties import PROMISES
-from sortie.policies.verification.search import BUDGET_S, LEAST_DRAWN_S
 from sortie.policies.verification.shield import check_shieldable
 from sortie.policies.verification.single_view import PLANE
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
@@ -33,6 +32,7 @@ from sortie.scenarios.schema import PolicySection, Scenario
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
 from sortie.sim.check.kits import KITS
 from sortie.sim.check.kits import verify as verify_model
+from sortie.sim.check.over_time import BUDGET_S as OVER_TIME_S
 from sortie.sim.check.over_time import COURSES, Subject, TimeVerdict, judge_over_time
 from sortie.sim.cli.console import out, print_failure, print_written
 from sortie.sim.cli.options import refuse
@@ -44,8 +44,7 @@ Kept = tuple[str, FleetView | None, Scenario]
 WRITTEN = "# A counterexample, written by sortie verify.\n"
 FOR_POLICIES = ("invariants", "drones", "budget", "views", "scenario", "courses", "flights", "out_dir")
 COLOURS = {
-    "holds": "green", "fails": "red", "proved": "green", "proved over the reals": "green", "refuted": "red",
-    "searched": "yellow", "drawn": "yellow",
+    "holds": "green", "fails": "red", "unfinished": "yellow", "proved": "green", "refuted": "red", "tried": "yellow",
 }  # fmt: skip
 
 
@@ -73,12 +72,12 @@ def verify(
         ),
     ] = DRONES,
     budget: Annotated[
-        float,
+        float | None,
         typer.Option(
-            help=f"Time for the proofs of all properties together, s. The kit, and the random views of the properties, get as much again each, and at least {LEAST_DRAWN_S:g} s. Lines about time get as much again for their proofs, and as much for courses and flights.",
+            help=f"Processor time for the proofs of all properties together, s, and again for random views; default: {PLANE_S:g} s, and {SEARCH_S:g} s for each invariant. Lines about time get as much for their proofs, and again for courses and flights.",
             min=0,
         ),
-    ] = BUDGET_S,
+    ] = None,
     views: Annotated[int, typer.Option(help="Number of random views that the kit tries.", min=10)] = VIEWS,
     scenario: Annotated[
         str | None,
@@ -93,9 +92,8 @@ def verify(
     """Test a policy or another model against the rules of its kind. Exit code 1 if a rule fails.
 
     The options are for policies. A policy is tested on random views, and the command tries to prove its properties
-    (*invariants*). Each verdict says what it covers: *proved* for all views of fleets up to a size, *proved over the
-    reals* (as if nothing were rounded), *searched* (some of all views), or *drawn* (random views alone). The exit code is
-    also 1 if a property is refuted, and 154 if the policy's code does not return and cannot be interrupted.
+    (*invariants*). A property is *proved* for all views of fleets up to a size, *refuted* by a view, or *tried* on so many
+    views. The exit code is also 1 if a property is refuted.
 
     Invariants about time (`within 0.5 s: …`, `climbs_in(dwell) <= 1`) are tested on sequences of views. What counts is
     what the gates enforce, after staleness rules and damping.
@@ -125,7 +123,13 @@ def verify(
         if over_time:
             subject = Subject(decide, section.name, section.params)
             verdicts = judge_over_time(
-                subject, over_time, drones=drones, budget_s=budget, scenario=flown, courses=courses, flights=flights
+                subject,
+                over_time,
+                drones=drones,
+                budget_s=OVER_TIME_S if budget is None else budget,
+                scenario=flown,
+                courses=courses,
+                flights=flights,
             )
             out.print(_verdicts(f"{policy}: over time, as the gates enforce it", verdicts))
             broken += sum(v.outcome == "refuted" for v in verdicts)
@@ -143,7 +147,7 @@ def _verify_model(kind: str, reference: str) -> None:
     with watched(DECISION_S):
         checks = verify_model(kind, name, params)
     for check in checks:
-        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), check.what)
+        table.add_row(check.name, _verdict(_word(check)), check.what)
     out.print(table)
     broken = len(failing(checks))
     if broken:
@@ -157,15 +161,15 @@ def _try(
     decide: Policy,
     rules: Sequence[Invariant],
     drones: int,
-    budget: float,
+    budget: float | None,
     views: int,
     has_more: bool,
 ) -> tuple[int, list[Kept]]:
     """Print what the kit and the proofs say; how many rules and properties are broken, and what shows it."""
     table = Table("rule", "verdict", "what", title=f"{policy}: the conformance kit, {views} drawn views")
-    checks = conform(decide, count=views, budget_s=budget)
+    checks = conform(decide, count=views)
     for check in checks:
-        table.add_row(check.name, _verdict("holds" if check.holds else "fails"), check.what)
+        table.add_row(check.name, _verdict(_word(check)), check.what)
     out.print(table)
     verdicts = prove(decide, rules, max_drones=drones, budget_s=budget)
     out.print(_verdicts(f"{policy}: proofs", verdicts))
@@ -186,6 +190,10 @@ def _verdicts(title: str, verdicts: Sequence[ProofVerdict | TimeVerdict]) -> Tab
     for verdict in verdicts:
         table.add_row(verdict.name, _verdict(verdict.outcome), verdict.what)
     return table
+
+
+def _word(check: Check) -> str:
+    return "holds" if check.holds else "unfinished" if check.unfinished else "fails"
 
 
 def _verdict(word: str) -> Text:

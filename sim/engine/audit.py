@@ -9,7 +9,7 @@ import simpy
 
 from sortie.policies.contract import Directive
 from sortie.policies.verification.enforced import CAUSES, POLICY, Violation
-from sortie.policies.verification.shield_together import MARK
+from sortie.policies.verification.shield import MARK
 from sortie.sim.results.record import DECISIONS_OF, VIOLATIONS_OF, Recorder
 
 _Key = tuple[int, str, str]  # peer, line, cause

@@ -39,8 +39,7 @@ from sortie.policies.verification.invariants import (
     violations,
 )
 from sortie.policies.verification.past import Past
-from sortie.policies.verification.shield import check_shieldable, enforce
-from sortie.policies.verification.shield_together import MARK, Ceilings
+from sortie.policies.verification.shield import MARK, Ceilings, check_shieldable, enforce
 from sortie.policies.verification.views import ViewError, from_json
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plugins.user_calls import is_guarded

@@ -13,7 +13,8 @@ from sortie.fleet.gate import Gate, make_payload
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age, health
 from sortie.policies.contract import Directive, Disc, Representation
-from sortie.policies.verification.links import as_link
+from sortie.policies.verification.invariants import COMPARE
+from sortie.policies.verification.words import DECISIONS
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 ORIGIN = (0.0, 0.0, 0.0)
@@ -55,8 +56,7 @@ NUMBERS = st.sampled_from([0.0, 0.1, 0.5, 1.0, 2.0, 5.0])
                  st.sampled_from([None, Disc(0.0, 0.0, 5.0)]), NUMBERS, NUMBERS, st.sampled_from([0.5, 1.0])),
        st.sampled_from(LinkHealth))  # fmt: skip
 def test_a_ceiling_allows_the_directives_that_age_leaves_as_they_are(asked: Directive, health: LinkHealth) -> None:
-    link = as_link(asked)
-    below = all(compare(link[at], value) for at, (compare, value) in CEILING[health])
+    below = all(COMPARE[sign](DECISIONS[word].raw(asked), value) for word, sign, value in CEILING[health])  # type: ignore[misc]
     assert below == (cap_by_age(asked, health, 0.5) == asked)
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from sortie.policies.catalogue.baselines import everyone
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.catalogue.worked import worked
-from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase
+from sortie.policies.contract import Directive, FleetView, Representation, TaskPhase
 from sortie.policies.geometry import footprint_overlap
 
 
@@ -60,50 +58,6 @@ def charge(view: FleetView) -> float:
     return 1.0 if view.me is None else view.me.battery_soc
 
 
-def reads_text(view: FleetView) -> list[Directive]:
-    return rises(view, f"{charge(view):.7f}" == "0.1234567")
-
-
-def reads_the_start_of_text(view: FleetView) -> list[Directive]:
-    return rises(view, str(charge(view)).startswith("0.1234567"))
-
-
-def asks_for_the_type(view: FleetView) -> list[Directive]:
-    return rises(view, type(charge(view)) is float and 0.1234567 < charge(view) < 0.12345671)
-
-
-def asks_for_the_type_in_a_helper(view: FleetView) -> list[Directive]:
-    return rises(view, Kind.of(charge(view)) and 0.1234567 < charge(view) < 0.12345671)
-
-
-def guards(view: FleetView) -> list[Directive]:
-    me = view.me
-    sound = isinstance(me, Descriptor) and isinstance(me.battery_soc, float)
-    return rises(view, sound and isinstance(charge(view), int | float) and 0.1234567 < charge(view) < 0.12345671)
-
-
-def reads_the_highest_flag(view: FleetView) -> list[Directive]:
-    return rises(view, view.me is not None and view.me.novelty_flags & 128)
-
-
-class Kind:
-    @staticmethod
-    def of(x: object) -> bool:
-        return KINDS["one"](x) is float
-
-
-KINDS = {"one": lambda x: type(x)}
-
-
-class Asks:
-    def __call__(self, view: FleetView) -> list[Directive]:
-        return asks_for_the_type(view)
-
-
-asks = Asks()
-bound = partial(asks_for_the_type)
-
-
 def falls(view: FleetView) -> list[Directive]:
     return [d._replace(rate_hz=10.0 if view.age_s[d.destination] / view.period_s <= 3 else 2.0) for d in everyone(view)]
 
@@ -113,12 +67,6 @@ def explains(view: FleetView) -> list[Directive]:
         full_sharing(view.ego, p, 1.0, f"{charge(view):.0%}" if p == 1 else f"{charge(view):.0%} left")
         for p in view.peers
     ]
-
-
-def gives_other_types(view: FleetView, *, fields: dict[str, object]) -> list[Directive]:
-    me = view.me
-    tired = me is not None and 0.12 < me.battery_soc < 0.12001
-    return [d._replace(**fields) if tired and d.destination == 1 else d for d in everyone(view)]
 
 
 def drops(view: FleetView) -> list[Directive]:

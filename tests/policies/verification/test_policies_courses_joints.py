@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -20,13 +20,13 @@ from sortie.policies.verification.courses import (
     Course,
     Values,
     changed_course,
-    constants_of,
     draw_course,
     shrink_course,
 )
+from sortie.policies.verification.drawn import views_at
 from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.own_constants import views_at
 from sortie.policies.verification.shield import shield
+from sortie.policies.verification.subject import constants_of
 
 STILL = Course(3, 20, 0.1, 0.1, 10.0, {}, {})
 VALUES = Values.of(())
@@ -85,29 +85,18 @@ def test_drawn_values_lie_on_both_sides_of_a_constant_that_can_be_one() -> None:
     assert set(Values.of({0.0, 1.0}).soc) - set(usual.soc) == {0.0, 1e-4, 1.0 - 1e-4}
 
 
-class _Holder:
-    limit = 0.2468
-
-    def __init__(self, own: float) -> None:
-        self.own = own
-
-
 AT_MODULE = {"a": 0.1357, 0.9753: "b"}
 
 
-def _decider(inner: float) -> Callable[..., Any]:
-    def decide(view: FleetView, by_place: float = 0.1122, *, by_name: float = 0.3344) -> list[Directive]:
-        limits = AT_MODULE, inner, by_place, by_name, 0.5566
-        return [] if len(limits) > view.ego else list[Directive]()
-
-    return decide
+def _decide(view: FleetView, by_place: float = 0.1122, *, by_name: float = 0.3344) -> list[Directive]:
+    limits = AT_MODULE, by_place, by_name, 0.5566
+    return [] if len(limits) > view.ego else list[Directive]()
 
 
 def test_the_numbers_of_a_policy_are_found_wherever_its_code_keeps_them() -> None:
-    found = constants_of(partial(_decider(0.7788), by_name=0.9911), parse("when battery < 0.4321: rho <= 0.8765"))
-    assert found >= {0.1357, 0.9753, 0.1122, 0.3344, 0.5566, 0.7788, 0.9911, 0.4321, 0.8765}
-    assert constants_of(shield(_decider(0.6161), parse("rho <= 1"))) >= {0.6161, 0.5566}
-    assert constants_of([math.inf, math.nan, 0.5]) == {0.5}
+    found = constants_of(partial(_decide, by_name=0.1100 + 1e-5), parse("when battery < 0.4321: rho <= 0.8765"))
+    assert found >= {0.1357, 0.9753, 0.1122, 0.3344, 0.5566, 0.1100 + 1e-5, 0.4321, 0.8765}
+    assert constants_of(shield(_decide, parse("rho <= 1"))) >= {0.1357, 0.5566}
 
 
 def _lines(course: Course) -> Any:

@@ -9,8 +9,6 @@
 
 from __future__ import annotations
 
-import operator
-
 import pytest
 from policies_examples import fleet_of
 
@@ -26,10 +24,8 @@ from sortie.policies.verification.enforced import (
     put_right,
 )
 from sortie.policies.verification.invariants import parse, violations
-from sortie.policies.verification.links import LEVEL, RATE_HZ
 from sortie.policies.verification.past import Past
-from sortie.policies.verification.shield import enforce, shield
-from sortie.policies.verification.shield_together import Ceilings
+from sortie.policies.verification.shield import Ceilings, enforce, shield
 
 NONE, DETECTIONS, FEATURES = Representation.NONE, Representation.DETECTIONS, Representation.FEATURES
 VIEW = fleet_of(4)
@@ -61,7 +57,7 @@ def test_a_link_that_rests_is_put_right_as_one_that_carries_nothing() -> None:
 
 
 def test_a_limit_is_each_links_own() -> None:
-    ceilings: Ceilings = {1: ((LEVEL, (operator.le, 0.0)),), 2: ((RATE_HZ, (operator.le, 4.0)),), 3: ()}
+    ceilings: Ceilings = {1: (("representation", "<=", 0.0),), 2: (("rate_hz", "<=", 4.0),), 3: ()}
     damped = [link(peer, NONE, 0.0) for peer in (1, 2, 3)]
     first, second, third = put_right(parse("rate_hz >= 3 and representation >= features"), VIEW, damped, (), ceilings)
     assert first is damped[0]  # nothing that is allowed mends it

@@ -51,23 +51,10 @@ def test_a_policy_that_sends_nothing_by_its_name_is_proved(name: str, tmp_path: 
     assert all(kit.values())
 
 
-def test_how_often_a_cache_was_asked_is_no_input(tmp_path: Path) -> None:
-    head = f"{NAMES['nothing']}\nfrom sortie.policies.catalogue.coverage_cells import new_share"
-    rate = "5.0 if new_share.cache_info().hits < 10**9 else 9.0"
-    verdict, _ = outcomes(tmp_path, head, LANDS.format(name="nothing"), rate)
-    assert verdict == "drawn"
-
-
 def test_what_few_views_reach_and_no_search_follows_ends_the_search_and_not_the_kit(tmp_path: Path) -> None:
     landing = "rate = 0.0 * random.Random(view.ego).random()\n        return [Directive(view.ego, p, rate_hz=rate, reason='x') for p in view.peers]"
     verdict, kit = outcomes(tmp_path, "import random", landing)
-    assert (verdict, all(kit.values())) == ("drawn", True)
-
-
-def test_other_parts_of_the_policies_package_are_no_input(tmp_path: Path) -> None:
-    landing = "return [Directive(view.ego, p, reason=f'{len(registry.POLICIES)}') for p in view.peers]"
-    verdict, kit = outcomes(tmp_path, "from sortie.policies import registry", landing)
-    assert (verdict, kit["reads only its view"]) == ("drawn", False)
+    assert (verdict, all(kit.values())) == ("tried", True)
 
 
 def test_equal_arguments_of_other_types_leave_nothing_behind() -> None:

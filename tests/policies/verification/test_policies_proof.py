@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,11 +14,9 @@ from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import resolve
 from sortie.policies.verification import drawn
-from sortie.policies.verification.advice import advise
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import ProofVerdict, check_property, property_of, prove
 from sortie.policies.verification.properties import PROMISES
-from sortie.policies.verification.search import BUDGET_S
 from sortie.policies.verification.views import from_json, to_json
 
 Decide = Callable[[FleetView], Sequence[Directive]]
@@ -27,7 +24,7 @@ HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detec
 
 
 def quick(
-    policy: Decide, line: str = "", drones: int = 2, views: int = 20, budget_s: float = BUDGET_S
+    policy: Decide, line: str = "", drones: int = 2, views: int = 20, budget_s: float = 60.0
 ) -> list[ProofVerdict]:
     return prove(policy, parse(line), max_drones=drones, views=views, budget_s=budget_s)
 
@@ -85,16 +82,23 @@ def test_a_crash_at_one_single_float_is_found() -> None:
 @pytest.mark.parametrize(
     ("fields", "what"),
     [
-        ({"destination": 1.0}, "destination is 1.0, must be a drone's id, a whole number"),
-        ({"reason": 5}, "reason is 5, must be text"),
-        ({"rate_hz": "10"}, "rate_hz is '10', must be in [0, 30], a number"),
+        ("destination=1.0", "destination is 1.0, must be a drone's id, a whole number"),
+        ("reason=5", "reason is 5, must be text"),
+        ("rate_hz='10'", "rate_hz is '10', must be in [0, 30], a number"),
     ],
 )
 def test_a_directive_of_other_types_is_refuted_and_named_by_every_property(
-    fields: dict[str, object], what: str
+    fields: str, what: str, tmp_path: Path
 ) -> None:
-    contract, *_, rates = quick(partial(planted("gives_other_types"), fields=fields), "rate_hz <= 10")
-    assert (contract.outcome, contract.what) == ("refuted", f"directive 0→{fields.get('destination', 1)}: {what}")
+    file = tmp_path / "policy.py"
+    file.write_text(
+        "from sortie import Directive\ndef decide(view):\n    tired = view.me is not None and 0.12 < view.me.battery_soc < 0.12001\n"
+        "    decided = [Directive(view.ego, p, reason='r') for p in view.peers]\n"
+        f"    return [d._replace({fields}) if tired and d.destination == 1 else d for d in decided]\n"
+    )
+    contract, *_, rates = quick(resolve(f"{file}:decide"), "rate_hz <= 10")
+    to = "1.0" if "destination" in fields else "1"
+    assert (contract.outcome, contract.what) == ("refuted", f"directive 0→{to}: {what}")
     assert rates.outcome == ("refuted" if "rate_hz" in fields else "proved")
     assert rates.outcome == "proved" or rates.what == contract.what
 
@@ -103,31 +107,9 @@ def test_a_directive_of_other_types_is_refuted_and_named_by_every_property(
 def test_what_cannot_be_searched_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawn, "LARGE_S", 0.2)  # each property would wait out its 10 s at the largest view
     verdict = quick(random_k)[0]
-    assert verdict.outcome == "drawn"
-    assert verdict.what.startswith("Cannot analyse: it reads stamp_ns, which cannot be searched. To make it provable: ")
+    assert verdict.outcome == "tried"
+    assert verdict.what.endswith("; not proved: it reads stamp_ns, which cannot be searched")
     assert last(random_k, "representation == none").outcome == "refuted", "by a drawn view"
-
-
-@pytest.mark.parametrize("name", ["reads_text", "reads_the_start_of_text"])
-def test_a_policy_that_reads_the_text_of_its_numbers_is_not_proved(name: str) -> None:
-    verdict = quick(planted(name))[0]
-    assert verdict.outcome == "drawn"
-    assert verdict.what == (
-        "Cannot analyse: it uses the text of battery_soc of drone 0 for more than a reason. To make it provable: put "
-        "numbers into the reason alone; 20 drawn views of up to 20 drones, 25 at the policy's own constants, 2 of 200 "
-        "drones and 2 of 5,000 keep it"
-    )
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "asks_for_the_type", "bound", "asks", "asks_for_the_type_in_a_helper", "guards", "reads_the_highest_flag",
-    ],
-)  # fmt: skip
-def test_what_is_answered_as_in_flight_is_searched(name: str) -> None:
-    verdict = quick(planted(name))[0]
-    assert (verdict.outcome, verdict.what) == ("refuted", "directive 0→1: rho is 2.0, must be in [0, 1]")
 
 
 def test_a_function_without_a_file_is_searched_and_not_proved() -> None:
@@ -137,7 +119,7 @@ def test_a_function_without_a_file_is_searched_and_not_proved() -> None:
     (*_, slow) = quick(decide, "rate_hz <= 10")
     assert slow.outcome == "refuted"
     verdict = quick(decide, "rate_hz <= 20")[-1]
-    assert verdict.outcome == "searched"
+    assert verdict.outcome == "tried"
     assert "it is not a policy of Sortie's nor a function in a file that was named as file.py:function" in verdict.what
 
 
@@ -155,14 +137,14 @@ def test_a_number_in_a_reason_is_no_obstacle() -> None:
 )
 def test_a_policy_beyond_the_search_is_not_called_proved(name: str, why: str) -> None:
     verdict = quick(planted(name), "rate_hz <= 10")[-1]
-    assert verdict.outcome in ("drawn", "refuted")
+    assert verdict.outcome in ("tried", "refuted")
     assert why in verdict.what or "AssertionError" in verdict.what
 
 
 def test_a_spent_budget_is_not_called_proved() -> None:
     verdict = quick(worked, drones=3, budget_s=0.0)[0]
-    assert verdict.outcome == "searched"
-    assert "the time of 0 s ended in fleets of 1" in verdict.what
+    assert verdict.outcome == "tried"
+    assert "it has more cells than 0 s of processor time reach" in verdict.what
 
 
 def test_a_line_that_larger_fleets_break_is_not_proved_for_them() -> None:
@@ -176,7 +158,8 @@ def test_a_line_that_larger_fleets_break_is_not_proved_for_them() -> None:
 def test_a_proof_says_how_large_the_fleets_are_and_when_a_peer_is_detached() -> None:
     verdict = quick(everyone, "count_links(representation > none) <= 2", views=0)[-1]
     covered = "all views of up to 2 drones, at a period of 0.1 s, detached after 10 periods"
-    assert (verdict.outcome, verdict.what.rpartition(", ")[0]) == ("proved", covered)
+    assert verdict.outcome == "proved"
+    assert verdict.what.startswith(covered)
 
 
 def test_a_fault_where_a_peer_is_detached_later_is_found_by_drawn_views() -> None:
@@ -192,9 +175,9 @@ def test_a_fault_where_a_peer_is_detached_later_is_found_by_drawn_views() -> Non
 def test_without_the_solver_the_verdict_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "z3", None)
     verdict = quick(planted("best_goodput"), drones=3)[0]
-    assert verdict.outcome == "drawn"
-    assert verdict.what.startswith(
-        "Cannot analyse: it combines goodput of drone 0 to drone 2 and goodput of drone 0 to drone 1, and z3 is not "
+    assert verdict.outcome == "tried"
+    assert verdict.what.endswith(
+        "; not proved: it combines goodput of drone 0 to drone 2 and goodput of drone 0 to drone 1, and z3 is not "
         "installed (pip install sortie-sim[verify])"
     )
 
@@ -210,36 +193,3 @@ def test_a_refutation_of_a_policy_that_fails_only_sometimes_says_so() -> None:
     verdicts = prove(decide, parse("rate_hz <= 2"), max_drones=1, views=20, budget_s=0.0)
     assert all(v.what for v in verdicts)
     assert any(v.what.startswith("not the same for the same view") for v in verdicts), verdicts
-
-
-def test_an_abstract_method_anywhere_in_its_file_is_no_obstacle(tmp_path: Path) -> None:
-    file = tmp_path / "rules.py"
-    file.write_text(
-        "from abc import ABC, abstractmethod\n"
-        "from sortie import Directive, Representation\n\n"
-        "class Rule(ABC):\n    @abstractmethod\n    def rate_hz(self): ...\n\n"
-        "class Slow(Rule):\n    def rate_hz(self): return 2.0\n\n"
-        "def decide(view):\n"
-        "    return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=Slow().rate_hz()) for p in view.peers]\n"
-    )
-    verdicts = prove(resolve(f"{file}:decide", {}), parse("rate_hz <= 5"), max_drones=2, views=20)
-    assert [v.outcome for v in verdicts] == ["proved"] * 3
-
-
-def test_a_call_that_no_search_follows_has_a_hint_of_its_own() -> None:
-    assert advise("calls json.loads").endswith(
-        "To make it provable: leave this call away, wherever it is in the file; Python's own functions and math can be followed"
-    )
-
-
-def test_a_global_that_another_function_of_the_file_changes_is_named_with_its_line(tmp_path: Path) -> None:
-    file = tmp_path / "counts.py"
-    file.write_text(
-        "from sortie import Directive\ncalls = 0\n\ndef debug():\n    global calls\n    calls += 1\n\n"
-        "def decide(view):\n    return [Directive(view.ego, p, reason='no') for p in view.peers]\n"
-    )
-    first = prove(resolve(f"{file}:decide", {}), [], max_drones=2, views=5)[0]
-    assert first.what.startswith(
-        "Cannot analyse: it changes the global calls in line 5. To make it provable: decide from the view alone, and keep "
-        "functions that change globals in another file"
-    )

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import math
-import operator
 from collections.abc import Callable
-from decimal import Decimal
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -59,7 +56,16 @@ def test_a_threshold_cuts_at_the_very_float() -> None:
 
 
 @pytest.mark.parametrize(
-    "act", [math.sqrt, int, round, hash, lambda x: x % 2, lambda x: x**2, lambda x: 1 / x, lambda x: x.is_integer()]
+    "act",
+    [
+        math.sqrt,
+        lambda x: int(x * 1e6),
+        hash,
+        lambda x: x % 2,
+        lambda x: x**2,
+        lambda x: 1 / x,
+        lambda x: x.is_integer(),
+    ],
 )
 def test_what_a_range_cannot_answer_is_refused_and_no_except_hides_it(act: Callable[[object], object]) -> None:
     def run(path: Path) -> None:
@@ -68,52 +74,6 @@ def test_what_a_range_cannot_answer_is_refused_and_no_except_hides_it(act: Calla
 
     with pytest.raises(Refused, match="charge"):
         list(explore(run))
-
-
-@pytest.mark.parametrize(
-    "look",
-    [
-        lambda x: f"{x:.3f}" == "0.123",
-        lambda x: f"{x:.3f}" != "0.123",
-        lambda x: f"{x}" < "0.5",
-        lambda x: str(x).startswith("0.123"),
-        lambda x: repr(x) == "0.123",
-        lambda x: f"{x!r}" == "0.123",
-        lambda x: format(x, ".3f") in ("0.122", "0.123"),
-        lambda x: f"{x:.3f}" in {"0.123"},
-        lambda x: {"0.123": 1}.get(f"{x:.3f}"),
-        lambda x: "charge " + f"{x:.3f}" == "charge 0.123",
-        lambda x: f"{x:.3f}" + " left" == "0.123 left",
-        lambda x: "charge %s" % str(x) == "charge 0.123",  # noqa: UP031 - what older code does
-        lambda x: "0.12" in str(x),
-        lambda x: str(x)[:4] == "0.12",
-        lambda x: len(str(x)) == 5,
-        lambda x: next(iter(str(x))) == "0",
-        lambda x: float(f"{x:.3f}") < 0.5,
-        lambda x: int(f"{x:.0f}") == 0,
-        lambda x: str(str(x)).split("."),
-    ],
-)
-def test_whoever_looks_into_the_text_of_a_number_is_refused(look: Callable[[object], object]) -> None:
-    with pytest.raises(Refused, match="uses the text of charge for more than a reason"):
-        list(explore(lambda p: look(p.number("charge", 0.0, 1.0))))
-
-
-def test_text_that_is_handed_on_is_not_and_one_number_alone_has_its_own() -> None:
-    def reasons(x: object) -> list[str]:
-        return [f"{x:.3f}", "charge " + str(x), f"{x:.1f}, {x:.2f}", str(x) or "none", f"{x:>9}"]
-
-    ((path, found),) = explore(lambda p: reasons(p.number("charge", 0.0, 1.0)))
-    assert path.refusal is None
-    assert all(isinstance(text, str) for text in found)
-    assert list(cells(lambda x: f"{x:.2f}" == "0.50", 0.5, 0.5)) == [(0.5, 0.5, True)]
-    with pytest.raises(ValueError, match="Unknown format code 'd'"):  # as of a plain float
-        list(explore(lambda p: f"{p.number('charge', 0.0, 1.0):d}"))
-
-
-def test_a_number_read_out_of_other_text_fails_instead_of_being_one() -> None:
-    with pytest.raises(ValueError, match="could not convert string to float"):
-        list(explore(lambda p: float(f"charge {p.number('charge', 0.0, 1.0):.3f}".split()[1])))
 
 
 def test_isinstance_and_match_answer_as_in_flight() -> None:
@@ -127,15 +87,6 @@ def test_isinstance_and_match_answer_as_in_flight() -> None:
 
     assert kind(0.5) == kind(Path([]).number("charge", 0.0, 1.0))
     assert kind(5)[:4] == kind(Path([]).number("targets", 0, 16))[:4]
-
-
-@pytest.mark.parametrize("other", [Decimal("0.5"), np.float32(0.3), np.int64(1), 1j])
-@pytest.mark.parametrize("act", [operator.eq, operator.ne, lambda a, b: b == a, operator.mul, lambda a, b: b * a])
-def test_a_number_that_rounds_otherwise_is_refused(act: Callable[[object, object], object], other: object) -> None:
-    with pytest.raises(
-        Refused, match=f"compares or combines charge with a {type(other).__name__}|uses charge for more than arithmetic"
-    ):
-        list(explore(lambda p: act(p.number("charge", 0.0, 1.0), other)))
 
 
 def flags_of(act: Callable[[Any], object]) -> list[object]:

@@ -5,17 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from random import Random
-from typing import Any
 
 import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, Representation
-from sortie.policies.verification import shield_together
 from sortie.policies.verification.invariants import parse, violations
-from sortie.policies.verification.nearest import nearest
-from sortie.policies.verification.shield import enforce
-from sortie.policies.verification.shield_together import MARK, MOST_CHANGES
+from sortie.policies.verification.shield import MARK, enforce
 
 RUNGS, RATES_HZ, WEIGHTS = (0, 1, 2), (0.0, 2.0, 5.0, 10.0), (0.2, 1.0)
 CANNOT = f"{MARK}cannot keep "
@@ -132,7 +128,6 @@ def test_a_product_of_two_fields_that_are_both_zero_can_rise() -> None:
     lines = ["rate_hz * rho > 1 and rho + fusion_weight >= 1"]
     (after,) = shielded(lines, [link(1, 5, 0.0, 0.3)])
     assert keeps_all(lines, [after]), after
-    assert after.rate_hz * after.rho < 1.1
     (plain,) = shielded(["rate_hz * rho > 1"], [link(1, 5, 0.0)])
     assert plain.rate_hz * plain.rho > 1
 
@@ -161,23 +156,7 @@ def test_the_reason_names_what_was_decided_and_all_lines_that_changed_it() -> No
     lines = ["rate_hz <= 4", "any_link(fusion_weight == 1)", "when any_link(rate_hz >= 2): representation == tracks"]
     (after,) = shielded(lines, [link(1, 2, 10.0, 0.2)])
     assert (after.representation, after.rate_hz, after.fusion_weight) == (Representation.TRACKS, 4.0, 1.0)
-    assert after.reason == f"{MARK}{lines[0]}; {lines[2]}; {lines[1]} (decided detections at 10 Hz: decided)"
-
-
-def test_lines_that_exclude_each_other_on_a_link_are_kept_by_one_link_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten lines, nineteen links, one field changed for each line: every link is tried once for each line, and few twice."""
-    tries = []
-
-    def counted(*args: Any) -> Directive | None:
-        tries.append(args)
-        return nearest(*args)
-
-    monkeypatch.setattr(shield_together, "nearest", counted)
-    decided = [link(peer, 2, 10.0 + 0.5 * peer) for peer in range(1, 20)]
-    directives = shielded([f"any_link(rate_hz == {hz})" for hz in range(1, 11)], decided)
-    changed = [d for d, before in zip(directives, decided, strict=True) if d != before]
-    assert sorted(d.rate_hz for d in changed) == list(range(1, 11))
-    assert len(tries) <= 10 * 19 + MOST_CHANGES
+    assert after.reason == f"{MARK}{lines[0]}; {lines[1]}; {lines[2]} (decided detections at 10 Hz: decided)"
 
 
 def test_a_link_passes_a_line_on_to_another_link_that_can_keep_it() -> None:
@@ -187,13 +166,6 @@ def test_a_link_passes_a_line_on_to_another_link_that_can_keep_it() -> None:
     for order in itertools.permutations(lines):
         directives = enforce(parse("\n".join(order)), view, [link(p, 2, 10.0 if p == 1 else 2.0) for p in (1, 2, 3)])
         assert [d.rate_hz for d in directives] == [9.0, 8.0, 2.0]
-
-
-def test_a_link_passes_a_line_on_where_fewer_fields_change_then() -> None:
-    lines = ["any_link(rate_hz == 8)", "any_link(representation >= detections and rate_hz == 9)"]
-    for order in itertools.permutations(lines):
-        directives = shielded(order, [link(1, 2, 10.0), link(2, 0, 2.0), link(3, 0, 2.0)])
-        assert [(int(d.representation), d.rate_hz) for d in directives] == [(2, 9.0), (0, 8.0), (0, 2.0)]
 
 
 def test_a_line_about_one_link_comes_before_a_line_about_several() -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from sortie.policies.registry import resolve
-from sortie.policies.verification import call_checks
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import ProofVerdict, prove
 
@@ -27,13 +26,13 @@ def decide(view):
 """
 NATURAL = {
     "water-filling": (
-        "proved over the reals",
+        "proved",
         "total = sum(me.goodput_to(p) for p in view.peers)\n"
         "if total <= 0: return [to(view, p, 1.0) for p in view.peers]\n"
         "return [to(view, p, 10.0, me.goodput_to(p) / total) for p in view.peers]",
     ),
     "linear": (
-        "proved over the reals",
+        "proved",
         "score = 0.6 * me.battery_soc + 0.4 * me.cpu_headroom\nreturn [to(view, p, 10.0 * min(1.0, score)) for p in view.peers]",
     ),
     "leader by goodput": (
@@ -46,24 +45,24 @@ NATURAL = {
         "return [to(view, p, 5.0 if p in top else 0.0) for p in view.peers]",
     ),
     "product": (
-        "proved over the reals",
+        "proved",
         "return [to(view, p, min(10.0, me.goodput_to(p) * me.battery_soc)) for p in view.peers]",
     ),
     "a truth as a number": (
-        "proved over the reals",
+        "proved",
         "score = me.battery_soc * me.cpu_headroom + me.battery_soc * (me.task_phase == 2)\nreturn [to(view, p, min(10.0, score)) for p in view.peers]",
     ),
     "mean charge": (
-        "proved over the reals",
+        "proved",
         "mean = sum(d.battery_soc for d in view.descriptors.values()) / len(view.descriptors)\n"
         "return [to(view, p, 10.0 if me.battery_soc >= mean else 2.0) for p in view.peers]",
     ),
     "worst link": (
-        "proved over the reals",
+        "proved",
         "worst = min(me.goodput_to(p) for p in view.peers)\nreturn [to(view, p, max(1.0, min(10.0, worst / 5))) for p in view.peers]",
     ),
     "difference": (
-        "proved over the reals",
+        "proved",
         "near = {p: abs(me.battery_soc - view.descriptors[p].battery_soc) < 0.2 for p in view.peers}\n"
         "return [to(view, p, 10.0 if near[p] else 4.0) for p in view.peers]",
     ),
@@ -109,20 +108,4 @@ def test_faults_where_inputs_are_combined_are_found(name: str, tmp_path: Path) -
 @pytest.mark.parametrize("name", BEYOND)
 def test_what_the_reals_do_not_show_is_not_proved_exactly(name: str, tmp_path: Path) -> None:
     body = f"{BEYOND[name]}\nreturn [to(view, p, 20.0 if bad else 2.0) for p in view.peers]"
-    assert verdict(tmp_path, body).outcome in ("drawn", "refuted", "proved over the reals")
-
-
-@pytest.mark.parametrize("compensates", [False, True])
-def test_sums_are_proved_where_the_rounding_of_this_python_is_no_part_of_the_proof(
-    compensates: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """From Python 3.12 on `sum` compensates the rounding of floats, which a search of single inputs does not follow."""
-    monkeypatch.setattr(call_checks, "COMPENSATES", compensates)
-    assert verdict(tmp_path, NATURAL["mean charge"][1]).outcome == "proved over the reals"
-    fast = "return [to(view, p, 20.0 if {sum}([me.battery_soc, 0.1, 0.2]) > 1.5 else 2.0) for p in view.peers]"
-    one = verdict(tmp_path, fast.format(sum="sum"))
-    assert one.outcome == ("drawn" if compensates else "proved")
-    assert ("use sortie.scenarios.plain_sum" in one.what) == compensates
-    plain = f"from sortie.scenarios.plain_sum import plain_sum\n{fast.format(sum='plain_sum')}"
-    assert verdict(tmp_path, plain).outcome == "proved"
-    assert verdict(tmp_path, plain.replace("[me", "x for x in [me")).outcome == "proved"  # a generator
+    assert verdict(tmp_path, body).outcome in ("tried", "refuted")

@@ -11,7 +11,6 @@ from policies_examples import fleet_of
 
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import describe_error, modules_of, resolve
-from sortie.policies.verification.confine import Reached, confined
 
 START = "from sortie.policies.contract import Directive, nothing\n"
 DECIDE = "\ndef decide(view):\n    return [nothing(view.ego, p, {}) for p in view.peers]\n"
@@ -87,7 +86,6 @@ def test_a_policy_imports_what_is_beside_it(form: str, tmp_path: Path) -> None:
     before, path = set(sys.modules), list(sys.path)
     policy = resolve(f"{tmp_path}/mine.py:decide")
     assert policy(fleet_of(2))[0].reason == "beside"
-    assert confined(policy)(fleet_of(2))[0].reason == "beside"
     assert sys.path == path
     assert not [finder for finder in sys.meta_path if "sortie" in type(finder).__module__]
     left = {name for name in set(sys.modules) - before if not name.startswith(("sortie.", "sortie_user_"))}
@@ -177,17 +175,3 @@ def test_a_helpers_error_names_its_line(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError) as caught:
         reason(tmp_path)
     assert describe_error(caught.value).endswith("(helper.py, line 2)")
-
-
-@pytest.mark.parametrize("form", ["import helper", "from . import helper"])
-@pytest.mark.parametrize("inside", [True, False])
-def test_a_helper_is_confined_with_its_policy(form: str, inside: bool, tmp_path: Path) -> None:
-    body = "\ndef decide(view):\n    {}\n    return helper.peek()\n"
-    write(tmp_path, {
-        "mine.py": body.format(form) if inside else form + body.format("pass"),
-        "helper.py": "import time\ndef peek(): return [time.time()]",
-    })  # fmt: skip
-    policy = resolve(f"{tmp_path}/mine.py:decide")
-    assert policy(fleet_of(2))
-    with pytest.raises(Reached, match="time"):
-        confined(policy)(fleet_of(2))

@@ -11,9 +11,10 @@ import pytest
 from sortie.policies.contract import Directive, FleetView, PolicyError, Representation
 from sortie.policies.registry import resolve
 from sortie.policies.verification import search
-from sortie.policies.verification.courses import Course, Values, constants_of, draw_course
+from sortie.policies.verification.courses import Course, Values, draw_course
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.search import Budget
+from sortie.policies.verification.subject import constants_of
 from sortie.scenarios.plugins.user_calls import watched
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Scenario
@@ -116,7 +117,7 @@ def test_a_flight_of_a_course_enforces_what_the_loop_enforces(policy: str, shiel
         ("two_rates", "within 0.5 s: rate_hz > 0", "refuted"),  # the dwell time after take-off
         ("two_rates", "climbs_in(dwell) <= 1", "proved"),
         ("flips", "climbs_in(4) <= 1", "refuted"),
-        ("by_charge", "climbs_in(dwell) <= 1", "searched"),
+        ("by_charge", "climbs_in(dwell) <= 1", "tried"),
         ("own_region", "climbs_in(dwell) <= 1", "proved"),
         ("one_of_two_regions", "switches_in(0.5) <= 2", "refuted"),
     ],
@@ -253,7 +254,7 @@ def test_a_break_that_does_not_come_again_refutes_nothing(monkeypatch: pytest.Mo
 
     rules = parse("when age_s < 0.5: within 1.5 s: rate_hz > 0")
     (verdict,) = judge_over_time(Subject(once, "once", {}), rules, drones=2, budget_s=60.0, courses=2)
-    assert verdict.outcome == "searched"
+    assert verdict.outcome == "tried"
 
 
 RAISES = """

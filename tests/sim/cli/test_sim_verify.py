@@ -10,7 +10,7 @@ from cli_examples import command
 
 from sortie.policies.contract import TaskPhase
 from sortie.policies.registry import resolve
-from sortie.policies.verification.policy_rules import RULES
+from sortie.policies.verification.conformance import RULES
 from sortie.policies.verification.proof import prove
 from sortie.policies.verification.subject import own_invariants
 from sortie.policies.verification.views import draw_views, from_json, to_json

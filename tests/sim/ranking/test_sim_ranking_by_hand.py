@@ -56,7 +56,7 @@ def ranking() -> Ranked:
         "ours": {"poor": flight(0.25), "rich": flight(error="boom")},
     }  # fmt: skip
     verified = {
-        "theirs": Verified(16, (), "proved", "searched"), "mine": Verified(16, (), "drawn", "proved"),
+        "theirs": Verified(16, (), "proved", "tried"), "mine": Verified(16, (), "tried", "proved"),
         "ours": Verified(16, ("stale views", "silence"), "proved", "refuted"),
     }  # fmt: skip
     return Ranked(
@@ -92,8 +92,8 @@ def test_each_table_has_each_figure_in_its_column() -> None:
             ["2–3", "ours", "15.2 %", "20.8 %", "1.1 MB", "2.0 %", "1.88 kJ"],
         ],
         [
-            ["1", "theirs", "6.5 kB", "77 J", "5", "searched", "60 µs"],  # as on this machine
-            ["2–3", "mine", "3.2 kB", "38 J", "2", "drawn", "10 µs"],
+            ["1", "theirs", "6.5 kB", "77 J", "5", "tried", "60 µs"],  # as on this machine
+            ["2–3", "mine", "3.2 kB", "38 J", "2", "tried", "10 µs"],
             ["2–3", "ours", "1.6 kB", "19 J", "1", "2 of 16 broken", "5 µs"],
         ],
     ]
@@ -299,7 +299,7 @@ def test_a_policy_that_failed_everywhere_has_dashes_and_nulls() -> None:
     first, second, third = (cells(part)[0] for part in board.summary(alone)._parts if isinstance(part, Table))
     assert first[3:] == ["–", "–", "–", "2"]
     assert second[2:] == ["–"] * 5
-    assert third[2:] == ["–", "–", "–", "drawn", "–"]
+    assert third[2:] == ["–", "–", "–", "tried", "–"]
     (kept,) = board.plain(alone)["policies"]
     assert kept["decision_us"] is None
     assert kept["figures"]["switches"] == {"mean": None, "low": None, "high": None, "count": 0}
