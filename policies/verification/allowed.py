@@ -113,6 +113,10 @@ _EXPRESSIONS = (
 )  # fmt: skip
 _OF_NUMBERS = (abs, min, max, round, int, float, Disc, *_ENUMS)
 """What may be called at module level, beside `math`."""
+_WORDS: dict[type[ast.AST], str] = {
+    ast.Try: "a try statement", ast.With: "a with statement", ast.ClassDef: "a class", ast.Set: "a set", ast.SetComp: "a set",
+    ast.Yield: "yield", ast.YieldFrom: "yield",
+}  # fmt: skip
 _COMPREHENSIONS = (ast.ListComp, ast.DictComp, ast.GeneratorExp)
 
 
@@ -334,7 +338,7 @@ class _Walk:
         if node is None:
             return
         if not isinstance(node, (*_STATEMENTS, *_EXPRESSIONS, ast.FunctionDef)):
-            raise NotAllowed(f"has {type(node).__name__}", node)
+            raise NotAllowed(f"has {_WORDS.get(type(node), type(node).__name__)}", node)
         visit = getattr(self, f"_{type(node).__name__.lower()}", None)
         if visit is not None:
             visit(node, may_be_text)

@@ -28,6 +28,7 @@ from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetVie
 from sortie.policies.verification.invariants import (
     COMPARE,
     Binary,
+    Fresh,
     Invariant,
     InvariantError,
     LinksTerm,
@@ -40,7 +41,7 @@ from sortie.policies.verification.invariants import (
     violations,
     walk,
 )
-from sortie.policies.verification.words import CHANGES, DECISIONS, Scope
+from sortie.policies.verification.words import CHANGES, DECISIONS, WORDS, Scope
 from sortie.scenarios.representation import AT_LEVEL, NAME_OF
 
 MARK = "shield: "
@@ -54,6 +55,8 @@ LEAST_RATE_HZ = 2.0
 HIGHEST = {word: 1.0 if word in ("duty", "roi") else DIRECTIVE_BOUNDS[word].high for word in DECISIONS}
 """The upper bound of each field; the lower one is 0."""
 _LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0)
+_PLAIN = frozenset({float, int, bool, type(None), Disc, Representation})
+"""Types of fields that are no symbols of a proof."""
 _NOT_SHIELDED = ("sum_links", "count_links", "every_link")
 _MIRRORED = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "==": "==", "!=": "!="}
 _OPPOSITE = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "==": "!=", "!=": "=="}
@@ -173,19 +176,24 @@ class _Enforcing:
         self._of_links = [rule for rule in rules if _is_of_links(rule)]
         self._alone = [rule for rule in rules if not _is_of_links(rule) and self._may_apply(rule)]
 
+        self._of_peer = [rule.when for rule in self._alone if rule.when is not None and _is_about_peer(rule.when)]
+        self._differ = any(_is_about_peer(rule.then) for rule in self._alone)
+        """Whether equal links to different peers may be corrected otherwise."""
+
     def directives(self) -> list[Directive]:
         """The directives that keep the rules."""
         self._left = MOST_IN_ALL
-        unkept = set[int]()
+        unkept, known = set[int](), dict[Any, tuple[list[str], Directive | None]]()
         for k, link in enumerate(self._decided):
-            broken = [rule for rule in self._alone if self._breaks(rule, link)]
-            if broken:
-                found_one = self._nearest(link, link, self._alone, self._keeps_alone)
-                if found_one is None:
-                    unkept.add(k)
-                else:
-                    self._links[k] = found_one
-                    self._because[k].update(dict.fromkeys(rule.text for rule in broken))
+            key = self._key(link)
+            texts, after = known.get(key) or self._corrected(link)
+            if key is not None:
+                known[key] = texts, after
+            if texts and after is None:
+                unkept.add(k)
+            elif texts and after is not None:
+                self._links[k] = after._replace(destination=link.destination, reason=link.reason)
+                self._because[k].update(dict.fromkeys(texts))
         lost = self._keep_together() if self._of_links else []
         found = [self._replaced(k) for k in range(len(self._links))]
         for k in range(len(self._links)) if lost else sorted(unkept):
@@ -196,6 +204,20 @@ class _Enforcing:
             if texts and not found[k].reason.startswith(note):
                 found[k] = found[k]._replace(reason=f"{note}({found[k].reason})")
         return found
+
+    def _key(self, link: Directive) -> Any:
+        """What links of this decision have in common that are corrected alike; None if nothing can be said."""
+        fields = tuple(link)[2:9]
+        parts = (*fields, *(link.roi or ()))
+        if self._differ or not all(type(x) in _PLAIN for x in parts):
+            return None
+        scope = self._scope._replace(link=link)
+        return fields, self._ceilings.get(link.destination), *[bool(evaluate(when, scope)) for when in self._of_peer]
+
+    def _corrected(self, link: Directive) -> tuple[list[str], Directive | None]:
+        """The rules about one link that a link breaks, as texts, and the nearest directive that keeps them."""
+        broken = [rule.text for rule in self._alone if self._breaks(rule, link)]
+        return broken, self._nearest(link, link, self._alone, self._keeps_alone) if broken else None
 
     def _broken(self, rule: Invariant, links: Sequence[Directive]) -> list[Directive | None]:
         return violations(rule, self._view, links, self._fresh)
@@ -403,6 +425,12 @@ class _Enforcing:
 def _is_about_link(node: Node) -> bool:
     """Whether it depends on directives that may change."""
     return any(isinstance(n, LinksTerm) or (isinstance(n, Name) and n.word in DECISIONS) for n in walk(node))
+
+
+def _is_about_peer(node: Node) -> bool:
+    """Whether it depends on the peer otherwise than through the link's directive."""
+    of_peer = (n.word not in DECISIONS and WORDS[n.word].of_link for n in walk(node) if isinstance(n, Name))
+    return any(of_peer) or any(isinstance(n, Fresh) for n in walk(node))
 
 
 @lru_cache(maxsize=1024)

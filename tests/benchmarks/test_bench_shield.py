@@ -1,8 +1,7 @@
 """How long a shield takes for one decision: ten lines, five fields, 20 drones.
 
-`make bench-all` prints it. A decision takes at most 0.3 ms, even if each link has another directive with new numbers that
-breaks several lines: links with similar numbers share a search. With `ten lines and a choice` two ways to keep a line
-change equally many fields. Then the search finds both, and each link takes the nearer one. Lines about several links that exclude each other on one link may take a few milliseconds: the links that keep them are searched.
+`make bench-all` prints it. A decision takes a few milliseconds where each line bounds one field, and some tens where each link
+breaks lines that tie fields together. With `ten lines and a choice` two ways to keep a line change equally many fields.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ POINTS = (
     "bad = str(X) == 'K.0'",
     "bad = f'{X:.0f}' == 'K'",
     "bad = float(K) == X",
-    "bad = int(X) >> 3 == K >> 3",
+    "bad = (int(X) >> 3 == K >> 3) and int(X) == K",
     "bad = X + K == 2 * K",
     "bad = (X >= K) and not (X > K)",
     "bad = complex(X) == K",

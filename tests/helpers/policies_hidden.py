@@ -1,4 +1,4 @@
-"""Policies with a fault that only real objects, another process or a later decision show, and correct ones beside them.
+"""Policies with a fault that only real objects, another process or a later decision show. None is in plain Python.
 
 A body is as in `policies_corpus`. K is a charge at which the fault shows.
 """
@@ -166,53 +166,3 @@ KEPT = (
     ("import types\nclass D(dict):\n    def items(self):\n        return []\nM = types.MappingProxyType(D(k=[0]))", "M['k'][0] += 1\nn = M['k'][0]"),
 )  # fmt: skip
 """What is set up when the file is loaded, and how each decision counts."""
-
-HARMLESS = (
-    "class A:\n    def f(self): return 1\nclass B(A):\n    def f(self): return super().f()\nbad = soc > B().f()", "bad = soc > 10**400",
-    "match me.task_phase:\n    case TaskPhase.TRACK:\n        bad = soc > 1\n    case _:\n        pass", "class C:\n    HIGH = 3\nmatch len(view.peers):\n    case C.HIGH:\n        bad = soc > 1",
-    "def f(p: int, q: tuple[float, int]) -> dict[int, float]:\n    return {p: q[0]}\nbad = f(1, (soc, 2))[1] > 1",
-    "seen = set()\nfor p in view.peers:\n    seen |= {p}\nd = {0: 5.0}\nd[0] -= 1\nbad = len(seen) > 9 or d[0] > 4", "for p, q in zip(view.peers, view.peers[1:]):\n    bad = q < p",
-    "class L:\n    def __init__(self, least): self.least = least\n    def __call__(self, x): return x < self.least\nbad = L(0.5)(soc) and soc > 0.5",
-    "C = collections.namedtuple('C', 'low high')\nbad = soc < C(0.3, 0.7).low and soc > 0.5", "try:\n    bad = {0: True}[len(view.peers)]\nexcept (KeyError, IndexError):\n    pass",
-    "kinds = {'a', 'b'}\nbad = 'c' in kinds or soc > 1", "names = {TaskPhase.TRACK, TaskPhase.SEARCH}\nbad = me.task_phase in names and me.task_phase == 4",
-    "bad = sorted({'b', 'a'} | {'c'}) != ['a', 'b', 'c'] or soc > 1", "strong = {p for p in view.peers if me.goodput_to(p) > 5}\nfor p in strong:\n    bad = bad or me.goodput_to(p) < 5",
-    "d = collections.defaultdict(set)\nfor p in view.peers:\n    d[0].add(p)\nbad = d[0] != set(view.peers) or type(d[0]) is not set", "why = f'{soc:.1%} of {first:.0f}'\nbad = soc > 1",
-    "from sortie.policies.catalogue.worked import worked\nbad = any(d.rate_hz > 10 for d in worked(view))", "g = {}\nfor p in view.peers:\n    g.setdefault(0, []).append(Directive(view.ego, p))\nbad = len(g[0]) != len(view.peers)", "names = ', '.join(str(p) for p in view.peers)\nbad = not names", "def f(x: float) -> list[float] | None:\n    return None\nbad = f(soc) is not None",
-    "import sortie.policies.contract as contract\nbad = contract.PHASE_NAMES[me.task_phase] == 'x'", "bad = me.novelty_flags + 0.5 < 0 or me.novelty_flags == 0.5", "bad = soc not in (soc,)",
-)  # fmt: skip
-"""The same words in correct policies, which stay proved."""
-
-_IMPORT = "from sortie.policies.contract import"
-UNLISTED = (
-    (f"{_IMPORT} Roster\nbad = Roster(0, (0, 1)).slot(1) == 7", "calls sortie.policies.contract.Roster"),
-    (f"{_IMPORT} Descriptor\nbad = Descriptor(0) == 7", "calls sortie.policies.contract.Descriptor"),
-    (f"{_IMPORT} PolicyError\nbad = PolicyError('x') == 7", "calls sortie.policies.contract.PolicyError"),
-    (f"{_IMPORT} goodput_in\nbad = goodput_in((1.0,), 0, None, 1) > 1", "calls sortie.policies.contract.goodput_in"),
-    (f"{_IMPORT} DIRECTIVE_BOUNDS as B\nbad = B['rho'].high > 1", "reads sortie.policies.contract.DIRECTIVE_BOUNDS"),
-    ("from sortie.scenarios.representation import LEVELS\nbad = LEVELS[0] > 9", "reads sortie.scenarios.representation.LEVELS"),
-    ("from sortie.scenarios.disc import rank_by_overlap\nbad = len(rank_by_overlap(0, ())) > 1", "calls sortie.scenarios.disc.rank_by_overlap"),
-    ("bad = view.frozen.ego > 9", "reads frozen of a FleetView"), ("bad = view.index(view.ego) > 9", "reads index of a FleetView"),
-    ("bad = me.with_roster(None) == 7", "reads with_roster of a Descriptor"), ("bad = Directive._make(range(10)).rho > 9", "reads _make of a type"),
-    ("bad = Directive(0, 1)._asdict()['rho'] > 9", "reads _asdict of a Directive"), ("bad = me.task_phase.real > 9", "reads real of a TaskPhase"),
-    ("bad = Directive(0, 1).count(7) > 9", "reads count of a Directive"),
-    ("class N: pass\nbad = Directive(0, 1, reason=N()) == 7", "gives more than numbers, texts, lists, tuples and Sortie's objects to Directive"),
-    ("class N: pass\nbad = Directive(0, 1)._replace(reason=N()) == 7", "gives more than numbers, texts, lists, tuples and Sortie's objects to Directive._replace"),
-    ("bad = Directive(0, 1)._replace(reason=decide) == 7", "gives more than numbers, texts, lists, tuples and Sortie's objects to Directive._replace"),
-    ("f = functools.partial(Directive(0, 1)._replace, rho=0.5)\nbad = f().rho > 1", "hands on Directive._replace"),
-    ("from sortie.policies.catalogue.worked import worked\nbad = len(worked(view, rho=soc)) > 9", "gives worked a parameter that is no plain number"),
-    ("import typing\nfrom sortie.scenarios.plain_sum import plain_sum\nclass N(typing.NamedTuple):\n    x: float\n    total = plain_sum\nbad = N(1.0).total() > 9", "makes a method of plain_sum"),
-    (f"{_IMPORT} boxes_across_networks\n@boxes_across_networks\ndef f(v): return []\nbad = len(f(view)) > 9", "calls sortie.policies.contract.f"),
-    (f"{_IMPORT} boxes_across_networks\ndef f(v): return []\nboxes_across_networks(f)", "decorates by a call"),
-    ("import typing\nclass N(typing.NamedTuple):\n    x: float\n    total = statistics.mean\nbad = N(1.0).total() > 9", "makes a method of mean"),
-)  # fmt: skip
-"""What a policy may not use of Sortie's, and the verdict's words for it."""
-
-LISTED = (
-    "from sortie.scenarios.link_state import heard_share, state_of\nbad = state_of(first) is LinkState.PROBED and first > 1 or heard_share(1.0) == 7",
-    "from sortie.scenarios.plain_sum import plain_sum\nbad = plain_sum([me.goodput_to(p) for p in view.peers[:1]]) < 0",
-    "from sortie.scenarios.disc import Disc, disc_overlap\nbad = disc_overlap(1.0, 2.0, Disc(0.0, 0.0, 2.0).radius_m) > 1", "bad = Directive(0, 1, rate_hz=soc)._replace(rho=0.5).rate_hz > 1",
-    "from sortie.scenarios.representation import BOXES, NAME_OF\nbad = NAME_OF[BOXES[0]] != 'tracks' or Representation.CODES.level > 3", "bad = Representation(2).name != 'DETECTIONS' or TaskPhase.TRACK.value > 2",
-    "from sortie.policies.contract import FEATURE_CELLS, Coverage, nothing_to_all\nbad = FEATURE_CELLS < Coverage.WELL or len(nothing_to_all(0, (1, 2), f'{soc:.1f}')) > 2",
-    "bad = max(map(me.goodput_to, view.peers)) < 0 or view.full_sharing_maps > 9", "bad = view.attached.shares_features_with(view.peers[0]) and soc > 1",
-)  # fmt: skip
-"""What it may use of them, in correct policies."""

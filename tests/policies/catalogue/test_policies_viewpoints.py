@@ -174,7 +174,7 @@ def changes_its_input(view: FleetView) -> Reposition | None:
     [
         (remembers, "its viewpoint: two calls with the same view differ"),
         (reads_the_order, "its viewpoint: drones in another order get another place"),
-        (reads_the_clock, "its viewpoint uses time, which is not in its view"),
+        (reads_the_clock, "its viewpoint: two calls with the same view differ"),
         (changes_its_input, "its viewpoint changed its input"),
         (lambda view: Reposition(1e4, 0.0) if view.me else None, "reposition of drone"),
         (lambda view: view.nothing, "its viewpoint raises AttributeError"),
