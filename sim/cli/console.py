@@ -12,7 +12,6 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from sortie.scenarios.compiled import when_compiling
 from sortie.sim.folders import RunError
 from sortie.sim.terminal import Terminal
 
@@ -90,11 +89,13 @@ def bars() -> Iterator[Callable[[str, float], Callable[[float], None]]]:
             task = progress.add_task(label, total=round(total))
             return lambda done: progress.update(task, completed=round(done))
 
-        def compiling() -> None:
-            if err.is_terminal:
-                progress.console.print("compiling loops, which later runs reuse: a minute or so")
+        if not err.is_terminal:
+            yield add
+            return
+        from sortie.scenarios.compiled import when_compiling  # numba takes a second to import
 
-        with when_compiling(compiling):
+        note = "compiling loops, which later runs reuse: a minute or so"
+        with when_compiling(lambda: progress.console.print(note)):
             yield add
 
 

@@ -202,6 +202,8 @@ def _difference(old: Mapping[str, Any], new: Mapping[str, Any], within: str = ""
 def _scenario_of(path: Path) -> Scenario:
     """The scenario of a run. Packages that offered its models need not be installed."""
     text = read_file(path / SCENARIO).decode()
+    if not text.endswith("\n"):
+        raise ValueError(f"{path / SCENARIO}: ends within a line")
     with models_of_the_past():
         scenario = loads(text, source=str(path / SCENARIO))
     if scenario.takes_turns and not re.search("^  egos:", text, re.MULTILINE):  # of a version in which all were scored

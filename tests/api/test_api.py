@@ -416,7 +416,7 @@ WRONG: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "a list of pairs for overrides": (lambda: sortie.load("track_target", [("fleet.drones", 3)]), sortie.ScenarioError, "overrides: [('fleet.drones', 3)], must be a map or a list"),  # type: ignore[list-item]
     "a progress that is no function": (lambda: sortie.fly("track_target", SHORT, progress=True), sortie.ScenarioError, "progress: True, must be a function, or None"),  # type: ignore[arg-type]
     "an observer that is none": (lambda: sortie.fly("track_target", SHORT, observer=print), sortie.ScenarioError, "must have the methods begin and second"),  # type: ignore[arg-type]
-    "a run saved nowhere": (lambda: sortie.fly("track_target", SHORT).save(None), sortie.RunError, "path: None, must be a path"),  # type: ignore[arg-type]
+    "a run saved nowhere": (lambda: sortie.fly("track_target", SHORT).save(3), sortie.RunError, "path: 3, must be a path"),  # type: ignore[arg-type]
     "two policies of one name": (lambda: sortie.compare("track_target", [lambda view: [], lambda view: []]), sortie.PolicyError, "give functions of one name, such as lambdas, a __name__ of their own"),
     "seeds and a half-width": (lambda: sortie.compare("track_target", ["worked"], seeds=3, half_width=0.1), sortie.RunError, "seeds and half_width: name one of them"),
     "a half-width as text": (lambda: sortie.compare("track_target", ["worked"], half_width="1"), sortie.RunError, "half_width: '1', must be a number above 0 and below 1; 0.01 is one AP point"),  # type: ignore[arg-type]

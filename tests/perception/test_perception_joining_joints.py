@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from perception_examples import capture
@@ -128,22 +130,15 @@ def test_a_known_variance_stays_with_its_box_however_boxes_are_sorted() -> None:
     assert sorted(found.xy_m[:, 0].tolist()) == pytest.approx(sorted(wanted), abs=1e-5)
 
 
-def test_what_places_have_in_common_is_the_callers_share_or_the_detectors_or_all() -> None:
-    """None leaves it to the ego's errors, and without those everything may be in common; 0 is a share like any other."""
+def test_what_places_have_in_common_is_the_detectors_share_or_all() -> None:
     own, theirs = boxes_at((20.0, 0.0, 0.6)), boxes_at((20.6, 0.5, 0.8))
-    sent = np.array([[0.05, 0.0, 0.6]])
-    source = SourceBoxes(theirs, 0.5, HERE, covariance_m2=sent)
+    source = SourceBoxes(theirs, 0.5, HERE, covariance_m2=np.array([[0.05, 0.0, 0.6]]))
 
-    def place(errors: BoxErrors | None, common: float | None) -> np.ndarray:
-        (found,) = joined_many([EgoSources(HERE, own, False, [source], errors=errors)], "nms", common)
+    def place(errors: BoxErrors | None) -> np.ndarray:
+        (found,) = joined_many([EgoSources(HERE, own, False, [source], errors=errors)], "nms")
         return found.xy_m[0]
 
-    np.testing.assert_array_equal(place(None, None), place(None, 1.0))
-    np.testing.assert_array_equal(place(ERRORS, None), place(ERRORS, ERRORS.common))
-    assert np.abs(place(None, None) - place(None, 0.0)).max() > 0.01
-    assert np.abs(place(ERRORS, 0.0) - place(ERRORS, None)).max() > 0.001
-    # independent: each axis is the mean by weight and inverse variance
-    variances = np.array([float(CARS.sigma0_m2)] * 2), sent[0, [0, 2]]
-    weights = 1.0 / variances[0], 0.5 / variances[1]
-    wanted = (weights[0] * own.xy_m[0] + weights[1] * theirs.xy_m[0]) / (weights[0] + weights[1])
-    np.testing.assert_allclose(place(None, 0.0), wanted, atol=1e-4)
+    shares = [place(replace(ERRORS, common=common)) for common in (0.0, ERRORS.common, 1.0)]
+    np.testing.assert_array_equal(place(ERRORS), shares[1])
+    assert np.abs(shares[0] - shares[1]).max() > 0.001
+    assert np.abs(shares[1] - shares[2]).max() > 0.001

@@ -14,14 +14,12 @@ from policies_corpus import LINE
 from policies_faults import sliver, unreached, whole
 from policies_more_faults import KEEPERS, MANY, kept, memory, returned, size, stand_in
 
-from sortie.policies.contract import FleetView
 from sortie.policies.registry import resolve
 from sortie.policies.verification.drawn import views_at
 from sortie.policies.verification.invariants import parse
 from sortie.policies.verification.proof import ProofVerdict, prove
 from sortie.policies.verification.single_view import check_property, property_of
 from sortie.policies.verification.views import LARGEST, draw_view
-from sortie.scenarios.plugins.user_calls import ProgramExitError
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # a planted `__del__` is refused
@@ -148,15 +146,6 @@ def test_a_number_that_claims_to_be_pythons_own_is_refused(tmp_path: Path, home:
     )
     found = verdicts(tmp_path, text, views=10)
     assert [v.outcome for v in found] == ["refuted"] * 3
-
-
-def test_an_exception_that_no_except_catches_is_the_policys_fault(tmp_path: Path) -> None:
-    path = tmp_path / "policy.py"
-    path.write_text("def decide(view):\n    raise GeneratorExit\n")
-    policy = resolve(f"{path}:decide")
-    with pytest.raises(ProgramExitError, match="raises GeneratorExit, must return"):
-        policy(FleetView(0, 0.1, {}, {}))
-    assert {v.outcome for v in prove(policy, views=5, max_drones=2)} == {"refuted"}
 
 
 @pytest.mark.parametrize("number", ["Decimal(2)", "Fraction(2)"])

@@ -153,7 +153,7 @@ def test_verify(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )  # fmt: skip
     assert command("verify", "best-2(received_budget=0.25)", *options) == 0
     assert resolved.args == ("best-2", {"received_budget": 0.25})
-    assert seen["conform"].kwargs == {"count": 50, "budget_s": 4.0}
+    assert seen["conform"].kwargs == {"count": 50}
     decide, rules = seen["prove"].args
     assert seen["prove"].kwargs == {"max_drones": 3, "budget_s": 4.0}
     subject, timed = seen["judge_over_time"].args
@@ -187,7 +187,8 @@ def test_a_model_of_another_kind_is_verified_with_its_parameters(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checks = [
-        SimpleNamespace(name=name, holds=holds, what="") for name, holds in (("a", True), ("b", False), ("c", False))
+        SimpleNamespace(name=name, holds=holds, unfinished=False, what="")
+        for name, holds in (("a", True), ("b", False), ("c", False))
     ]
     seen = Seen(checks)
     monkeypatch.setattr(verify_command, "verify_model", seen)

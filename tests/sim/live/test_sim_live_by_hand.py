@@ -171,12 +171,12 @@ def test_without_traffic_there_are_no_ratios() -> None:
     )  # fmt: skip
     assert (found.descriptor_bytes, found.context_share, found.decide_ms_p50, found.data_age_ms_p50) == (None,) * 4
     assert {(t.mean_bytes, t.heard_share, t.delivered_share) for t in found.topics} == {(None, None, None)}
-    assert {row[0]: row[2] for row in overhead_rows(found)}["context over data"] == "–"
+    assert dict(overhead_rows(found))["context over data"] == "–"
 
 
 def test_the_overhead_table_and_the_changes_are_the_result_s() -> None:
     found = summary()
-    assert {what: here for what, _, here in overhead_rows(found)} == {
+    assert dict(overhead_rows(found)) == {
         "descriptor, serialised": "180 B", "descriptors a second": "8.0 of 3 drones", "directives a second": "40",
         "context plane": "3.0 kB/s", "data plane": "0.3 MB/s", "context over data": "1.00 %", "a decision, median": "2.500 ms",
         "a decision, 99th %": "3.970 ms", "of one core": "25 % by 3 drones, 2 % by the bench",
