@@ -202,7 +202,7 @@ def _difference(old: Mapping[str, Any], new: Mapping[str, Any], within: str = ""
 def _scenario_of(path: Path) -> Scenario:
     """The scenario of a run. Packages that offered its models need not be installed."""
     text = read_file(path / SCENARIO).decode()
-    if not text.endswith("\n"):
+    if text and not text.endswith("\n"):
         raise ValueError(f"{path / SCENARIO}: ends within a line")
     with models_of_the_past():
         scenario = loads(text, source=str(path / SCENARIO))
