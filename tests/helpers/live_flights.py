@@ -15,7 +15,7 @@ from sortie.sim.live.reports import Report
 from sortie.sim.live.result import LiveResult
 from sortie.sim.live.session import fly_live
 
-LONGEST_S = 120.0
+LONGEST_S = 600.0
 stop = session._request_stop
 PATIENT = "context={degraded_after_periods: 100, detached_after_periods: 300}"
 """Peers stay fresh on a machine that stalls for 10 s."""
