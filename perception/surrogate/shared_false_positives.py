@@ -7,7 +7,6 @@ drawn anew at every look. Their number follows from the number of false positive
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,19 +60,3 @@ class SharedFalsePositives:
         xy = (tiles[tile] + np.stack([uniform(key, 1), uniform(key, 2)], axis=1)) * TILE_M
         poses = np.column_stack([fleet.position_m[:, :2], fleet.yaw_rad])
         return Things(xy, 2 * np.pi * uniform(key, 3), key, rarity, in_square(xy, poses).T)
-
-
-def estimate_shared(seen: Sequence[int], others: int) -> tuple[float, float]:
-    """The share of false positives that are of shared things, and the chance that a drone has one of those.
-
-    Chosen so that as many others have them, and as many pairs of others, as was counted on average.
-
-    Args:
-        seen: for each false positive, how many of the `others` that could have had it as well had it.
-    """
-    n = np.asarray(seen, dtype=np.float64)
-    if not n.sum():
-        return 0.0, 1.0
-    pairs = float((n * (n - 1)).mean() / ((others - 1) * n.mean()))
-    chance = min(1.0, max(pairs, float(n.mean()) / others))
-    return float(n.mean()) / (others * chance), chance

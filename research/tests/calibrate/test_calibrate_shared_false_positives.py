@@ -5,27 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from perception_examples import capture, cross
-from surrogate_examples import detector_runs
 
 from research.benchmark.scenes import model_of
-from research.calibrate.correlation import fit_shared_false_positives
 from research.calibrate.plan import scene_model
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.surrogate.model import SHIPPED, load
 from sortie.perception.types import Capture
 from sortie.scenarios.schema import Perception, Scene
-
-
-@pytest.mark.parametrize(("part", "chance"), [(0.0, 1.0), pytest.param(0.5, 0.3, marks=pytest.mark.slow), (0.9, 0.8)])
-def test_a_fleet_of_known_shared_false_positives_is_measured_as_such(part: float, chance: float) -> None:
-    planted = replace(load(SHIPPED), shared_false_positives=np.array([part, chance, 0.4, 0.1], np.float32))
-    found = fit_shared_false_positives(detector_runs(planted, 40), planted.floor, 0)
-    # how often another has it too: some stand so near a car that was missed that they are taken for it
-    assert 0.75 * part * chance <= found[0] * found[1] <= part * chance + 0.02
-    if part:
-        assert found[1] == pytest.approx(chance, abs=0.1)
-        assert found[2] == pytest.approx(0.4, abs=0.1)
-        assert found[3] == pytest.approx(0.1, abs=0.03)
 
 
 def test_alarms_come_as_often_whether_they_are_shared_or_not() -> None:
