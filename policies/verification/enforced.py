@@ -23,8 +23,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from sortie.policies.contract import Directive, FleetView, Representation
-from sortie.policies.verification.invariants import Invariant, describe_directives, violations
-from sortie.policies.verification.past import Past
+from sortie.policies.verification.invariants.language import Invariant, describe_directives, violations
+from sortie.policies.verification.invariants.past import Past
 from sortie.policies.verification.shield import Ceilings, enforce
 
 POLICY, STALENESS, DAMPING, NO_PEER = "policy", "staleness", "damping", "no peer"

@@ -25,7 +25,7 @@ from typing import Any
 
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import DIRECTIVE_BOUNDS, Directive, Disc, FleetView, Policy, Representation
-from sortie.policies.verification.invariants import (
+from sortie.policies.verification.invariants.language import (
     COMPARE,
     Binary,
     Fresh,
@@ -41,7 +41,7 @@ from sortie.policies.verification.invariants import (
     violations,
     walk,
 )
-from sortie.policies.verification.words import CHANGES, DECISIONS, WORDS, Scope
+from sortie.policies.verification.invariants.words import CHANGES, DECISIONS, WORDS, Scope
 from sortie.scenarios.representation import AT_LEVEL, NAME_OF
 
 MARK = "shield: "

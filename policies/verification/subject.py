@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from sortie.policies.contract import Policy, PolicyError
-from sortie.policies.verification.invariants import Invariant, Number
+from sortie.policies.verification.invariants.language import Invariant, Number
 from sortie.policies.verification.shield import Shielded
 from sortie.scenarios.plugins.reference import describe_error
 from sortie.scenarios.plugins.user_calls import Guarded

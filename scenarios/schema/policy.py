@@ -59,7 +59,7 @@ class PolicySection(Section):
     invariants: str = Field(
         "",
         max_length=10000,
-        description="What enforced directives must keep, one line each (policies/verification/invariants.py); violations are events.",
+        description="What enforced directives must keep, one line each (policies/verification/invariants/language.py); violations are events.",
     )
     of_makes: bool = Field(
         True,

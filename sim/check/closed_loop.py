@@ -16,8 +16,8 @@ from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, nothing
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.verification.enforced import Steps, Violation, effective, judge, put_right
-from sortie.policies.verification.invariants import Invariant, just_heard
-from sortie.policies.verification.past import Past
+from sortie.policies.verification.invariants.language import Invariant, just_heard
+from sortie.policies.verification.invariants.past import Past
 from sortie.policies.verification.shield import enforce
 from sortie.scenarios.plugins.reference import describe_error
 from sortie.scenarios.schema import Scenario

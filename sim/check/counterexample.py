@@ -10,9 +10,9 @@ from typing import Any
 
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import PHASE_NAMES, Directive, FleetView, Policy, PolicyError, TaskPhase
-from sortie.policies.verification.age_rule import raised_part
-from sortie.policies.verification.single_view import RepeatableView
-from sortie.policies.verification.views import to_json
+from sortie.policies.verification.kit.age_rule import raised_part
+from sortie.policies.verification.kit.single_view import RepeatableView
+from sortie.policies.verification.kit.views import to_json
 from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie

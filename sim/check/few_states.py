@@ -1,7 +1,7 @@
 """Proofs of lines about time: every sequence of views through the policy, the staleness rules and damping.
 
 A policy whose directives take few values, together with damping, has few states: what each link enforces, what waits for
-its dwell time, and how long the line has been broken. The search of cells (`policies.verification.search`) finds every
+its dwell time, and how long the line has been broken. The search of cells (`policies.verification.proof.search`) finds every
 combination of directives that the policy can decide, and what the line's condition is there. A search over the states then
 follows every sequence of these combinations, one a frame, with `damp` itself.
 
@@ -22,14 +22,15 @@ from sortie.fleet.staleness import cap_by_age, health
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import DETACHED_AFTER_PERIODS, Directive, Disc, Policy, PolicyError, nothing
 from sortie.policies.damping import EPSILON_S, DampedLink, damp, is_climb, is_switch, lower_of
-from sortie.policies.verification.allowed import why_not_provable
+from sortie.policies.verification.budget import Budget
 from sortie.policies.verification.enforced import effective
-from sortie.policies.verification.invariants import Invariant, LinksTerm, Recent, violations
-from sortie.policies.verification.past import ROUNDING_S
-from sortie.policies.verification.ranges import FleetOfRanges, region_axes
-from sortie.policies.verification.search import Budget, Run, rosters
-from sortie.policies.verification.symbols import Path, Ranged, Refused, explore
-from sortie.policies.verification.words import DWELL, Span
+from sortie.policies.verification.invariants.language import Invariant, LinksTerm, Recent, violations
+from sortie.policies.verification.invariants.past import ROUNDING_S
+from sortie.policies.verification.invariants.words import DWELL, Span
+from sortie.policies.verification.proof.allowed import why_not_provable
+from sortie.policies.verification.proof.ranges import FleetOfRanges, region_axes
+from sortie.policies.verification.proof.search import Run, rosters
+from sortie.policies.verification.proof.symbols import Path, Ranged, Refused, explore
 from sortie.scenarios.plugins.user_calls import text_of
 from sortie.sim.check.closed_loop import PlaneTimes
 

@@ -19,7 +19,7 @@ from sortie.fleet.sensor_faults import own_errors
 from sortie.perception.detectors import make_detector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Share
-from sortie.policies.verification.conformance import Check
+from sortie.policies.verification.kit.conformance import Check
 from sortie.radio.channel.pathloss import free_space_loss_db
 from sortie.radio.own_links import changed_snr, own_link, path_loss
 from sortie.scenarios.plugins.reference import Params, resolve

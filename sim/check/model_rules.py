@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sortie.policies.verification.conformance import Check
+from sortie.policies.verification.kit.conformance import Check
 from sortie.scenarios.plugins.reference import PluginError
 
 Rule = Callable[[], str | None]

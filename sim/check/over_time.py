@@ -16,19 +16,20 @@ from itertools import islice, takewhile
 from typing import Any, NamedTuple
 
 from sortie.policies.contract import FleetView, Policy, PolicyError
-from sortie.policies.verification.courses import (
+from sortie.policies.verification.budget import Budget
+from sortie.policies.verification.invariants.language import Invariant, Recent
+from sortie.policies.verification.invariants.words import DWELL
+from sortie.policies.verification.kit.courses import (
     Course,
     Values,
     changed_course,
     draw_course,
     shrink_course,
 )
-from sortie.policies.verification.invariants import Invariant, Recent
-from sortie.policies.verification.proof import Outcome
-from sortie.policies.verification.search import Budget, Stopped
+from sortie.policies.verification.kit.views import to_json
+from sortie.policies.verification.proof.proof import Outcome
+from sortie.policies.verification.proof.search import Stopped
 from sortie.policies.verification.subject import constants_of
-from sortie.policies.verification.views import to_json
-from sortie.policies.verification.words import DWELL
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream

@@ -14,7 +14,7 @@ from sortie.fleet.flight.mobility import MOBILITY
 from sortie.perception.detectors import DETECTORS
 from sortie.policies import registry
 from sortie.policies.registry import POLICIES, missing_parts
-from sortie.policies.verification.words import CONSTANTS, LINK_FUNCTIONS, TIME_WORDS, WORDS
+from sortie.policies.verification.invariants.words import CONSTANTS, LINK_FUNCTIONS, TIME_WORDS, WORDS
 from sortie.scenarios.plugins.reference import PluginError, installed, parameters, resolve
 from sortie.scenarios.reading.files import MODELS, builtin
 from sortie.scenarios.reading.load import campaigns, library, load

@@ -15,14 +15,14 @@ from rich.text import Text
 import sortie
 from sortie.policies.contract import FleetView, Policy
 from sortie.policies.registry import resolve
-from sortie.policies.verification.conformance import VIEWS, Check, conform, failing
-from sortie.policies.verification.invariants import Invariant, InvariantError, parse
-from sortie.policies.verification.proof import DRONES, PLANE_S, SEARCH_S, ProofVerdict, prove
-from sortie.policies.verification.properties import PROMISES
+from sortie.policies.verification.invariants.language import Invariant, InvariantError, parse
+from sortie.policies.verification.invariants.promises import PROMISES
+from sortie.policies.verification.kit.conformance import VIEWS, Check, conform, failing
+from sortie.policies.verification.kit.single_view import PLANE
+from sortie.policies.verification.kit.views import LARGEST, to_json
+from sortie.policies.verification.proof.proof import DRONES, PLANE_S, SEARCH_S, ProofVerdict, prove
 from sortie.policies.verification.shield import check_shieldable
-from sortie.policies.verification.single_view import PLANE
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
-from sortie.policies.verification.views import LARGEST, to_json
 from sortie.scenarios.exit_codes import FAILED
 from sortie.scenarios.plugins.reference import Params
 from sortie.scenarios.plugins.user_calls import DECISION_S, LOAD_S, watched

@@ -28,9 +28,8 @@ from sortie.policies.contract import (
     Viewpoint,
 )
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
-from sortie.policies.verification.age_rule import raised_part
 from sortie.policies.verification.enforced import Steps, effective, judge, put_right
-from sortie.policies.verification.invariants import (
+from sortie.policies.verification.invariants.language import (
     Invariant,
     InvariantError,
     describe_directives,
@@ -38,9 +37,10 @@ from sortie.policies.verification.invariants import (
     parse,
     violations,
 )
-from sortie.policies.verification.past import Past
+from sortie.policies.verification.invariants.past import Past
+from sortie.policies.verification.kit.age_rule import raised_part
+from sortie.policies.verification.kit.views import ViewError, from_json
 from sortie.policies.verification.shield import MARK, Ceilings, check_shieldable, enforce
-from sortie.policies.verification.views import ViewError, from_json
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.scenarios.schema import PolicyChange, PolicySection, Scenario

@@ -7,7 +7,7 @@ import simpy
 from sortie.fleet.agent import Guard
 from sortie.fleet.plane import PlaneRules, equipment_of
 from sortie.policies.catalogue.baselines import silence
-from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.invariants.language import parse
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sortie.policies.contract import Policy
-from sortie.policies.verification.conformance import conform, failing
-from sortie.policies.verification.proof import prove
+from sortie.policies.verification.kit.conformance import conform, failing
+from sortie.policies.verification.proof.proof import prove
 from sortie.scenarios.plugins.user_calls import DECISION_S, watched
 
 SEARCH_S = 10.0

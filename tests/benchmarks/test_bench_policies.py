@@ -10,7 +10,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from sortie.policies.registry import POLICIES
-from sortie.policies.verification.conformance import full_view
+from sortie.policies.verification.kit.conformance import full_view
 
 pytestmark = pytest.mark.slow
 

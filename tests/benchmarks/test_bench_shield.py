@@ -15,9 +15,9 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import POLICIES
-from sortie.policies.verification.conformance import full_view
 from sortie.policies.verification.enforced import put_right
-from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.kit.conformance import full_view
 from sortie.policies.verification.shield import enforce
 
 pytestmark = pytest.mark.slow

@@ -13,8 +13,8 @@ from sortie.fleet.gate import Gate, make_payload
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
 from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age, health
 from sortie.policies.contract import Directive, Disc, Representation
-from sortie.policies.verification.invariants import COMPARE
-from sortie.policies.verification.words import DECISIONS
+from sortie.policies.verification.invariants.language import COMPARE
+from sortie.policies.verification.invariants.words import DECISIONS
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 ORIGIN = (0.0, 0.0, 0.0)

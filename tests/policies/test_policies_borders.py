@@ -11,8 +11,8 @@ from sortie.policies.catalogue.deputies import deputies
 from sortie.policies.contract import PERSON_FLAG, Directive, FleetView, Representation
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.verification.enforced import Steps, effective, judge
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.past import Past
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.invariants.past import Past
 from sortie.scenarios.disc import Disc
 
 REGION = Disc(3.0, 4.0, 32.0)

@@ -54,8 +54,8 @@ from sortie.policies.contract import (
 from sortie.policies.damping import DampedLink, apply_hysteresis, damp
 from sortie.policies.geometry import footprint_overlap, peers_by_overlap
 from sortie.policies.registry import POLICIES, handshake_bytes, resolve, viewpoint_of
-from sortie.policies.verification.invariants import WORDS, Scope
-from sortie.policies.verification.views import draw_views
+from sortie.policies.verification.invariants.language import WORDS, Scope
+from sortie.policies.verification.kit.views import draw_views
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS, WAITING_MBPS, probed_mbps
 
 REGION = Disc(3.0, 4.0, 32.0)

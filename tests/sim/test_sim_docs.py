@@ -14,7 +14,7 @@ import typer
 from places import ROOT
 from typer.testing import CliRunner
 
-from sortie.policies.verification.conformance import conform
+from sortie.policies.verification.kit.conformance import conform
 from sortie.scenarios.reading.load import load
 from sortie.sim.cli.app import app
 

@@ -302,7 +302,7 @@ def test_a_region_lies_where_the_ego_sees_it_whoever_publishes_it(monkeypatch: p
     """And a drone pays for what it sent, not for what it was sent."""
     from sortie.policies import observation
     from sortie.policies.contract import Disc
-    from sortie.policies.verification.views import draw_view
+    from sortie.policies.verification.kit.views import draw_view
     from sortie.sim import env as env_room
 
     peer = next(iter(draw_view(1, 1).descriptors.values()))._replace(

@@ -17,7 +17,7 @@ from sortie.policies.contract import (
     FleetView,
     Representation,
 )
-from sortie.policies.verification.views import draw_views
+from sortie.policies.verification.kit.views import draw_views
 
 PAPER = """\
 | method | Mis. | Scene | Plat. | Geom. | decides |

@@ -9,7 +9,7 @@ from sim_examples import example
 from sortie.fleet.staleness import LinkHealth, health
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import POLICIES
-from sortie.policies.verification.views import draw_view
+from sortie.policies.verification.kit.views import draw_view
 from sortie.sim.engine.sortie import run_sortie
 
 GONE_S = 1.5

@@ -7,7 +7,7 @@ import pytest
 from sortie.policies.catalogue.adaptive import arm
 from sortie.policies.contract import Directive, FleetView, Representation, boxes_across_networks
 from sortie.policies.registry import POLICIES
-from sortie.policies.verification.views import draw_view
+from sortie.policies.verification.kit.views import draw_view
 
 VIEWS = [v for v in (draw_view(7, n) for n in range(60)) if len(v.peers) >= 2]
 FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS

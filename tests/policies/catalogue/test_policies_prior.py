@@ -26,8 +26,8 @@ from sortie.policies.contract import (
     Representation,
 )
 from sortie.policies.registry import POLICIES, handshake_bytes, missing_parts, own_fusion, resolve
-from sortie.policies.verification.invariants import just_heard
-from sortie.policies.verification.views import draw_views
+from sortie.policies.verification.invariants.language import just_heard
+from sortie.policies.verification.kit.views import draw_views
 from sortie.scenarios.link_state import SILENT_MBPS
 
 VIEWS = list(draw_views(0, 200))

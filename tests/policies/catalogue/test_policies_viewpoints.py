@@ -15,7 +15,7 @@ from sortie.policies.catalogue.vantage import MOST_M, over_region
 from sortie.policies.checks import check_reposition
 from sortie.policies.contract import Directive, Disc, FleetView, PolicyError, Reposition, TaskPhase, looks_from
 from sortie.policies.registry import POLICIES, resolve, viewpoint_of
-from sortie.policies.verification.conformance import conform, failing
+from sortie.policies.verification.kit.conformance import conform, failing
 
 
 class Near(float):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sortie.policies.registry import POLICIES, resolve
-from sortie.policies.verification.allowed import why_not_provable
+from sortie.policies.verification.proof.allowed import why_not_provable
 
 HEAD = "import math, random, helper\nfrom helper import LEAST, rate\nfrom sortie import Directive, LinkState\nRATES = {0: 2.0}\nSEEN = []\n"
 HELPER = "LEAST = 0.3\nNOW = [0]\ndef rate(soc, least=LEAST):\n    return 2.0 if soc < least else 8.0\ndef counts():\n    NOW[0] += 1\n"

@@ -15,8 +15,8 @@ from sortie.perception.budget import cells_in
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import PolicyError, Representation
 from sortie.policies.registry import BOUNDS, POLICIES, parameters, resolve
-from sortie.policies.verification.conformance import conform, failing
-from sortie.policies.verification.views import draw_views, to_json
+from sortie.policies.verification.kit.conformance import conform, failing
+from sortie.policies.verification.kit.views import draw_views, to_json
 
 
 @pytest.mark.parametrize("name", POLICIES)

@@ -10,9 +10,9 @@ from policies_corpus import FAULTY, HELPER, LINE, RIGHT, UNPLAIN, source
 from policies_hidden import KEPT, ORDERS, TEXTS, UNSEEN, K
 
 from sortie.policies.registry import resolve
-from sortie.policies.verification.allowed import why_not_provable
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import ProofVerdict, prove
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.proof.allowed import why_not_provable
+from sortie.policies.verification.proof.proof import ProofVerdict, prove
 from sortie.scenarios.plugins.user_calls import Guarded, Source
 
 pytestmark = pytest.mark.slow

@@ -16,15 +16,15 @@ from typing import Any
 import pytest
 
 from sortie.policies.contract import COVERAGE_BYTES, PERSON_FLAG, Directive, Disc, FleetView, TaskPhase
-from sortie.policies.verification.courses import (
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.kit.courses import (
     Course,
     Values,
     changed_course,
     draw_course,
     shrink_course,
 )
-from sortie.policies.verification.drawn import views_at
-from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.kit.drawn import views_at
 from sortie.policies.verification.shield import shield
 from sortie.policies.verification.subject import constants_of
 

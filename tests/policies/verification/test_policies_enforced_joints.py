@@ -23,8 +23,8 @@ from sortie.policies.verification.enforced import (
     judge,
     put_right,
 )
-from sortie.policies.verification.invariants import parse, violations
-from sortie.policies.verification.past import Past
+from sortie.policies.verification.invariants.language import parse, violations
+from sortie.policies.verification.invariants.past import Past
 from sortie.policies.verification.shield import Ceilings, enforce, shield
 
 NONE, DETECTIONS, FEATURES = Representation.NONE, Representation.DETECTIONS, Representation.FEATURES

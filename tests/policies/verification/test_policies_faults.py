@@ -15,11 +15,11 @@ from policies_faults import sliver, unreached, whole
 from policies_more_faults import KEEPERS, MANY, kept, memory, returned, size, stand_in
 
 from sortie.policies.registry import resolve
-from sortie.policies.verification.drawn import views_at
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import ProofVerdict, prove
-from sortie.policies.verification.single_view import check_property, property_of
-from sortie.policies.verification.views import LARGEST, draw_view
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.kit.drawn import views_at
+from sortie.policies.verification.kit.single_view import check_property, property_of
+from sortie.policies.verification.kit.views import LARGEST, draw_view
+from sortie.policies.verification.proof.proof import ProofVerdict, prove
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # a planted `__del__` is refused

@@ -13,8 +13,8 @@ from policies_corpus import LINE, source
 from policies_examples import fleet_of
 
 from sortie.policies.registry import resolve
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import prove
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.proof.proof import prove
 
 pytestmark = pytest.mark.slow
 

@@ -6,8 +6,8 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, Disc, FleetView, Representation, TaskPhase
-from sortie.policies.verification.invariants import InvariantError, just_heard, parse, violations
-from sortie.policies.verification.words import WORDS
+from sortie.policies.verification.invariants.language import InvariantError, just_heard, parse, violations
+from sortie.policies.verification.invariants.words import WORDS
 
 VIEW = fleet_of(3, soc=0.2, goodput=4.0)
 SHARED = [

@@ -16,9 +16,9 @@ from policies_examples import fleet_of
 
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Descriptor, Directive, FleetView, Representation, TaskPhase, boxes_across_networks
-from sortie.policies.verification import conformance
-from sortie.policies.verification.conformance import RULES, Check, conform, failing
-from sortie.policies.verification.views import ViewError, draw_view, draw_views, from_json, shrink, to_json
+from sortie.policies.verification.kit import conformance
+from sortie.policies.verification.kit.conformance import RULES, Check, conform, failing
+from sortie.policies.verification.kit.views import ViewError, draw_view, draw_views, from_json, shrink, to_json
 
 FEATURES, DETECTIONS = Representation.FEATURES, Representation.DETECTIONS
 calls = itertools.count()

@@ -13,8 +13,8 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, FleetView, Reposition, Representation, looks_from
-from sortie.policies.verification.conformance import RULES, conform
-from sortie.policies.verification.views import draw_view, draw_views, shrink
+from sortie.policies.verification.kit.conformance import RULES, conform
+from sortie.policies.verification.kit.views import draw_view, draw_views, shrink
 
 VIEW = fleet_of(5)
 

@@ -9,11 +9,10 @@ import pytest
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.registry import resolve
-from sortie.policies.verification.age_rule import MOST_LISTED, listed
-from sortie.policies.verification.drawn import views_at
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import ProofVerdict, prove
-from sortie.policies.verification.views import LARGEST, draw_view, from_json, shrink, to_json
+from sortie.policies.verification.invariants.language import MOST_LISTED, listed, parse
+from sortie.policies.verification.kit.drawn import views_at
+from sortie.policies.verification.kit.views import LARGEST, draw_view, from_json, shrink, to_json
+from sortie.policies.verification.proof.proof import ProofVerdict, prove
 from sortie.scenarios.disc import LISTED_MEMBERS
 from sortie.scenarios.schema.base import MOST_DRONES
 

@@ -9,9 +9,9 @@ import pytest
 from sortie.policies.catalogue.coverage_cells import well_cells
 from sortie.policies.contract import Coverage, TaskPhase, nothing, nothing_to_all
 from sortie.policies.registry import resolve
-from sortie.policies.verification.conformance import conform
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import prove
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.kit.conformance import conform
+from sortie.policies.verification.proof.proof import prove
 
 LINE = "when phase == landing: rate_hz == 0"
 POLICY = """

@@ -13,11 +13,11 @@ from sortie.policies.catalogue.baselines import silence
 from sortie.policies.contract import Directive, Representation
 from sortie.policies.damping import DampedLink, damp, is_climb
 from sortie.policies.verification.enforced import Steps, judge
-from sortie.policies.verification.invariants import InvariantError, parse, violations
-from sortie.policies.verification.past import Past
-from sortie.policies.verification.proof import prove
+from sortie.policies.verification.invariants.language import InvariantError, parse, violations
+from sortie.policies.verification.invariants.past import Past
+from sortie.policies.verification.invariants.words import TIME_WORDS, WORDS
+from sortie.policies.verification.proof.proof import prove
 from sortie.policies.verification.shield import check_shieldable, enforce
-from sortie.policies.verification.words import TIME_WORDS, WORDS
 
 FRAME_S = 0.1
 VIEW = fleet_of(3)

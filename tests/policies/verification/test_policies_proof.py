@@ -13,11 +13,11 @@ from sortie.policies.catalogue.baselines import everyone, random_k
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import resolve
-from sortie.policies.verification import drawn
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import ProofVerdict, check_property, property_of, prove
-from sortie.policies.verification.properties import PROMISES
-from sortie.policies.verification.views import from_json, to_json
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.invariants.promises import PROMISES
+from sortie.policies.verification.kit import drawn
+from sortie.policies.verification.kit.views import from_json, to_json
+from sortie.policies.verification.proof.proof import ProofVerdict, check_property, property_of, prove
 
 Decide = Callable[[FleetView], Sequence[Directive]]
 HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"

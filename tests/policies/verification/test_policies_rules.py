@@ -23,9 +23,9 @@ from sortie.policies.checks import check_directives, find_inexact
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, PolicyError, Representation
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.registry import POLICIES
-from sortie.policies.verification.age_rule import raised_part, without_detached
-from sortie.policies.verification.conformance import RULES, full_view
-from sortie.policies.verification.views import draw_view
+from sortie.policies.verification.kit.age_rule import raised_part, without_detached
+from sortie.policies.verification.kit.conformance import RULES, full_view
+from sortie.policies.verification.kit.views import draw_view
 from sortie.scenarios.reading.load import ScenarioError, loads
 
 FLEET = fleet_of(5)

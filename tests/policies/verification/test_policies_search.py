@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sortie.policies.geometry import peers_by_overlap
-from sortie.policies.verification.ranges import FleetOfRanges, _places
-from sortie.policies.verification.symbols import Path, Ranged, Refused, explore
+from sortie.policies.verification.proof.ranges import FleetOfRanges, _places
+from sortie.policies.verification.proof.symbols import Path, Ranged, Refused, explore
 
 
 def cells(run: Callable[[Ranged], object], low: float = 0.0, high: float = 1.0) -> list[tuple[float, float, object]]:

@@ -21,18 +21,18 @@ from policies_examples import fleet_of
 from sortie.policies.contract import PERSON_FLAG, Directive, Disc, Representation, Roster, TaskPhase
 from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.registry import resolve
-from sortie.policies.verification.age_rule import older_views, raised_part, without_detached
-from sortie.policies.verification.invariants import WORDS, Scope
-from sortie.policies.verification.proof import prove
-from sortie.policies.verification.ranges import FleetOfRanges
-from sortie.policies.verification.search import Run as OneRun
-from sortie.policies.verification.search import rosters
-from sortie.policies.verification.single_view import PLANE, RepeatableView, check_property
-from sortie.policies.verification.solver import solver_paths
+from sortie.policies.verification.invariants.language import WORDS, Scope
+from sortie.policies.verification.kit.age_rule import older_views, raised_part, without_detached
+from sortie.policies.verification.kit.single_view import PLANE, RepeatableView, check_property
+from sortie.policies.verification.kit.views import from_json, to_json
+from sortie.policies.verification.proof.proof import prove
+from sortie.policies.verification.proof.ranges import FleetOfRanges
+from sortie.policies.verification.proof.search import Run as OneRun
+from sortie.policies.verification.proof.search import rosters
+from sortie.policies.verification.proof.solver import solver_paths
+from sortie.policies.verification.proof.symbols import Path as Run
+from sortie.policies.verification.proof.symbols import Ranged, Refused, explore
 from sortie.policies.verification.subject import own_invariants
-from sortie.policies.verification.symbols import Path as Run
-from sortie.policies.verification.symbols import Ranged, Refused, explore
-from sortie.policies.verification.views import from_json, to_json
 
 DECIDERS: list[Callable[[Any], Any]] = [
     lambda x: x < 0.25,

@@ -12,11 +12,11 @@ from policies_examples import fleet_of, planted
 from sortie.policies.catalogue.baselines import everyone, silence
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, Disc, FleetView, Policy, Representation, TaskPhase
-from sortie.policies.verification.conformance import conform, failing
-from sortie.policies.verification.invariants import InvariantError, just_heard, parse, violations
-from sortie.policies.verification.proof import prove
+from sortie.policies.verification.invariants.language import InvariantError, just_heard, parse, violations
+from sortie.policies.verification.kit.conformance import conform, failing
+from sortie.policies.verification.kit.views import draw_views
+from sortie.policies.verification.proof.proof import prove
 from sortie.policies.verification.shield import MARK, _distance, enforce, interventions, shield
-from sortie.policies.verification.views import draw_views
 
 HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"
 SPARING = """

@@ -10,7 +10,7 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, Representation
-from sortie.policies.verification.invariants import parse, violations
+from sortie.policies.verification.invariants.language import parse, violations
 from sortie.policies.verification.shield import MARK, enforce
 
 RUNGS, RATES_HZ, WEIGHTS = (0, 1, 2), (0.0, 2.0, 5.0, 10.0), (0.2, 1.0)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from sortie.policies.registry import resolve
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import ProofVerdict, prove
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.proof.proof import ProofVerdict, prove
 
 pytestmark = pytest.mark.slow
 

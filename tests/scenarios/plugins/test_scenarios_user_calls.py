@@ -17,7 +17,7 @@ import pytest
 
 from sortie.policies.contract import FleetView, PolicyError
 from sortie.policies.registry import parameters, resolve, viewpoint_of
-from sortie.policies.verification.conformance import conform, full_view
+from sortie.policies.verification.kit.conformance import conform, full_view
 from sortie.scenarios.plugins import user_calls
 from sortie.scenarios.plugins.user_calls import (
     Guarded,

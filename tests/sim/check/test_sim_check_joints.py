@@ -14,8 +14,8 @@ from sim_examples import example
 
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import resolve
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.views import from_json
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.kit.views import from_json
 from sortie.scenarios.schema import DecisionExpectation, Expectation
 from sortie.sim.check.checking import Checked
 from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes

@@ -10,10 +10,10 @@ import pytest
 
 from sortie.policies.contract import Directive, FleetView, PolicyError, Representation
 from sortie.policies.registry import resolve
-from sortie.policies.verification import search
-from sortie.policies.verification.courses import Course, Values, draw_course
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.search import Budget
+from sortie.policies.verification import budget
+from sortie.policies.verification.budget import Budget
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.kit.courses import Course, Values, draw_course
 from sortie.policies.verification.subject import constants_of
 from sortie.scenarios.plugins.user_calls import watched
 from sortie.scenarios.reading.load import loads
@@ -213,7 +213,7 @@ def test_views_of_a_course_come_frame_by_frame_and_count_in_the_plane_s_periods(
 
 def test_courses_end_with_their_time_and_each_line_gets_a_share(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [0.0]
-    monkeypatch.setattr(search, "process_time", lambda: now_s[0])
+    monkeypatch.setattr(budget, "process_time", lambda: now_s[0])
 
     def slow(view: FleetView) -> list[Directive]:
         now_s[0] += 0.3
@@ -228,7 +228,7 @@ def test_courses_end_with_their_time_and_each_line_gets_a_share(monkeypatch: pyt
 
 def test_a_course_of_a_slow_policy_is_made_smaller_as_far_as_the_time_allows(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [0.0]
-    monkeypatch.setattr(search, "process_time", lambda: now_s[0])
+    monkeypatch.setattr(budget, "process_time", lambda: now_s[0])
     monkeypatch.setattr(over_time, "shows_in_flight", lambda scenario: True)
 
     def silent(view: FleetView) -> list[Directive]:
@@ -301,7 +301,7 @@ def test_a_policy_that_fails_in_a_flight_of_the_scenario_is_refuted_by_it(tmp_pa
 
 def test_a_flight_of_the_scenario_ends_with_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [0.0]
-    monkeypatch.setattr(search, "process_time", lambda: now_s[0])
+    monkeypatch.setattr(budget, "process_time", lambda: now_s[0])
     flown_s: list[float] = []
 
     def fly(scenario: Scenario, *, progress: Callable[[float], None]) -> SortieRecord:

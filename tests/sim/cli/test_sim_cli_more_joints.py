@@ -18,7 +18,7 @@ import sortie
 from sortie.perception.evaluation import SINGLE, Sharing
 from sortie.perception.metrics.bootstrap import Difference
 from sortie.policies.contract import PolicyError
-from sortie.policies.verification.invariants import Invariant
+from sortie.policies.verification.invariants.language import Invariant
 from sortie.scenarios.reading.load import ScenarioError
 from sortie.sim.cli import console
 from sortie.sim.cli import verify as verify_command

@@ -10,10 +10,10 @@ from cli_examples import command
 
 from sortie.policies.contract import TaskPhase
 from sortie.policies.registry import resolve
-from sortie.policies.verification.conformance import RULES
-from sortie.policies.verification.proof import prove
+from sortie.policies.verification.kit.conformance import RULES
+from sortie.policies.verification.kit.views import draw_views, from_json, to_json
+from sortie.policies.verification.proof.proof import prove
 from sortie.policies.verification.subject import own_invariants
-from sortie.policies.verification.views import draw_views, from_json, to_json
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug
 from sortie.sim.cli import console
 

@@ -16,7 +16,7 @@ from sim_examples import example
 from sortie.fleet.flight.viewpoints import Move
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Directive, Disc, FleetView, Reposition, Representation, TaskPhase
-from sortie.policies.verification.invariants import parse
+from sortie.policies.verification.invariants.language import parse
 from sortie.scenarios.plugins.reference import PluginError
 from sortie.scenarios.schema import PolicyChange
 from sortie.sim.engine import sortie as engine

@@ -20,7 +20,7 @@ from recording_examples import record_flight
 from sim_examples import example
 
 from sortie.policies.contract import Descriptor, FleetView, TaskPhase
-from sortie.policies.verification.views import to_json
+from sortie.policies.verification.kit.views import to_json
 from sortie.scenarios.schema import FlightGroup, Scenario
 from sortie.scenarios.schema.fleet import Make
 from sortie.sim.engine.sortie import run_sortie

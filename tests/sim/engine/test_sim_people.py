@@ -17,8 +17,8 @@ from sortie.perception.thermal import people_boxes
 from sortie.perception.types import Capture, Share
 from sortie.policies.contract import Directive, Disc, FleetView, Policy, Representation
 from sortie.policies.registry import resolve
-from sortie.policies.verification.invariants import parse
-from sortie.policies.verification.proof import prove
+from sortie.policies.verification.invariants.language import parse
+from sortie.policies.verification.proof.proof import prove
 from sortie.scenarios.reading.load import load
 from sortie.sim.engine.people import People
 from sortie.sim.engine.sortie import run_sortie

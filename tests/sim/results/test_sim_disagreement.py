@@ -19,7 +19,7 @@ from sortie.fleet.trust import discounted
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Representation, nothing
 from sortie.policies.damping import apply_hysteresis
 from sortie.policies.registry import POLICIES, resolve
-from sortie.policies.verification.views import draw_view
+from sortie.policies.verification.kit.views import draw_view
 from sortie.sim.results.disagreement import CAUSES, Pair, figures, measure, pairs_of, pairs_table
 from sortie.sim.results.views import Decision
 

@@ -13,7 +13,7 @@ import pytest
 import sortie
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, Disc, FleetView, Representation
-from sortie.policies.verification.views import draw_view, to_json
+from sortie.policies.verification.kit.views import draw_view, to_json
 from sortie.sim.results import arrow_types
 from sortie.sim.results.views import decisions
 

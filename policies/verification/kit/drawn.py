@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sortie.policies.contract import FleetView, Policy
-from sortie.policies.verification.invariants import Invariant
-from sortie.policies.verification.search import Budget
-from sortie.policies.verification.single_view import PLANE, Property, RepeatableView, check_property, complaint_of
+from sortie.policies.verification.budget import Budget
+from sortie.policies.verification.invariants.language import Invariant
+from sortie.policies.verification.kit.single_view import PLANE, Property, RepeatableView, check_property, complaint_of
+from sortie.policies.verification.kit.views import LARGEST, LONGEST_S, MAX_DRONES, draw_view, shrink
 from sortie.policies.verification.subject import constants_of
-from sortie.policies.verification.views import LARGEST, LONGEST_S, MAX_DRONES, draw_view, shrink
 from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.streams import stream
 

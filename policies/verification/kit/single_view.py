@@ -8,9 +8,15 @@ from typing import Any
 
 from sortie.policies.checks import check_directives, find_inexact, find_wrong_type
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError
-from sortie.policies.verification.age_rule import listed, older_views, raised_part, without_detached
-from sortie.policies.verification.conformance import missing_links
-from sortie.policies.verification.invariants import Invariant, describe_directives, just_heard, violations
+from sortie.policies.verification.invariants.language import (
+    Invariant,
+    describe_directives,
+    just_heard,
+    listed,
+    violations,
+)
+from sortie.policies.verification.kit.age_rule import older_views, raised_part, without_detached
+from sortie.policies.verification.kit.conformance import missing_links
 from sortie.scenarios.plugins.user_calls import text_of
 
 ONE_BY_ONE = 8

@@ -23,11 +23,11 @@ from sortie.policies.checks import check_directives, check_reposition, find_wron
 from sortie.policies.contract import Descriptor, Directive, FleetView, Policy, PolicyError, Representation
 from sortie.policies.geometry import rank_loop
 from sortie.policies.registry import parameters, viewpoint_of
-from sortie.policies.verification.age_rule import by_peer, listed, older_views, raised_part, without_detached
-from sortie.policies.verification.invariants import just_heard
-from sortie.policies.verification.search import Budget
+from sortie.policies.verification.budget import Budget
+from sortie.policies.verification.invariants.language import by_peer, just_heard, listed
+from sortie.policies.verification.kit.age_rule import older_views, raised_part, without_detached
+from sortie.policies.verification.kit.views import draw_view, draw_views, shrink
 from sortie.policies.verification.subject import with_function
-from sortie.policies.verification.views import draw_view, draw_views, shrink
 from sortie.scenarios.plugins.user_calls import Guarded, text_of
 from sortie.scenarios.plugins.user_code import load
 

@@ -7,8 +7,8 @@ from typing import NamedTuple, Protocol, TypeVar
 
 from sortie.policies.contract import Directive, nothing
 from sortie.policies.damping import is_climb, is_switch
-from sortie.policies.verification.invariants import Invariant, Recent
-from sortie.policies.verification.words import DWELL, Span
+from sortie.policies.verification.invariants.language import Invariant, Recent
+from sortie.policies.verification.invariants.words import DWELL, Span
 
 ROUNDING_S = 1e-6
 """Tolerance of times: frames of 0.1 s are not exactly as long."""

@@ -1,4 +1,4 @@
-"""Views with ranges as fields, for the search of `sortie.policies.verification.proof`, and plain examples of their cells."""
+"""Views with ranges as fields, for the search of `sortie.policies.verification.proof.proof`, and plain examples of their cells."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ import numpy as np
 from sortie.policies import geometry
 from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, LinkState, TaskPhase
 from sortie.policies.geometry import peers_by_overlap
-from sortie.policies.verification.stand_ins import (
+from sortie.policies.verification.kit.views import LONGEST_S, OTHER_CODEBOOK
+from sortie.policies.verification.proof.stand_ins import (
     FLAGS,
     ORDER_IN_VIEW,
     Flags,
@@ -28,8 +29,7 @@ from sortie.policies.verification.stand_ins import (
     orders,
     space_of,
 )
-from sortie.policies.verification.symbols import Path, Ranged
-from sortie.policies.verification.views import LONGEST_S, OTHER_CODEBOOK
+from sortie.policies.verification.proof.symbols import Path, Ranged
 from sortie.scenarios.disc import disc_overlap
 from sortie.scenarios.link_state import state_of
 

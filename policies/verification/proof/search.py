@@ -7,16 +7,15 @@ decide the same there; otherwise nothing is proved.
 
 from __future__ import annotations
 
-import copy
 import itertools
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from time import process_time
 from typing import Any, NamedTuple
 
 from sortie.policies.contract import Directive, Disc, FleetView, Policy
-from sortie.policies.verification.ranges import FleetOfRanges
-from sortie.policies.verification.symbols import Path, Ranged, Refused, explore
+from sortie.policies.verification.budget import Budget
+from sortie.policies.verification.proof.ranges import FleetOfRanges
+from sortie.policies.verification.proof.symbols import Path, Ranged, Refused, explore
 
 MakePath = Callable[[Sequence[int]], Path]
 
@@ -37,31 +36,6 @@ class Searched:
         self.fault: Found | None = None
         self.unclear = ""
         """Why nothing is proved although no fault was confirmed."""
-
-
-class Budget:
-    """The processor time that several searches or tests of a policy may take together, from now on."""
-
-    def __init__(self, budget_s: float) -> None:
-        self.budget_s = budget_s
-        self._begin_s = process_time()
-
-    @property
-    def is_spent(self) -> bool:
-        """Whether the time is over."""
-        return self.used_s >= self.budget_s
-
-    @property
-    def used_s(self) -> float:
-        """The time used so far."""
-        return process_time() - self._begin_s
-
-    def shares(self, count: int) -> list[Budget]:
-        """An even share for each of several that follow each other. What one leaves, the next may use."""
-        ends = [copy.copy(self) for _ in range(count)]
-        for k, end in enumerate(ends, 1):
-            end.budget_s *= k / count
-        return ends
 
 
 class Stopped(Exception):

@@ -31,8 +31,7 @@ from functools import lru_cache
 from typing import Any
 
 from sortie.policies.contract import Directive, FleetView, Representation
-from sortie.policies.verification.age_rule import listed
-from sortie.policies.verification.words import (
+from sortie.policies.verification.invariants.words import (
     CHANGES,
     CONSTANTS,
     DECISIONS,
@@ -49,6 +48,9 @@ from sortie.policies.verification.words import (
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.representation import NAME_OF
+
+MOST_LISTED = 40
+"""A complaint names so many drones or directives at most."""
 
 
 class InvariantError(SortieError):
@@ -426,3 +428,20 @@ def describe_directives(directives: Iterable[Directive]) -> str:
         for d in directives
     )
     return listed(texts, "; ")
+
+
+def listed(items: Iterable[object], between: str = ", ") -> str:
+    """Items as text; of more than `MOST_LISTED` the first, and how many more there are.
+
+    Example:
+        >>> listed([3, 1, 2])
+        '3, 1, 2'
+    """
+    texts = [str(item) for item in items]
+    more = len(texts) - MOST_LISTED
+    return between.join(texts[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
+
+
+def by_peer(directives: Iterable[Directive]) -> dict[int, Directive]:
+    """Directives by their destinations."""
+    return {d.destination: d for d in directives}

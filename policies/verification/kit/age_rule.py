@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from sortie.policies.contract import Directive, FleetView, Representation
-
-MOST_LISTED = 40
-"""A complaint names so many drones or directives at most."""
+from sortie.policies.verification.invariants.language import by_peer
 
 
 def older_views(view: FleetView, *, one_by_one: bool = True) -> Iterator[tuple[tuple[int, ...], float, FleetView]]:
@@ -68,20 +66,3 @@ def _rise(old: Directive | None, d: Directive) -> str | None:
 def _rung(d: Directive) -> Representation:
     """Its representation; plain numbers are not ordered by fidelity."""
     return Representation(d.representation) if type(d.representation) is int else d.representation
-
-
-def listed(items: Iterable[object], between: str = ", ") -> str:
-    """Items as text; of more than `MOST_LISTED` the first, and how many more there are.
-
-    Example:
-        >>> listed([3, 1, 2])
-        '3, 1, 2'
-    """
-    texts = [str(item) for item in items]
-    more = len(texts) - MOST_LISTED
-    return between.join(texts[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
-
-
-def by_peer(directives: Iterable[Directive]) -> dict[int, Directive]:
-    """Directives by their destinations."""
-    return {d.destination: d for d in directives}

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from sortie.policies.verification.symbols import LONGEST_TEXT, MARK, Path, Ranged, Refused
+from sortie.policies.verification.proof.symbols import LONGEST_TEXT, MARK, Path, Ranged, Refused
 
 STEP = 3_000_000
 """The most steps of the solver, as it counts them (`rlimit`), for one question."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from sortie.policies.contract import plain_copy
-from sortie.policies.verification.symbols import Path
+from sortie.policies.verification.proof.symbols import Path
 
 FLAGS = 8
 """The bits of a descriptor's novelty flags; the plane uses three of them."""

@@ -1,6 +1,6 @@
 """Proofs that a policy keeps its properties on every view of a fleet, or a view on which it does not.
 
-The policy runs on views whose fields are ranges (`sortie.policies.verification.symbols`). Its comparisons divide the
+The policy runs on views whose fields are ranges (`sortie.policies.verification.proof.symbols`). Its comparisons divide the
 ranges into cells. The search visits every cell, for every roster up to `max_drones`, every ego, every subset of peers
 heard, every order of the drones in the view, and
 
@@ -31,13 +31,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sortie.policies.contract import DETACHED_AFTER_PERIODS, FleetView, Policy
-from sortie.policies.verification.allowed import why_not_provable
-from sortie.policies.verification.drawn import TRIED_VIEWS, Drawn
-from sortie.policies.verification.invariants import Invariant, InvariantError
-from sortie.policies.verification.search import Budget, Found, Searched, Stopped, search_size
-from sortie.policies.verification.single_view import PLANE, Property, check_property, property_of
-from sortie.policies.verification.solver import solver_paths
-from sortie.policies.verification.symbols import Combined, Refused
+from sortie.policies.verification.budget import Budget
+from sortie.policies.verification.invariants.language import Invariant, InvariantError
+from sortie.policies.verification.kit.drawn import TRIED_VIEWS, Drawn
+from sortie.policies.verification.kit.single_view import PLANE, Property, check_property, property_of
+from sortie.policies.verification.proof.allowed import why_not_provable
+from sortie.policies.verification.proof.search import Found, Searched, Stopped, search_size
+from sortie.policies.verification.proof.solver import solver_paths
+from sortie.policies.verification.proof.symbols import Combined, Refused
 
 DRONES = 5
 """The largest fleet that a proof covers if nothing else is asked for."""

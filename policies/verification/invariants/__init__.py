@@ -1,0 +1,1 @@
+"""The language of invariants, one evaluator, and the lines about time."""

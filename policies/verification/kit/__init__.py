@@ -1,0 +1,1 @@
+"""The conformance kit: its rules, and the views that they are tried on."""

@@ -1,0 +1,1 @@
+"""The search of all views, for policies in plain Python."""
