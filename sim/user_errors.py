@@ -99,7 +99,9 @@ def as_text(error: Exception) -> str:
 
 def defect() -> str:
     """How to report a defect of Sortie; it comes after a traceback."""
-    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    program = Path(sys.argv[0])
+    named = ["python", "-m", program.parent.name] if program.name == "__main__.py" else [program.name]
+    command = shlex.join([*named, *sys.argv[1:]])
     return (
         "This is a defect of Sortie, not a mistake of yours. Please report it to the project, with the lines above,\n"
         f"the version ({code_version()}, Python {platform.python_version()}) and what you ran: {command}"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-import typer
+from page_commands import commands_in, fault
 from places import ROOT
 from typer.testing import CliRunner
 
@@ -118,41 +118,17 @@ def test_a_file_that_a_page_names_is_there(page: Path) -> None:
         assert any(place.is_file() for place in places), f"{page.relative_to(ROOT)}: {name}"
 
 
-def commands_in(page: Path) -> list[str]:
-    """Every `sortie …` of a page: on a line of its own in an example, or as code within a sentence."""
-    text = page.read_text("utf-8")
-    lines = re.findall(r"^\s*(?:\.venv/bin/)?(sortie .+)$", text, re.M)
-    return [c.replace("[", "").replace("]", "") for c in (*lines, *re.findall(r"`(sortie [^`\n]+)`", text))]
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_every_command_told_is_one_with_these_options(page: Path) -> None:
-    for told in commands_in(page):
-        words = shlex.split(told, comments=True)[1:]
-        if words[0] not in ("…", "..."):
-            assert fault(words) is None, told
-
-
-def fault(words: list[str]) -> str | None:
-    """What is wrong with a command's name and options; what is left out is not."""
-    command: Any = typer.main.get_command(app)
-    context: Any = None
-    try:
-        while True:
-            context = command.make_context(command.name or "sortie", list(words), parent=context)
-            words = [*context._protected_args, *context.args]  # a group may have put something before them
-            if not hasattr(command, "resolve_command") or not words:
-                return None
-            _, command, words = command.resolve_command(context, words)
-    except Exception as error:
-        return None if type(error).__name__ in ("MissingParameter", "NoArgsIsHelpError") else str(error)
+    for told in commands_in(page, "sortie"):
+        assert fault(app, told) is None, told
 
 
 @pytest.mark.parametrize(
     "words", [["soar"], ["fly", "track_target", "--speed", "3"], ["recording", "break"], ["live", "--loss", "lots"]]
 )
 def test_a_command_that_is_none_is_found(words: list[str]) -> None:
-    assert fault(words) is not None
+    assert fault(app, shlex.join(["sortie", *words])) is not None
 
 
 def test_the_readme_s_example_flies_and_its_policy_is_one(capsys: pytest.CaptureFixture[str]) -> None:

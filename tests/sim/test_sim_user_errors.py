@@ -20,7 +20,7 @@ from sortie.sim.check import checking
 from sortie.sim.check.plugin import ScenarioFile
 from sortie.sim.engine import pilot
 from sortie.sim.folders import RunError
-from sortie.sim.user_errors import as_text, missing, of_user, user_errors
+from sortie.sim.user_errors import as_text, defect, missing, of_user, user_errors
 
 SHIPPED = str(Path(sortie.__file__).parent / "scenarios" / "library" / "gone.yaml")
 
@@ -111,6 +111,14 @@ def test_a_report_has_the_traceback_of_a_defect_alone(wrong: Path) -> None:
     assert text.index("np.zeros(3) + np.zeros(4)") < text.index("This is a defect of Sortie")
     assert sortie.__version__ in text
     assert as_text(RunError("a: is no file")) == "RunError: a: is no file"
+
+
+@pytest.mark.parametrize(
+    ("ran", "told"), [("/a/bin/sortie", "sortie"), ("/a/research/__main__.py", "python -m research")]
+)
+def test_a_defect_says_what_was_run(ran: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", [ran, "fly", "a b"])
+    assert defect().endswith(f"what you ran: {told} fly 'a b'")
 
 
 def test_pytest_shows_the_traceback_of_a_defect(
