@@ -1,13 +1,10 @@
-"""Write a file whole, under a temporary name beside it, renamed when it is complete; read arrays that may be damaged."""
+"""Read arrays and codebooks from files that may be damaged."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-import os
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +17,6 @@ from sortie.scenarios.regular import regular
 
 _MOST_DEFLATED = 1040
 """Deflate makes at most so many bytes of one, and a little more at a stream's begin and end."""
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path to write to; it takes the place of `path` at the end, or is removed after an error.
-
-    Folders are made as needed. The name ends in `.part`, so that nobody takes a file that was cut off for a whole one.
-    A link stays: the file that it leads to is replaced. A device or a pipe is written itself.
-    """
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        yield path
-        return
-    path = path.resolve()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        yield part
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
-import numbers
 import platform
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import requires, version
 from importlib.resources import files
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 from sortie.scenarios.code_digest import contents, digest_of, installed
@@ -108,70 +106,6 @@ def name_of(thing: object) -> str:
     return f"{source.__module__}.{source.__qualname__}"
 
 
-def state_of(thing: Any, name: str = "it", within: tuple[object, ...] = ()) -> object:
-    """Everything that decides how a callable answers, as JSON; `name_of` alone leaves most of it out.
-
-    That is its place in its file with the file's digest, and the values that it holds: closures, defaults, attributes,
-    bound arguments, and the plain values among the global variables that a function names.
-
-    Args:
-        thing: a function, a method, a `partial`, or an object whose class has `__call__` in Python.
-        name: how an error calls it.
-        within: what holds it.
-
-    Raises:
-        ValueError: a value that is neither a number, a text nor a tuple, list or dict of them, or code without a file.
-    """
-    if _is_plain(thing):
-        return repr(thing)
-    if any(thing is outer for outer in within):
-        return "holds itself"
-
-    def each(values: Mapping[Any, object]) -> list[object]:
-        return [[repr(k), state_of(v, k if isinstance(k, str) else name, (*within, thing))] for k, v in values.items()]
-
-    if isinstance(thing, tuple | list):
-        return [state_of(value, name, (*within, thing)) for value in thing]
-    if isinstance(thing, dict):
-        return each(thing)
-    if isinstance(thing, functools.partial):
-        return each({"its function": thing.func, "its arguments": thing.args, "its keywords": thing.keywords})
-    if inspect.ismethod(thing):
-        return each({"its function": thing.__func__, "its object": thing.__self__})
-    if inspect.isfunction(thing):
-        seen = inspect.getclosurevars(thing)
-        known = {key: value for key, value in sorted(seen.globals.items()) if _is_plain(value)}
-        held: dict[str, object] = {
-            "its globals": known, "its closure": seen.nonlocals, "its defaults": thing.__defaults__,
-            "its keywords": thing.__kwdefaults__, "its attributes": vars(thing),
-        }  # fmt: skip
-        return [_place(thing, name), list(thing.__code__.co_positions()), each(held)]
-    if isinstance(thing, type):
-        return _place(thing, name)
-    call = inspect.getattr_static(type(thing), "__call__", None)
-    if not inspect.isfunction(call) and not (within and inspect.ismethod(within[-1])):
-        of = type(thing).__name__
-        raise ValueError(f"{name} is of type {of}, must be a number, a text, or a tuple, list or dict of them")
-    of_class = {k: v for c in reversed(type(thing).__mro__) for k, v in vars(c).items() if _is_plain(v)}
-    held = {"its call": call, "its class": of_class, "its state": object.__getstate__(thing)}
-    return [_place(type(thing), name), each(held)]
-
-
-def _is_plain(value: object) -> bool:
-    return value is None or isinstance(value, numbers.Number | str | bytes)
-
-
-def _place(code: Any, name: str) -> str:
-    """The name of a function or a class, and the digest of its file."""
-    try:
-        file = Path(inspect.getsourcefile(code) or "")
-    except (OSError, TypeError):
-        file = Path()
-    if not file.is_file():
-        raise ValueError(f"{name} is typed in, must be in a file")
-    return f"{code.__module__}.{code.__qualname__} {_digest(file)}"
-
-
 def runs_user_code(scenario: Scenario) -> bool:
     """Whether a scenario names a model in a file of a user's own."""
     return any(is_file(name) for _, name in named_models(scenario.model_dump(mode="json")))
@@ -224,8 +158,7 @@ def own_files(
         try:
             file = Path(inspect.getsourcefile(function) or "")
             source = inspect.getsource(function)
-        # typed in, written in C, or compiled under another file's name
-        except (OSError, TypeError, SyntaxError, TokenError):
+        except (OSError, TypeError):  # typed in, or written in C
             file, source = Path(), ""
         if file.is_file():
             code.append(file)

@@ -255,7 +255,8 @@ def compare(
             was enough.
         kept: a file to which finished seeds are written. After an interruption the same call goes on from there. A later
             call with a smaller half-width uses them too. True chooses a file in `runs`; False writes nothing. A policy
-            that is a callable must be in a file and hold numbers and texts alone, so that another one is not taken for it.
+            that is a callable must be a function at the top of a file, or a `functools.partial` of one with numbers and
+            texts, so that another one is not taken for it.
 
     Raises:
         ScenarioError, PolicyError: the scenario or a policy is wrong; raised before anything flies.
@@ -361,14 +362,12 @@ class CampaignResult:
     def rows(self) -> pa.Table:
         """One row for each run: its varied fields, policy, seed, status and the campaign's metrics.
 
-        Each row is checked against its hash.
-
         Raises:
-            RunError: nothing is finished, a row is broken, or the Parquet table or its manifest was changed.
+            RunError: nothing is finished, or the file of the rows is damaged.
         """
-        from sortie.sim.campaign.rows import read_checked
+        from sortie.sim.campaign.rows import read_rows
 
-        return read_checked(self.path).all
+        return read_rows(self.path).all
 
     def report(self) -> Path:
         """Write `report.md` with its figures into the folder, and return its path.
@@ -415,8 +414,7 @@ def campaign(
         resume: only continue; raise an error if the folder has no campaign.
         retry_failed: fly failed runs once more.
         progress: called with a `sortie.sim.campaign.drive.Progress` after each batch.
-        notice: called with a line when a cluster has no workers, and for each file that somebody else changed in the
-            folder; None issues warnings.
+        notice: called with a line when a cluster has no workers; None issues warnings.
 
     Raises:
         ScenarioError, PolicyError: the campaign is wrong; raised before anything flies.
@@ -460,7 +458,7 @@ def campaign(
             memory_b=None if worker_memory_gb is None else round(worker_memory_gb * 1e9),
         ) as engine:  # fmt: skip
             watch = (lambda p: None) if progress is None else progress
-            how: dict[str, Any] = {"retry_failed": retry_failed, "progress": watch, "notice": tell}
+            how: dict[str, Any] = {"retry_failed": retry_failed, "progress": watch}
             done = [run_campaign(plan, folder, engine, resume_only=resume, **how)]
             if units is not None:  # of those that stop_when left
                 units = min(units, done[0].of // plan.unit_runs)
@@ -476,20 +474,16 @@ def open_campaign(folder: str | Path) -> CampaignResult:
     """Open a campaign's folder, to read its finished runs.
 
     Raises:
-        RunError: the folder has no campaign, a row is broken, or the Parquet table or manifest was changed.
+        RunError: the folder has no campaign, or the file of its rows is damaged.
 
     Example:
         >>> sortie.open_campaign("runs/campaign-link_battery").rows    # doctest: +SKIP
     """
     from sortie.sim.campaign.store import CampaignTable
-    from sortie.sim.campaign.table import foreign_line
 
     path = as_path("folder", folder)
     with user_errors(), closing(CampaignTable(path)) as store:
         finished, failed = store.count()
-        store.ensure_table()
-    if foreign := foreign_line(path):
-        _warn(foreign)
     return CampaignResult(path, finished, failed, 0, 0.0)
 
 

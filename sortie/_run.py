@@ -18,6 +18,7 @@ from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.outcome_fields import is_zero_count
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.run_files import RECORDING
 from sortie.sim.user_errors import missing, user_errors
 
 if TYPE_CHECKING:
@@ -172,7 +173,7 @@ class Run:
                 if recording:
                     raise missing(error) from error
                 return
-            save_rrd(self.record, folder / run_folder.RECORDING)
+            save_rrd(self.record, folder / RECORDING)
 
         place = None if path is None else as_path("path", path)
         return run_folder.save(self.record, place, None if recording is False else add_recording, replace=replace)
@@ -223,10 +224,10 @@ class Run:
         """The run's own recording where it lies in its folder, else one made in `made`."""
         from sortie.sim.playback.recording import save_rrd
 
-        if self.path is not None and (self.path / run_folder.RECORDING).is_file():
-            return self.path / run_folder.RECORDING
-        save_rrd(self.record, made / run_folder.RECORDING)
-        return made / run_folder.RECORDING
+        if self.path is not None and (self.path / RECORDING).is_file():
+            return self.path / RECORDING
+        save_rrd(self.record, made / RECORDING)
+        return made / RECORDING
 
     def __repr__(self) -> str:
         return f"<Run of {self.scenario.name} under {self.policy}, seed {self.seed}, {self.scenario.duration_s:g} s>"

@@ -6,13 +6,10 @@ MAVLink is NED, FRD and w-first quaternions in scaled integers; `sortie.fleet.fl
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import hmac
 import math
-import os
 import struct
-import tempfile
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -22,6 +19,7 @@ from pymavlink.dialects.v20 import common as mavlink2
 from sortie.fleet.flight.frames import compass_deg, swap_attitude, swap_enu_ned, swap_flu_frd, to_wxyz, yaw_rad
 from sortie.fleet.logs.geodesy import Origin, geodetic
 from sortie.fleet.logs.telemetry import KEY_BYTES, Telemetry
+from sortie.scenarios.replacing import replacing
 
 _GNSS = mavlink2.MAV_SYS_STATUS_SENSOR_GPS
 _SENSORS = (
@@ -268,27 +266,15 @@ class Listener:
 def write_tlog(path: Path | str, frames: Iterable[tuple[int, bytes]]) -> None:
     """Write a telemetry log: for every frame its time as big-endian u64 µs since 1970, then the frame.
 
-    Written to a temporary name beside `path` and renamed, so that a log is there whole or not at all. A link stays: the
-    file that it leads to is replaced.
+    The log is there whole or not at all (`sortie.scenarios.replacing`).
 
     Args:
         path: conventionally *.tlog.
         frames: (µs since 1970, MAVLink frame), in order of time.
 
     Raises:
-        OSError: the disk refuses, or `path` is a folder, a device or a pipe.
+        OSError: the disk refuses, or `path` is a folder.
     """
-    path = Path(path).resolve()
-    if path.exists() and not path.is_file():
-        raise OSError(errno.EINVAL, "is not a regular file", str(path))
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            for time_us, frame in frames:
-                file.write(LOG_STAMP.pack(time_us) + frame)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(temporary)
-        raise
+    with replacing(Path(path)) as partial, partial.open("wb") as file:
+        for time_us, frame in frames:
+            file.write(LOG_STAMP.pack(time_us) + frame)

@@ -33,7 +33,6 @@ from sortie.perception.evaluation.sharing import (
     link_bytes,
     sending_order,
 )
-from sortie.perception.files import replacing
 from sortie.perception.geometry import CELLS, Geometry, to_world
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.joining import NMS_IOU
@@ -42,6 +41,7 @@ from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.types import Boxes
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.regular import regular
+from sortie.scenarios.replacing import replacing
 from sortie.scenarios.streams import stream
 
 Ints = NDArray[np.int64]

@@ -12,12 +12,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
 from sortie.perception.errors import InputError
-from sortie.perception.files import replacing
 from sortie.perception.geometry import IMAGE_PX, SHARP_PX
 from sortie.perception.network.fusion.base import Fusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.model import CarNet, ModelConfig
 from sortie.scenarios.plugins.reference import installed, is_file
+from sortie.scenarios.replacing import replacing
 
 
 def save_weights(net: CarNet, path: Path, facts: dict[str, Any] | None = None) -> None:

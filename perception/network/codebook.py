@@ -23,9 +23,9 @@ from torch import Tensor
 
 from sortie.perception import budget
 from sortie.perception.errors import InputError
-from sortie.perception.files import replacing
 from sortie.perception.geometry import CHANNELS
 from sortie.perception.network.model import CarNet
+from sortie.scenarios.replacing import replacing
 
 ENTRIES = 256
 """Of a stage: one byte names one of them."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sortie.perception.files import replacing
 from sortie.perception.recordings.recording import FORMAT, Floats, RecordingError, checked, from_zarr
+from sortie.scenarios.replacing import replacing
 
 
 def write_recording(
@@ -96,9 +94,7 @@ def _to_zarr(
         raise RecordingError(
             f"{path}: Zarr needs pip install 'sortie-sim[zarr]', or a name that ends in .npz"
         ) from None
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
+    with replacing(path, replace=False) as part:
         group = zarr.open_group(part, mode="w")
         for name, values in small.items():
             group.create_array(name, data=values)
@@ -118,6 +114,3 @@ def _to_zarr(
         if features is not None and (out is None or f + 1 != n):
             raise RecordingError(f"{path}: features end after {0 if out is None else f + 1} frames, must be {n}")
         checked(path, *from_zarr(part))
-        part.rename(path)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)

@@ -24,11 +24,11 @@ from safetensors.numpy import save_file
 from scipy.special import expit, ndtri
 
 from sortie.perception.errors import InputError
-from sortie.perception.files import replacing
 from sortie.perception.scene.town import Floats
 from sortie.perception.surrogate.draws import BANDS
 from sortie.perception.surrogate.exchange import ALARM_COVARIATES, FUSED_COVARIATES
 from sortie.perception.surrogate.features import LOOK_COVARIATES, beside
+from sortie.scenarios.replacing import replacing
 from sortie.scenarios.shipped import CALIBRATION, SHIPPED_WEIGHTS, calibration_of
 
 Singles = NDArray[np.float32]

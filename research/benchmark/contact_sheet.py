@@ -12,9 +12,9 @@ from research.benchmark.difficulty import Split
 from research.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
 from research.benchmark.visibility import SEEN, inside, visible
 from sortie.perception.errors import InputError
-from sortie.perception.files import replacing
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import CAMERAS, Renderer
+from sortie.scenarios.replacing import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

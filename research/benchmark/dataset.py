@@ -22,10 +22,10 @@ from research.benchmark.difficulty import Difficulty, Layout, Split
 from research.benchmark.manifest import COLUMNS, BenchmarkError
 from research.benchmark.scenes import DRONES, draw_captures, draw_scene, model_of, scene_id
 from sortie.perception.errors import InputError
-from sortie.perception.files import replacing
 from sortie.perception.geometry import FULL, Geometry
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import Renderer
+from sortie.scenarios.replacing import replacing
 
 FORMAT = 1
 """Of the files; a change of what a scene looks like raises it, so that old files are not taken for new ones."""

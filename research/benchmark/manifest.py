@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from research.benchmark.difficulty import Split
-from sortie.perception.files import read_npz, replacing
+from sortie.perception.files import read_npz
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.replacing import replacing
 
 MANIFEST = "manifest.json"
 COLUMNS = ("images", "true_pose", "est_pose", "cars")

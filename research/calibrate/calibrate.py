@@ -19,12 +19,12 @@ from research.calibrate.levels import level
 from research.calibrate.plan import MANNERS, THRESHOLD, Split, scene_model
 from research.calibrate.rows import FitRows, rows_of
 from sortie.perception.errors import InputError
-from sortie.perception.files import replacing
 from sortie.perception.ground_truth import ground_truth
 from sortie.perception.metrics.ap import average_precision, match
 from sortie.perception.network.checkpoint import read_config
 from sortie.perception.network.detector import named_weights
 from sortie.perception.surrogate.model import Parameters, save
+from sortie.scenarios.replacing import replacing
 from sortie.scenarios.report_text import NONE, interval, table
 
 FLOORS = (0.3, 0.25, 0.2, 0.15, 0.1)

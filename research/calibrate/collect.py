@@ -24,10 +24,10 @@ from research.calibrate.plan import (
 )
 from sortie.perception.code_digest import boxes_digest
 from sortie.perception.errors import InputError
-from sortie.perception.files import replacing
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
+from sortie.scenarios.replacing import replacing
 from sortie.scenarios.schema import Perception
 
 FLOOR = 0.02

@@ -12,7 +12,8 @@ from rich.table import Table
 from sortie.scenarios.regular import regular
 from sortie.sim.cli.console import out, print_written, stages
 from sortie.sim.cli.options import DeviceOption, WorkersOption
-from sortie.sim.folders import RunError, ensure_between, ensure_folder, put_between, replacing, writing_durably
+from sortie.sim.folders import RunError, ensure_folder, write_text, writing
+from sortie.sim.readme import with_section
 
 if TYPE_CHECKING:
     from research.flip.measure import StudyRow
@@ -96,9 +97,11 @@ def study_report(
     plan = read_plan()
     drawn: list[tuple[str, str]] = []
     ensure_folder(out_dir, TABLE, "report", {REPORT, TABLE, *figures.CAPTIONS})
-    ensure_between(readme, report.BEGIN, report.END)
+    if readme is not None:
+        with_section(readme, report.BEGIN + report.END, report.BEGIN, report.END)  # its errors come first
     rows = _read_rows(table)
-    with replacing(out_dir) as folder:
+    with writing(out_dir) as folder:
+        folder.mkdir()
         _write_table(to_table(rows), folder / TABLE)
         if common.available():
             drawn = figures.draw_all(plan, rows, folder)
@@ -106,7 +109,7 @@ def study_report(
     if readme is not None:
         link = Path(os.path.relpath(out_dir.resolve() / REPORT, readme.resolve().parent)).as_posix()
         section = report.short(plan, rows, link)
-        put_between(readme, section, report.BEGIN, report.END)
+        write_text(readme, with_section(readme, section, report.BEGIN, report.END))
         print_written("the study's sentences in", readme, " written")
     for line in report.answers(plan, report.StudyRows(rows)):
         out.print(line)
@@ -174,6 +177,5 @@ def _read_rows(path: Path) -> list[StudyRow]:
 def _write_table(table: object, path: Path) -> None:
     import pyarrow.parquet as pq
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with writing_durably(path) as file:
-        pq.write_table(table, file)
+    with writing(path) as partial:
+        pq.write_table(table, partial)

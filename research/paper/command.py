@@ -17,7 +17,8 @@ from research.paper.verdict import ClaimVerdict
 from research.paper.ways import Absent, CellsBy, Serve, Ways
 from sortie.sim.cli.console import out, print_written, stages
 from sortie.sim.cli.options import DeviceOption, WorkersOption, refuse
-from sortie.sim.folders import RunError, ensure_between
+from sortie.sim.folders import RunError
+from sortie.sim.readme import with_section
 from sortie.sim.terminal import Terminal
 
 if TYPE_CHECKING:
@@ -103,7 +104,8 @@ def paper(
             raise RunError(f"{name} is {value!r}, must be {' or '.join(allowed)}")
     given = {"temperature": temperature, "silent_weight": silent_weight}
     fusion_params = {name: value for name, value in given.items() if value != {"temperature": 1.0}.get(name, 0.0)}
-    ensure_between(readme, report.BEGIN, report.END)
+    if readme is not None:
+        with_section(readme, report.BEGIN + report.END, report.BEGIN, report.END)  # its errors come first
     ways = Ways(absent, serve)  # type: ignore[arg-type]
     asked = TableSettings(chosen, cells_by, tau, "scene" if scenes else "frame", ways=ways)  # type: ignore[arg-type]
     cores = workers or os.cpu_count() or 1

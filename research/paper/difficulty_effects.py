@@ -25,12 +25,12 @@ from research.benchmark.scenes import draw_captures, draw_scene, model_of, scene
 from research.paper.instrument import CarNetInstrument
 from research.paper.ways import FULL_SHARING, SINGLE, Sharing, evaluate
 from sortie.perception.code_digest import boxes_digest
-from sortie.perception.files import replacing
 from sortie.perception.metrics.ap import Matched
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.bev import lift
 from sortie.perception.scene.render import Renderer
 from sortie.perception.scene.scene_model import SceneModel
+from sortie.scenarios.replacing import replacing
 
 SEED = 7
 SCENES = 12

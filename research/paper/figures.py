@@ -11,7 +11,7 @@ import numpy as np
 from research.paper.claims import BUDGETS, CURVE
 from research.paper.rows import INSTRUMENTS, ClaimRow, Point
 from research.paper.verdict import ClaimVerdict
-from sortie.perception.files import replacing
+from sortie.scenarios.replacing import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -21,8 +21,9 @@ from research.paper.results import TableSettings
 from research.paper.rows import ClaimRow, Point
 from research.paper.sensitivity import Varied, sensitivity
 from research.train.devices import gpu_name, measuring_device
-from sortie.sim.folders import ensure_folder, put_between, replacing
+from sortie.sim.folders import ensure_folder, write_text, writing
 from sortie.sim.identity import RELEASE, machine
+from sortie.sim.readme import with_section
 
 REPORT, TABLE, POINTS, VARIED = "README.md", "paper.parquet", "points.parquet", "sensitivity.parquet"
 FIGURES = {
@@ -159,7 +160,8 @@ def write(result: PaperResult, path: Path) -> list[Path]:
         RunError: as `ensure_writable`, or the disk refuses.
     """
     ensure_writable(path)
-    with replacing(path) as partial:
+    with writing(path) as partial:
+        partial.mkdir()
         pq.write_table(rows.to_table(result.rows, result.facts), partial / TABLE)
         for name, several in ((POINTS, result.points), (VARIED, result.varied)):
             pq.write_table(pa.Table.from_pylist([_plain(p) for p in several]), partial / name)
@@ -175,7 +177,8 @@ def put_into_readme(readme: Path, result_rows: Sequence[ClaimRow], facts: dict[s
     Raises:
         RunError: no such file, or one without the section's markers.
     """
-    put_between(readme, report.short(result_rows, facts, link), report.BEGIN, report.END)
+    section = report.short(result_rows, facts, link)
+    write_text(readme, with_section(readme, section, report.BEGIN, report.END))
 
 
 def _draw(result: PaperResult, folder: Path) -> list[str]:

@@ -18,11 +18,11 @@ from research.benchmark.dataset import Benchmark, Frames, load_frames, make_spli
 from research.train.recipe import of_benchmark
 from sortie.perception.budget import payload_bytes
 from sortie.perception.errors import InputError
-from sortie.perception.files import replacing
 from sortie.perception.geometry import CHANNELS
 from sortie.perception.network.codebook import ENTRIES, Codebook, encoder_digest, save_codebook
 from sortie.perception.network.inference import folded
 from sortie.perception.network.model import CarNet
+from sortie.scenarios.replacing import replacing
 from sortie.scenarios.streams import stream
 
 CELLS_OF_A_MAP = 205

@@ -32,11 +32,11 @@ from research.train.learn import SHARDS, Batch, Thinning, apply, draw_batch, gra
 from research.train.recipe import PEAK_LR, Recipe, benchmark_root
 from research.train.validation import history, publish, validate, validate_all
 from sortie.perception.errors import InputError
-from sortie.perception.files import replacing
 from sortie.perception.metrics.bootstrap import Difference
 from sortie.perception.network.fusion.own import OwnFusion
 from sortie.perception.network.fusion.registry import FUSIONS
 from sortie.perception.network.model import CarNet, ModelConfig
+from sortie.scenarios.replacing import replacing
 from sortie.scenarios.streams import stream
 
 AHEAD = 2

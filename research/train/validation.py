@@ -18,11 +18,11 @@ from research.paper.results import TAU
 from research.paper.ways import FULL_SHARING, SINGLE, evaluate
 from research.train.learn import EGOS
 from research.train.recipe import command, of_benchmark
-from sortie.perception.files import replacing
 from sortie.perception.geometry import IMAGE_PX, Geometry
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.perception.network.checkpoint import read_facts, save_weights
 from sortie.perception.network.model import CarNet
+from sortie.scenarios.replacing import replacing
 from sortie.scenarios.report_text import interval, table
 
 LEVELS = ((1.0, 1.0), (1.0, 2.5), (0.0, 0.0))

@@ -54,7 +54,6 @@ def run_campaign(
     retry_failed: bool = False,
     units: int | None = None,
     progress: Callable[[Progress], None] = lambda p: None,
-    notice: Callable[[str], None] = lambda line: None,
 ) -> Progress:
     """Fly what is missing of a campaign into its folder.
 
@@ -63,15 +62,12 @@ def run_campaign(
     Args:
         retry_failed: runs that failed count as missing.
         units: fly the first so many; None: all.
-        notice: called with a line for each thing that was found changed in the folder, and is put right.
 
     Raises:
         RunError: a folder that cannot be used, a cluster that is not there, a disk that is full.
     """
     store = CampaignStore(folder, plan, resume_only=resume_only, retry_failed=retry_failed)
     try:
-        for line in store.complaints():
-            notice(line)
         done = _drive(plan, store, engine, plan.runs if units is None else units * plan.unit_runs, progress)
         store.export()
         return done

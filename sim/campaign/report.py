@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -35,12 +35,8 @@ NO_INTERVALS = {
 }
 
 
-def write_report(folder: Path, notice: Callable[[str], None] = lambda line: None) -> Path:
+def write_report(folder: Path) -> Path:
     """Write report.md, figures and the Parquet table into a campaign's folder; returns the report's path.
-
-    Args:
-        folder: the campaign's folder.
-        notice: called with a line for each thing that somebody else changed in the folder, and that is put right.
 
     Raises:
         RunError: no campaign there, nothing finished, or the disk refuses.
@@ -48,8 +44,6 @@ def write_report(folder: Path, notice: Callable[[str], None] = lambda line: None
     """
     rows = read_rows(folder)
     with closing(CampaignTable(folder)) as store:
-        for line in store.complaints():
-            notice(line)
         store.export()
     try:
         pictures = {VARIED: False, PARETO: False}
@@ -97,7 +91,7 @@ def _lines(rows: CampaignRows, folder: Path, pictures: dict[str, bool]) -> Itera
     yield from _failed(rows, folder)
     yield "\n## The rows\n"
     yield f"""```python
-sortie.open_campaign("{folder}").rows  # checked against their hashes
+sortie.open_campaign("{folder}").rows
 polars.read_parquet("{folder}/{TABLE}")
 pandas.read_parquet("{folder}/{TABLE}")
 duckdb.sql("from '{folder}/{TABLE}'")

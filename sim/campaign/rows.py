@@ -143,17 +143,6 @@ def read_rows(folder: Path) -> CampaignRows:
     return CampaignRows(plan, kept, unit[whole], policy, table)
 
 
-def read_checked(folder: Path) -> CampaignRows:
-    """As `read_rows`, for a folder whose table is as it was written.
-
-    Raises:
-        RunError: as `read_rows`, or the table or its manifest was changed.
-    """
-    with closing(CampaignTable(folder)) as store:
-        store.ensure_table()
-    return read_rows(folder)
-
-
 def sign(metric: str) -> int:
     """1 where more of a metric is better, -1 where less is, 0 where that is not known."""
     if is_accuracy(metric):

@@ -2,15 +2,12 @@
 
     campaign.sqlite     the plan, and the rows; a row is committed before progress counts it
     runs/table.parquet  the rows of finished parts; written at the end and with every report
-    manifest.json       what the table must be
 
-Each row is stored with a SHA-256 over the plan, the run's number and the values. A part is a fixed stretch of runs. The table is a function of the rows alone, so an interruption leaves no trace in it.
+A part is a fixed stretch of runs. The table is a function of the rows alone, so an interruption leaves no trace in it.
 """
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
 import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,13 +18,11 @@ from typing import Any
 import pyarrow as pa
 
 from sortie.sim.campaign.plan import FORMAT, CampaignPlan
-from sortie.sim.campaign.table import columns, foreign_line, row_of, row_type, table_fault, write_table
+from sortie.sim.campaign.table import columns, row_of, write_table
 from sortie.sim.campaign.work import RunResult
-from sortie.sim.folders import RunError, ensure_folder
+from sortie.sim.folders import RunError, ensure_place
 
-FILE, LOCK = "campaign.sqlite", ".lock"
-MAX_NAMED = 5
-"""Broken rows that one line names."""
+FILE = "campaign.sqlite"
 TIMEOUT_S = 60
 """How long a driver waits for a report that reads, and a report for a driver that writes."""
 _DISK = {
@@ -64,7 +59,6 @@ class CampaignTable:
     def _use(self, plan: CampaignPlan) -> None:
         self.plan = plan
         self._schema = pa.schema(list(columns(plan).items()), {"sortie.campaign": plan.digest})
-        self._type = row_type(plan)
         self.parts = -(-plan.runs // plan.shard)
 
     def runs_of(self, part: int) -> range:
@@ -79,7 +73,10 @@ class CampaignTable:
         """
         runs = self.runs_of(part)
         rows = list(self._rows(runs.start, runs.stop))
-        return pa.Table.from_pylist(rows, schema=self._schema) if len(rows) == len(runs) else None
+        if len(rows) < len(runs):
+            return None
+        with _errors(self.folder):
+            return pa.Table.from_pylist(rows, schema=self._schema)
 
     def row(self, run: int) -> dict[str, Any] | None:
         """One run's row; None where it has not been flown. Raises RunError where it is broken."""
@@ -95,24 +92,8 @@ class CampaignTable:
         rows = [row["status"] for row in self._rows(0, self.plan.runs)]
         return len(rows), rows.count("failed")
 
-    def complaints(self) -> Iterator[str]:
-        """What somebody else did to the folder and `export` puts right or passes over, a line for each."""
-        if fault := table_fault(self.folder, self.plan):
-            yield f"{fault}; it is written anew from {FILE}"
-        if foreign := foreign_line(self.folder):
-            yield foreign
-
-    def ensure_table(self) -> None:
-        """Refuse a table that is not as it was written.
-
-        Raises:
-            RunError: it, or its manifest, was changed.
-        """
-        if fault := table_fault(self.folder, self.plan):
-            raise RunError(f"{fault}; `sortie campaign report {self.folder}` writes both anew")
-
     def export(self) -> None:
-        """Write the finished parts as a Parquet table, with its manifest.
+        """Write the finished parts as a Parquet table.
 
         Raises:
             RunError: the disk refuses, or a row is broken.
@@ -125,38 +106,18 @@ class CampaignTable:
         self._db.close()
 
     def _rows(self, start: int, stop: int) -> Iterator[dict[str, Any]]:
-        for run, row in self._read(start, stop):
-            if row is None:
-                raise RunError(
-                    f"{self.folder / FILE}: the row of run {run} is broken; the campaign's command flies it again"
-                )
-            yield row
-
-    def _read(self, start: int, stop: int) -> Iterator[tuple[int, dict[str, Any] | None]]:
-        """Runs and their rows, in order; None for one whose hash or shape is wrong."""
-        ask = "SELECT run, row, sha256 FROM rows WHERE run >= ? AND run < ? ORDER BY run"
+        """The rows of runs, in order."""
+        ask = "SELECT row FROM rows WHERE run >= ? AND run < ? ORDER BY run"
         with _errors(self.folder):
-            for run, text, sha256 in self._db.execute(ask, (start, stop)):
-                yield run, self._row(run, text) if sha256 == self._sha256(run, text) else None
-
-    def _row(self, run: int, text: str) -> dict[str, Any] | None:
-        """A row's values by column; None where they are not what the campaign's columns are."""
-        try:
-            row = dict(zip(self._schema.names, self._type.validate_json(text, strict=True), strict=True))
-        except ValueError:
-            return None
-        return row if row["run"] == run else None
-
-    def _sha256(self, run: int, text: Any) -> str:
-        """Of a row of this campaign: a row that was copied from another has another one."""
-        return hashlib.sha256(f"{self.plan.digest} {run} {text}".encode(errors="replace")).hexdigest()
+            for (text,) in self._db.execute(ask, (start, stop)):
+                yield dict(zip(self._schema.names, json.loads(text), strict=True))
 
 
 class CampaignStore(CampaignTable):
     """The folder while a campaign runs.
 
     Raises:
-        RunError: a folder that cannot be used, that another driver uses, or that holds another campaign's results.
+        RunError: a folder that cannot be used, or that holds another campaign's results.
     """
 
     def __init__(
@@ -169,7 +130,6 @@ class CampaignStore(CampaignTable):
             raise RunError(f"{folder}: no campaign there to resume ({FILE} is missing)")
         with _errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            self._lock = (folder / LOCK).open("w")
         self._db = sqlite3.connect(folder / FILE, timeout=TIMEOUT_S)  # makes no file before it is used
         try:
             self._open(retry_failed)
@@ -178,39 +138,25 @@ class CampaignStore(CampaignTable):
             raise
 
     def _open(self, retry_failed: bool) -> None:
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise RunError(f"{self.folder}: another driver is at work there") from None
         with _errors(self.folder):
             self._db.execute("PRAGMA synchronous = EXTRA")  # a committed row survives a power cut
             if _check_same(self._db, self.folder, self.plan):
                 with self._db:
                     self._db.execute("BEGIN")
-                    self._db.execute("CREATE TABLE plan (digest TEXT, spec TEXT)")
-                    self._db.execute("CREATE TABLE rows (run INTEGER PRIMARY KEY, row TEXT, sha256 TEXT)")
-                    self._db.execute("INSERT INTO plan VALUES (?, ?)", (self.plan.digest, json.dumps(self.plan.spec)))
+                    self._db.execute("CREATE TABLE plan (spec TEXT)")
+                    self._db.execute("CREATE TABLE rows (run INTEGER PRIMARY KEY, row TEXT)")
+                    self._db.execute("INSERT INTO plan VALUES (?)", (json.dumps(self.plan.spec),))
         self._done = bytearray(self.plan.runs)
         self.failed = 0
         """Runs on disk that failed."""
-        self.broken: list[int] = []
-        """Runs whose rows are broken; they are flown again."""
-        for run, row in self._read(0, self.plan.runs):
-            if row is None:
-                self.broken.append(run)
-            failed = row is not None and row["status"] == "failed"
-            if row is not None and not (failed and retry_failed):
-                self._done[run] = 1
-                self.failed += failed
+        with _errors(self.folder):
+            for row in self._rows(0, self.plan.runs):
+                failed = row["status"] == "failed"
+                if not (failed and retry_failed):
+                    self._done[row["run"]] = 1
+                    self.failed += failed
         self.finished = sum(self._done)
         """Runs whose rows are on disk."""
-
-    def complaints(self) -> Iterator[str]:
-        """As of `CampaignTable`; rows that are broken, too."""
-        if self.broken:
-            runs = ", ".join(map(str, self.broken[:MAX_NAMED])) + (", …" if len(self.broken) > MAX_NAMED else "")
-            yield f"{self.folder / FILE}: {len(self.broken)} broken rows are flown again: runs {runs}"
-        yield from super().complaints()
 
     def is_done(self, part: int) -> bool:
         """Whether all rows of a part are on disk."""
@@ -231,7 +177,7 @@ class CampaignStore(CampaignTable):
         with _errors(self.folder), self._db:
             for run, result in new.items():
                 text = json.dumps(list(row_of(self.plan, self._schema, result).values()))
-                self._db.execute("REPLACE INTO rows VALUES (?, ?, ?)", (run, text, self._sha256(run, text)))
+                self._db.execute("REPLACE INTO rows (run, row) VALUES (?, ?)", (run, text))
         for run, result in new.items():
             self._done[run] = 1
             self.failed += result.status == "failed"
@@ -244,11 +190,6 @@ class CampaignStore(CampaignTable):
             self._db.execute("DELETE FROM rows WHERE run >= ?", (stop,))
         self.failed = sum(row["status"] == "failed" for row in self._rows(0, stop))
 
-    def close(self) -> None:
-        """Release the folder."""
-        super().close()
-        self._lock.close()
-
 
 def ensure_usable(folder: Path, plan: CampaignPlan) -> None:
     """Refuse a folder that a campaign cannot use, before a cluster is started for nothing.
@@ -259,8 +200,10 @@ def ensure_usable(folder: Path, plan: CampaignPlan) -> None:
     if (folder / FILE).is_file():
         with _errors(folder), closing(sqlite3.connect(folder / FILE, timeout=TIMEOUT_S)) as db:
             _check_same(db, folder, plan)
-    elif not folder.is_dir() or [path.name for path in folder.iterdir()] != [LOCK]:
-        ensure_folder(folder, FILE, "campaign")
+        return
+    ensure_place(folder)
+    if folder.is_dir() and (names := sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))):
+        raise RunError(f"{folder}: holds {names[0]} and no {FILE}; name another folder for the campaign")
 
 
 def _check_same(db: sqlite3.Connection, folder: Path, plan: CampaignPlan) -> bool:
@@ -288,14 +231,11 @@ def _plan(db: sqlite3.Connection, folder: Path) -> CampaignPlan | None:
     """The plan that a file holds; None where a driver broke off before it wrote one."""
     if db.execute("SELECT count(*) FROM sqlite_master").fetchone() == (0,):
         return None
-    digest, text = db.execute("SELECT digest, spec FROM plan").fetchone()
+    (text,) = db.execute("SELECT spec FROM plan").fetchone()
     spec = json.loads(text)
     if spec["format"] != FORMAT:
         raise RunError(f"{folder}: holds results of format {spec['format']}, must be {FORMAT}; name another folder")
-    plan = CampaignPlan(spec)
-    if plan.digest != digest:
-        raise RunError(f"{folder / FILE}: was changed by hand, its digest is another")
-    return plan
+    return CampaignPlan(spec)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sortie.sim.campaign.rows import read_checked, sign
+from sortie.sim.campaign.rows import read_rows, sign
 from sortie.sim.folders import RunError
 
 
@@ -38,7 +38,7 @@ def worst(
     Raises:
         RunError: no campaign there, no such metric or policy, or a metric of which nobody knows what is worse.
     """
-    rows = read_checked(folder)
+    rows = read_rows(folder)
     metrics = list(rows.plan.campaign.metrics)
     if metric not in metrics:
         raise RunError(f"{metric}: no metric of {folder}, must be {', '.join(metrics)}")

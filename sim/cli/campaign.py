@@ -130,7 +130,7 @@ def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")])
     from sortie.sim.campaign.report import write_report
     from sortie.sim.campaign.table import TABLE
 
-    path = write_report(folder, _notice)
+    path = write_report(folder)
     print_written("report written to", path, f", rows in {folder / TABLE}")
 
 

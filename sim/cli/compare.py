@@ -23,7 +23,10 @@ from sortie.sim.cli.options import (
     refuse,
     split_policies,
 )
-from sortie.sim.folders import RunError, ensure_between, ensure_files, put_between, write_text
+from sortie.sim.folders import RunError, ensure_files, write_text
+from sortie.sim.readme import with_section
+from sortie.sim.results.html_page import GENERATOR
+from sortie.sim.results.run_files import RECORDING_MARK
 from sortie.sim.studies.compare import MOST_SEEDS, Flown, chosen_seeds, in_town_of
 from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
 
@@ -106,7 +109,7 @@ def compare(
 ) -> None:
     """Fly a scenario or a set of conditions under several policies with equal seeds and draws, and print the comparison.
 
-    A file of --out, --report or --recording that exists needs --replace.
+    A file of --out, --report or --recording that `sortie compare` did not write needs --replace.
     """
     conditions = load_conditions(scenario)
     if conditions is not None:
@@ -119,9 +122,11 @@ def compare(
         raise RunError(f"--by-torch goes with a set of conditions; for {scenario}: --set perception.detector=torch")
     labels = split_policies(policies)
     base = [loaded(scenario, set_, label) for label in labels][0]  # noqa: RUF015  every policy's notes are printed
-    ensure_files(out_file, recording, report, replace=replace)
+    for file, mark in ((out_file, '{\n  "gains": ['), (recording, RECORDING_MARK), (report, GENERATOR)):
+        ensure_files(file, replace=replace, mark=mark)
     ensure_files(out_file, recording, report, kept)
-    ensure_between(readme, BEGIN, END)
+    if readme is not None:
+        with_section(readme, BEGIN + END, BEGIN, END)  # its errors come before the flights
     if half_width is not None:
         if seeds is not None or recording is not None:
             raise RunError(f"--{'recording' if seeds is None else 'seeds'} does not go with --half-width")
@@ -156,7 +161,7 @@ def compare(
             most_seeds=most_seeds,
         )  # fmt: skip
         section = comparison_markdown(Flown(compared.sorties, compared.gains), command, compared.precision)
-        put_between(readme, section, BEGIN, END)
+        write_text(readme, with_section(readme, section, BEGIN, END))
         print_written("the comparison in", readme, " written")
     if recording is not None:
         compared.save_recording(recording)

@@ -31,7 +31,7 @@ def compare_conditions(
     replace: bool = False,
 ) -> None:
     """Fly every policy in every condition, print AP by condition and the sums, keep both as JSON."""
-    ensure_files(out_file, replace=replace)
+    ensure_files(out_file, replace=replace, mark='{\n "summary": [')
     conditions = conditions.model_copy(update={"set": (*conditions.set, *sets)})
     with bars() as bar:
         each = {p: bar(p, len(conditions.conditions)) for p in policies}

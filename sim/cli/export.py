@@ -15,8 +15,8 @@ from sortie.sim.export.endpoint import read_key
 from sortie.sim.export.origin import parse_origin
 from sortie.sim.folders import RunError, ensure_files, ensure_folder
 from sortie.sim.results import run_folder
+from sortie.sim.results.run_files import BAG, PCAP, TLOG
 
-BAG, TLOG, PCAP = "bag", "sortie.tlog", "sortie.pcap"
 BEGIN = "2026-01-01T00:00:00"
 """When a sortie is said to have begun, where nobody says otherwise: the clock starts at zero, and many tools refuse 1970."""
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -54,7 +54,7 @@ def export(
 ) -> None:
     """Write a run for other tools: a ROS 2 bag (also for Foxglove), a log for ground stations, or a packet capture.
 
-    A file or a bag that exists needs --replace.
+    A file that exists and was not written by `sortie export` needs --replace.
     """
     if mcap + tlog + pcap != 1:
         raise typer.BadParameter("name one format: --mcap, --tlog or --pcap")
@@ -69,10 +69,10 @@ def export(
     began_us = (moment(begin, first, end) - EPOCH) // timedelta(microseconds=1)
     where = None if origin is None else parse_origin(origin)
     if tlog:
-        from sortie.sim.export.telemetry import save_tlog
+        from sortie.sim.export.telemetry import MARK, save_tlog
 
         path, secret = out_path or run / TLOG, None if key is None else read_key(key)
-        ensure_files(path, replace=replace)
+        ensure_files(path, replace=replace, mark=MARK)
         try:
             frames = save_tlog(run_folder.load(run), path, began_us, where, secret, drone)
         except TraceError as error:
@@ -80,10 +80,10 @@ def export(
         print_written(f"{frames} MAVLink frames, in", path)
         return
     if pcap:
-        from sortie.sim.export.pcap import write_pcap
+        from sortie.sim.export.pcap import MARK, write_pcap
 
         path = out_path or run / PCAP
-        ensure_files(path, replace=replace)
+        ensure_files(path, replace=replace, mark=MARK)
         sent = write_pcap(run_folder.load(run), path, began_us * 1000)
         parts = ", ".join(f"{count} {kind}" for kind, count in sent.items())
         print_written(f"{sum(sent.values())} packets ({parts}), in", path)
@@ -92,7 +92,7 @@ def export(
 
     path = out_path or run / BAG
     path = path if path.name.strip(".") else path.resolve()  # the bag is called as its folder is
-    ensure_folder(path, "metadata.yaml", "bag", {"metadata.yaml", f"{path.name}.mcap", LAYOUT}, replace=replace)
+    ensure_folder(path, LAYOUT, "bag", {"metadata.yaml", f"{path.name}.mcap", LAYOUT})
     record = run_folder.load(run)
     try:
         from sortie.sim.export.bag import write_bag

@@ -20,6 +20,7 @@ from sortie.sim.engine.needs import Forecast, ensure_room, needs
 from sortie.sim.engine.watchers import Watcher, Watchers
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
+from sortie.sim.results.run_files import RECORDING
 
 
 def fly(
@@ -87,9 +88,7 @@ def fly(
     else:
         flown, number, expected = loaded(_named(scenario), set_, policy), replication or 0, None
     if out_dir is not None:
-        run_folder.ensure_writable(out_dir)
-        if not replace:
-            run_folder.ensure_same(out_dir, flown, flown.seed if seed is None else seed, number)
+        run_folder.ensure_usable(out_dir, flown, flown.seed if seed is None else seed, number, replace=replace)
     need = needs(flown)
     if words := ensure_room(flown, need, out_dir or Path("runs/run"), force=force):
         line_printer(flown.name)(words)
@@ -98,16 +97,15 @@ def fly(
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = Forecast(flown, line_printer(flown.name), bar(flown.name, flown.duration_s), memory=need.memory)
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
-    there = "" if out_dir is None else run_folder.in_place_of(out_dir, flight.fingerprint)
-    note = f", in place of {there}" if there else ""
+    note = ""
     try:
         path = flight.save(out_dir, recording=recording, replace=replace)
-    except run_folder.OtherRunError:  # other code flew it, or it came meanwhile: what was flown now is kept too
-        path, note = flight.save(recording=recording), f", as {out_dir} holds {there or 'another run'}"
+    except run_folder.OtherRunError:  # flown by other code: what was flown now is kept too
+        path, note = flight.save(recording=recording), f", as {out_dir} holds another run"
     out.print(flight.summary())
     out.print(flight.decisions())
     report(flight.outcome)
-    recorded = (path / run_folder.RECORDING).is_file()
+    recorded = (path / RECORDING).is_file()
     see = f", see it with: sortie view {path}" if recorded else ""
     print_written("kept in", path, f"{note}{see}")
     if not recorded and recording is None:

@@ -18,7 +18,7 @@ from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Battery
 from sortie.sim.cli.console import out
 from sortie.sim.export.origin import parse_origin
-from sortie.sim.folders import RunError, ensure_folder, replacing, write_text
+from sortie.sim.folders import RunError, ensure_folder, write_text, writing
 
 if TYPE_CHECKING:
     from sortie.fleet.logs.flightlog import FlightLog
@@ -88,7 +88,8 @@ def import_log(
     flights, columns, text = flown_log(
         logs, folder, rate, from_s, until_s, lift, system or (), together=together, ground=ground or ()
     )
-    with replacing(folder) as new:
+    with writing(folder) as new:
+        new.mkdir()
         write_trace(new / TRACE, columns)
         write_text(new / SCENARIO, text)
     rows, first = len(columns["t_s"]), flights[0]

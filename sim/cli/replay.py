@@ -12,6 +12,7 @@ from sortie.scenarios.exit_codes import FAILED
 from sortie.sim.cli.console import out, print_failure, print_written
 from sortie.sim.cli.options import PolicyOption, ReplaceOption
 from sortie.sim.folders import ensure_files
+from sortie.sim.studies.replayed import CSV_HEAD
 
 
 def replay(
@@ -31,7 +32,7 @@ def replay(
 
     Without --policy the policies that flew decide again. A different decision does not change later views.
     """
-    ensure_files(out_file, replace=replace)
+    ensure_files(out_file, replace=replace, mark=CSV_HEAD)
     replayed = sortie.replay(sortie.open_run(run), policy, disagreement=disagreement)
     out.print(replayed.summary())
     if out_file is not None:

@@ -11,8 +11,8 @@ import sortie
 from sortie.sim.cli.console import print_written
 from sortie.sim.cli.options import ReplaceOption
 from sortie.sim.folders import ensure_files
-
-PAGE = "report.html"
+from sortie.sim.results.html_page import GENERATOR
+from sortie.sim.results.run_files import PAGE
 
 
 def report(
@@ -25,5 +25,5 @@ def report(
     """Write a run as one self-contained HTML page: figures, outcome and decisions. Only a page of Sortie is replaced without --replace."""
     path = out_path or run / PAGE
     opened = sortie.open_run(run)
-    ensure_files(path, replace=replace)
+    ensure_files(path, replace=replace, mark=GENERATOR)
     print_written("kept in", opened.report(path))

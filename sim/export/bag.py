@@ -47,7 +47,7 @@ from sortie.sim.export.origin import origin_of
 from sortie.sim.export.scene_markers import MARKERS, TOWN, SceneMarkers, Timed
 from sortie.sim.export.telemeter import Telemeter
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
-from sortie.sim.folders import replacing
+from sortie.sim.folders import writing
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words, event_in_words
@@ -100,7 +100,8 @@ def write_bag(record: SortieRecord, path: Path, begin_ns: int, origin: Origin | 
     origin = origin_of(record.scenario.fleet) if origin is None else origin
     streams = _streams(record, _makers(store.types), begin_ns, origin)
     counts: dict[str, int] = {}
-    with replacing(path) as partial:
+    with writing(path) as partial:
+        partial.mkdir()
         folder = partial / path.name
         writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)

@@ -38,7 +38,7 @@ from sortie.sim.engine.events import group_key
 from sortie.sim.engine.sortie import KEY_ID
 from sortie.sim.export.messages import descriptors, directives
 from sortie.sim.export.topics import TopicKind
-from sortie.sim.folders import RunError, writing_durably
+from sortie.sim.folders import writing
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
 
 KEPT_BYTES = 16
@@ -46,6 +46,9 @@ KEPT_BYTES = 16
 GROUP = bytes((239, 255, 0, 1))
 CONTEXT_PORT, DATA_PORT, POLICY_PORT, GATE_PORT = 7401, 7411, 7412, 7413
 """Of RTPS domain 0."""
+_RTPS, _GUID = b"RTPS\x02\x05\x00\x00", b"\x00\x00sortie\x00\x00"
+MARK = (_RTPS + _GUID).decode()
+"""Near the begin of each capture that Sortie wrote."""
 
 _FILE = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262_144, 101)  # nanoseconds, version 2.4, raw IP
 _PACKET = struct.Struct("<IIII")
@@ -95,16 +98,13 @@ def write_pcap(record: SortieRecord, path: Path, begin_ns: int) -> dict[TopicKin
         RunError: the disk refuses.
     """
     counts: Counter[TopicKind] = Counter()
-    try:
-        with writing_durably(path) as file:
-            file.write(_FILE)
-            for packet in packets(record, begin_ns):
-                kept, length = _datagram(packet), _IP.size + _UDP.size + packet.rtps_bytes
-                second, nanosecond = divmod(begin_ns + round(packet.t_s * 1e9), 1_000_000_000)
-                file.write(_PACKET.pack(second, nanosecond, len(kept), length) + kept)
-                counts[packet.kind] += 1
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+    with writing(path) as partial, partial.open("wb") as file:
+        file.write(_FILE)
+        for packet in packets(record, begin_ns):
+            kept, length = _datagram(packet), _IP.size + _UDP.size + packet.rtps_bytes
+            second, nanosecond = divmod(begin_ns + round(packet.t_s * 1e9), 1_000_000_000)
+            file.write(_PACKET.pack(second, nanosecond, len(kept), length) + kept)
+            counts[packet.kind] += 1
     return dict(counts)
 
 
@@ -203,13 +203,13 @@ def _datagram(packet: Packet) -> bytes:
 
 def _prefix(drone: int) -> bytes:
     """The first 12 bytes of the GUIDs of a drone's endpoints."""
-    return b"\x00\x00sortie\x00\x00" + struct.pack(">H", drone)
+    return _GUID + struct.pack(">H", drone)
 
 
 def _header(drone: int, t_ns: int, receiver: int | None) -> bytes:
     """RTPS header and INFO_TS, and INFO_DST where one drone is addressed."""
     second, nanosecond = divmod(t_ns, 1_000_000_000)
-    head = b"RTPS\x02\x05\x00\x00" + _prefix(drone)
+    head = _RTPS + _prefix(drone)
     head += struct.pack("<BBHII", 0x09, 1, 8, second, -(-(nanosecond << 32) // 1_000_000_000))
     return head if receiver is None else head + struct.pack("<BBH", 0x0E, 1, 12) + _prefix(receiver)
 

@@ -28,6 +28,8 @@ from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words, event_in_words
 
+MARK = "simulated flight, written by Sortie"
+"""What each drone says first in a log."""
 MOST_SYSTEMS = 255
 """System ids of MAVLink."""
 DATAGRAM_BYTES = 1400
@@ -123,9 +125,10 @@ def save_tlog(
         raise RunError(f"drone is {drone}, must be below fleet.drones = {record.scenario.fleet.drones}")
     origin = origin_of(record.scenario.fleet) if origin is None else origin
     stream = Stream(record.scenario, origin, key, None if key is None else begin_us)
+    said = [(0.0, i, text) for i in range(len(stream.transmitters)) for text in status_texts(MARK, 0, warning=False)]
     frames = [
         (begin_us + round(t_s * 1e6), stream.transmitters[sender].pack(message))
-        for t_s, sender, message in stream.add(record.tables)
+        for t_s, sender, message in (*said, *stream.add(record.tables))
         if drone in (None, sender)
     ]
     try:

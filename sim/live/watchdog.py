@@ -251,9 +251,8 @@ class Watchdog:
             pipe.close()
         if process is None:
             return ""
-        end_s = time.monotonic() + _EXIT_S
-        while not kill and process.exitcode is None and time.monotonic() < end_s:
-            time.sleep(0.01)  # not by `join`: that waits on without a limit for a process that has closed its files
+        if not kill:
+            process.join(_EXIT_S)
         process.kill()  # unless it has ended
         process.join(_EXIT_S)
         code = process.exitcode

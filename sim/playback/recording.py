@@ -17,7 +17,7 @@ import rerun.blueprint as rrb
 
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.scenarios.schema import Scenario
-from sortie.sim.folders import RunError, partial_file
+from sortie.sim.folders import writing
 from sortie.sim.playback.canvas import Canvas
 from sortie.sim.playback.charts import Charts
 from sortie.sim.playback.comparison import comparison, roots
@@ -123,17 +123,13 @@ def new_file(path: Path, layout: rrb.Blueprint, application: str = APPLICATION) 
     Raises:
         RunError: the file cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial_file(path) as partial:
-            partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
-            recording = rr.RecordingStream(application)
-            recording.save(partial, default_blueprint=layout)
-            yield recording
-            recording.flush()
-            recording.disconnect()
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with writing(path) as partial:
+        partial.open("wb").close()  # Rerun would tell of a bad path in a log line only
+        recording = rr.RecordingStream(application)
+        recording.save(partial, default_blueprint=layout)
+        yield recording
+        recording.flush()
+        recording.disconnect()
 
 
 def spread_m(record: SortieRecord) -> float:

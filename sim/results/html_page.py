@@ -6,8 +6,9 @@ from collections.abc import Iterable, Mapping
 from html import escape
 
 from sortie.scenarios.report_text import visible
-from sortie.sim.folders import GENERATOR
 
+GENERATOR = '<meta name="generator" content="Sortie">'
+"""In the head of each page that Sortie writes."""
 STYLE = """
 :root { color-scheme: light; }
 body { font: 15px/1.55 system-ui, sans-serif; color: #1c2128; background: #f4f5f7; margin: 0; }

@@ -1,21 +1,13 @@
-"""What the files of a run may hold, checked once when a run is opened: names, types, values, and that they belong together.
-
-A run may come from anybody, and may be damaged. So its files are read by what is declared here and in `TABLES`. All
-errors are `ValueError`, in one line that names the file, the column or field, and the value.
-"""
+"""Which values the tables of a run may hold; an error is one line that names the file, the column, the row and the value."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Collection, Iterator, Mapping
-from pathlib import Path
-from typing import Annotated, Any
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sortie.fleet.energy.battery import CAUSES as ENERGY_CAUSES
 from sortie.fleet.energy.battery import RECORDED
@@ -29,142 +21,12 @@ from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.results import beliefs, disagreement, views
 from sortie.sim.results.box_rows import columns_of, fusions_of
-from sortie.sim.results.record import HANDSHAKE, VIOLATIONS_OF
+from sortie.sim.results.record import HANDSHAKE
 
-MOST_BYTES = 64 << 20
-"""Of a file that is no table."""
 MOST_CHARACTERS = 20_000
 """Of a text: a reason may name the invariants of a shield, which have 10,000 characters at most."""
-_LARGEST = 1e12
+LARGEST = 1e12
 """Of any number of a table; far beyond what flies, and small enough to compute with."""
-_TOTALS = (
-    "context_descriptor_bytes", "context_directive_bytes", "medium_busy_fraction", "policy_changes",
-    "shield_interventions", "invariant_violations", "violated_ticks", *(f"{VIOLATIONS_OF}{cause}" for cause in CAUSES),
-)  # fmt: skip
-"""Those that the outcome needs."""
-
-Text = Annotated[str, Field(max_length=MOST_CHARACTERS)]
-Count = Annotated[float, Field(ge=0, le=_LARGEST)]
-
-
-class About(BaseModel):
-    """The fields of `record.json`."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-    policy: Text
-    seed: Annotated[int, Field(ge=0, lt=2**63)]
-    replication: Annotated[int, Field(ge=0, lt=2**32)]
-    version: Text
-    detector: Text
-    totals: dict[Text, Count]
-    calibration: Text | None = None
-    own_files: dict[Text, Text] = {}
-    metrics: dict[Text, float | None] = {}
-    wall: dict[Text, Count] = {}
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """The fields of a JSON file of a run.
-
-    Raises:
-        OSError, ValueError: it cannot be read, or is no JSON object with each key once and finite numbers.
-    """
-    try:
-        found = json.loads(read_file(path), object_pairs_hook=_once, parse_constant=_refuse)
-    except RecursionError:
-        raise ValueError(f"{path.name}: its values are nested too deeply") from None
-    except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from error
-    if not isinstance(found, dict):
-        raise ValueError(f"{path.name} holds a {type(found).__name__}, must hold fields")
-    return found
-
-
-def read_file(path: Path) -> bytes:
-    """The bytes of a file of a run that is no table.
-
-    Raises:
-        OSError, ValueError: it cannot be read, is no plain file, or is far longer than any run's.
-    """
-    ensure_plain(path)
-    if (size := path.stat().st_size) > MOST_BYTES:
-        raise ValueError(f"{path.name} has {size} bytes, must have at most {MOST_BYTES}")
-    return path.read_bytes()
-
-
-def read_about(path: Path) -> dict[str, Any]:
-    """The checked fields of `record.json`.
-
-    Raises:
-        OSError, ValueError: as `read_json`; or a field is missing, unknown or has a value that no run has.
-    """
-    about = read_json(path)
-    try:
-        About.model_validate(about)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part)[:60] for part in first["loc"])
-        value = "" if first["type"] == "missing" else f"{first['input']!r:.60}, "
-        raise ValueError(f"{path.name}: {where}: {value}{first['msg'][:1].lower()}{first['msg'][1:]}") from None
-    if lacking := [name for name in _TOTALS if name not in about["totals"]]:
-        raise ValueError(f"{path.name}: totals.{lacking[0]}: is missing")
-    return about
-
-
-def ensure_together(outcome: Mapping[str, Any], record: Any) -> None:
-    """Refuse files that are not of one run: what `outcome.json` has of the record must be the record's.
-
-    The fingerprint is among it, which is computed from all values of the tables.
-
-    Raises:
-        ValueError: naming the field that differs.
-    """
-    known = {
-        "scenario": record.scenario.name,
-        "duration_s": record.scenario.duration_s,
-        "frame_s": record.scenario.frame_s,
-        **{
-            name: getattr(record, name) for name in ("policy", "seed", "replication", "version", "own_files", "metrics")
-        },
-        "fingerprint": record.fingerprint,
-    }
-    for name, value in known.items():
-        if outcome.get(name, value if name != "fingerprint" else None) != value:
-            raise ValueError(f"outcome.json: {name} is {outcome.get(name)!r:.80}, the other files give {value!r:.80}")
-
-
-def read_table(path: Path, needed: Collection[str], known: Mapping[str, pa.DataType], rows: int | None) -> pa.Table:
-    """A table of a run, with its columns.
-
-    Args:
-        path: the Parquet file.
-        needed: the columns that it must have.
-        known: all that it may have, with their types.
-        rows: how many it must have; None is any number.
-
-    Raises:
-        OSError, ValueError: it cannot be read, or has other columns, types or rows.
-    """
-    ensure_plain(path)
-    try:
-        with pq.ParquetFile(path) as file:
-            names, found = file.schema_arrow.names, file.metadata.num_rows
-            again = "another version's, perhaps: fly it again"
-            if lacking := [name for name in needed if name not in names]:
-                raise ValueError(f"{path.name} has no column {lacking[0]}; {again}")
-            if more := [name for k, name in enumerate(names) if name not in known or name in names[:k]]:
-                raise ValueError(f"{path.name} has a column {more[0]!r:.80} too many; {again}")
-            for field in file.schema_arrow:
-                if field.type != known[field.name]:
-                    raise ValueError(f"{path.name}: {field.name} is of type {field.type}, must be {known[field.name]}")
-            if rows is not None and found != rows:
-                raise ValueError(f"{path.name} has {found} rows, must have {rows}")
-            table = file.read()
-        table.validate(full=True)  # texts are UTF-8, lists end within their values
-    except pa.ArrowException as error:
-        raise ValueError(f"{path.name}: {error}") from error
-    return table
 
 
 class Checks:
@@ -234,7 +96,7 @@ class Checks:
             leaf = name.rpartition(".")[2]
             whole = pa.types.is_integer(kind)
             low, high = self._ranges.get(f"{table}.{name}") or self._ranges.get(
-                leaf, (0, 2**62) if whole else (-_LARGEST, _LARGEST)
+                leaf, (0, 2**62) if whole else (-LARGEST, LARGEST)
             )
             sound = pc.and_(pc.greater_equal(values, low), pc.less_equal(values, high))  # NaN is not
             if leaf in _MAY_BE_NAN:
@@ -343,27 +205,3 @@ def _parts(name: str, values: pa.Array) -> Iterator[tuple[str, pa.Array]]:
 def _first(values: pa.Array, wrong: pa.Array, must: str) -> tuple[int, str] | None:
     at = pc.index(wrong, True).as_py()
     return None if at < 0 else (at, f"is {values[at].as_py()!r:.60}, {must}")
-
-
-def ensure_plain(path: Path) -> None:
-    """Refuse what is no plain file of the run's folder: it may lead elsewhere, or never end.
-
-    Raises:
-        ValueError: naming the file.
-    """
-    if path.is_symlink():
-        raise ValueError(f"{path.name} is a link, must be a file of the run's folder")
-    if not path.is_file():
-        raise ValueError(f"{path.name} is {'no plain file' if path.exists() else 'missing'}")
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"{next(n for n in found if names.count(n) > 1)!r:.60} stands there twice")
-    return found
-
-
-def _refuse(constant: str) -> Any:
-    raise ValueError(f"{constant} is no number that JSON has")

@@ -6,10 +6,12 @@ A short sortie's batches stay in memory. A killed flight leaves nothing that cou
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from sortie.scenarios import scratch
@@ -20,6 +22,7 @@ FIRST_ROWS = 32
 """Of a table of which nothing is known yet."""
 _READ_BYTES = 8 << 20
 """After so much was read, what was read leaves memory."""
+_ROW_GROUP_BYTES = 4 << 20
 _ALIGNED = 64  # as in Arrow's own files
 
 Unfold = Callable[[Sequence[tuple[Any, ...]]], Sequence[Any]]
@@ -133,6 +136,21 @@ def batches(
             read_bytes = 0
             scratch.release()
     scratch.release()
+
+
+def write_parquet(tables: Mapping[str, pa.Table], name: str, path: Path) -> None:
+    """A table as Parquet, a few megabytes of it at a time."""
+    schema = schema_of(tables, name)
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        held, held_bytes = [], 0
+        for batch in batches(tables, name):
+            held.append(batch)
+            held_bytes += batch.nbytes
+            if held_bytes >= _ROW_GROUP_BYTES:
+                writer.write_table(pa.Table.from_batches(held))
+                held, held_bytes = [], 0
+        if held:
+            writer.write_table(pa.Table.from_batches(held, schema))
 
 
 def in_blocks(tables: Mapping[str, pa.Table], name: str, columns: Sequence[str], rows: int) -> Iterator[pa.Table]:

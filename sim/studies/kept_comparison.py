@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import json
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +14,7 @@ from typing import NamedTuple
 
 from sortie.policies.registry import resolve
 from sortie.sim.folders import RunError, ensure_files
-from sortie.sim.identity import codes_here, own_files, state_of
+from sortie.sim.identity import codes_here, name_of, own_files
 from sortie.sim.studies.compare import Compared, Contender, Gain
 from sortie.sim.studies.multifidelity import (
     Batch,
@@ -38,19 +39,29 @@ def identity(contenders: Sequence[Contender], pilot: int) -> str:
     The half-width is no part of it. A comparison can go on to a narrower one.
 
     Raises:
-        RunError: a callable holds something else than plain values, so that it cannot be told from another one.
+        RunError: a callable that cannot be told from another one by its name and its file.
     """
     parts = [FORMAT, *codes_here(), pilot]
     for label, scenario, function in contenders:
-        try:
-            state = None if function is None else state_of(function)
-        except ValueError as error:
+        if function is not None and not _is_known_by_name(function):
             raise RunError(
-                f"policy {label}, in a comparison that is kept: {error}; write a function with parameters into a file and "
-                "name it (mine.py:mine), or leave out kept"
-            ) from None
-        parts += [label, state, scenario.model_dump_json(), sorted(own_files(scenario, function).items())]
+                f"policy {label}, in a comparison that is kept: must be a function at the top of a file, or a "
+                "functools.partial of one with numbers and texts; name the file (mine.py:mine), or leave out kept"
+            )
+        name = None if function is None else name_of(function)
+        parts += [label, name, scenario.model_dump_json(), sorted(own_files(scenario, function).items())]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
+
+
+def _is_known_by_name(policy: Callable[..., object]) -> bool:
+    """Whether a callable's name and its file decide what it does."""
+    values: list[object] = []
+    while isinstance(policy, functools.partial):
+        values += [*policy.args, *policy.keywords.values()]
+        policy = policy.func
+    if not inspect.isfunction(policy) or not all(v is None or isinstance(v, str | int | float) for v in values):
+        return False
+    return "<" not in policy.__code__.co_qualname and Path(policy.__code__.co_filename).is_file()
 
 
 @contextmanager
@@ -62,13 +73,12 @@ def kept(path: Path, of: str) -> Iterator[tuple[Flown, sqlite3.Connection]]:
         of: the comparison's `identity`.
 
     Raises:
-        RunError: it is no such file, holds another comparison, or another process uses it.
+        RunError: it is no such file, or holds another comparison.
     """
     ensure_files(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with closing(sqlite3.connect(path, timeout=1.0, isolation_level=None)) as db:
-            db.execute("PRAGMA locking_mode = EXCLUSIVE")
+        with closing(sqlite3.connect(path, isolation_level=None)) as db:
             db.execute("PRAGMA synchronous = EXTRA")  # a committed row survives a power cut
             db.execute("BEGIN EXCLUSIVE")
             if {name for (name,) in db.execute("SELECT name FROM sqlite_master")} - {"comparison", "flown"}:
@@ -89,8 +99,7 @@ def kept(path: Path, of: str) -> Iterator[tuple[Flown, sqlite3.Connection]]:
                 raise RunError(f"{path}: a row is damaged ({error}); name another file") from error
             yield flown, db
     except sqlite3.OperationalError as error:
-        busy = "locked" in str(error)
-        raise RunError(f"{path}: {'another comparison is using this file' if busy else error}") from error
+        raise RunError(f"{path}: {error}") from error
     except sqlite3.DatabaseError as error:
         raise RunError(f"{path}: no comparison there ({error}); name another file") from error
 

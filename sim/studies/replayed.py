@@ -29,6 +29,8 @@ _COLUMNS = {
     "t_s": pa.float64(), "drone": pa.int32(), "decision": pa.int32(), "peer": pa.int32(), "fields": pa.list_(pa.string()),
     "flown": pa.string(), "replayed": pa.string(), "flown_reason": pa.string(), "replayed_reason": pa.string(),
 }  # fmt: skip
+CSV_HEAD = ",".join(f'"{name}"' for name in _COLUMNS)
+"""The first line of a table of differences."""
 
 
 class Difference(NamedTuple):

@@ -11,54 +11,33 @@ from typing import Any
 import pytest
 from sim_examples import example
 
+from sortie.scenarios.replacing import replacing
 from sortie.sim import identity
-from sortie.sim.folders import (
-    RunError,
-    ensure_between,
-    ensure_files,
-    ensure_folder,
-    put_between,
-    replacing,
-    write_text,
-)
+from sortie.sim.folders import RunError, ensure_files, ensure_folder, write_text
+from sortie.sim.readme import with_section
+from sortie.sim.results.html_page import GENERATOR
 
 # --- folders -----------------------------------------------------------------------------------------
 
 
 def test_an_empty_folder_may_be_used_and_one_with_other_things_may_not(tmp_path: Path) -> None:
-    path = tmp_path / "run"
-    ensure_folder(path, "a.json", "run")
-    path.mkdir()
-    ensure_folder(path, "a.json", "run")
-    (path / "notes.txt").touch()
-    with pytest.raises(RunError, match=r"holds files but no a.json; a run would replace them"):
-        ensure_folder(path, "a.json", "run")
+    path, written = tmp_path / "run", {"a.json", "bag/b.mcap"}
+    ensure_folder(path, "a.json", "run", written)
+    (path / "bag").mkdir(parents=True)
+    with pytest.raises(RunError, match=r"run: holds bag, which no run wrote; choose another folder or move it"):
+        ensure_folder(path, "a.json", "run", written)
     (path / "a.json").touch()
-    ensure_folder(path, "a.json", "run")
-    with pytest.raises(RunError, match=r"holds notes\.txt, which no run wrote"):
-        ensure_folder(path, "a.json", "run", {"a.json"})
-    ensure_folder(path, "a.json", "run", {"a.json", "notes.txt"})
-
-
-def test_what_nobody_wrote_is_named(tmp_path: Path) -> None:
-    for name in ("a.json", "bag/b.mcap", ".DS_Store"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    written = {"a.json", "bag/b.mcap"}
-    ensure_folder(tmp_path, "a.json", "run", written)
-    (tmp_path / "mine.txt").touch()
-    with pytest.raises(RunError, match=r"holds mine\.txt, which no run wrote"):
-        ensure_folder(tmp_path, "a.json", "run", written)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(RunError, match=r"holds empty and 1 more, which no run wrote"):
-        ensure_folder(tmp_path, "a.json", "run", written)
+    ensure_folder(path, "a.json", "run", written)
+    (path / "notes.txt").touch()
+    with pytest.raises(RunError, match=r"run: holds notes\.txt, which no run wrote; choose another folder or move it"):
+        ensure_folder(path, "a.json", "run", written)
 
 
 def test_a_place_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RunError, match="is a file, a run needs a folder"):
-        ensure_folder(tmp_path / "file", "a.json", "run")
-    with pytest.raises(RunError, match=r"cannot make its folder: .*/file is a file"):
+        ensure_folder(tmp_path / "file", "a.json", "run", ())
+    with pytest.raises(RunError, match=r"its folder cannot be made or written to: .*/file is a file"):
         ensure_files(None, tmp_path / "file" / "x" / "y.txt")
     with pytest.raises(RunError, match="is a folder, must be a file"):
         ensure_files(tmp_path / "new.txt", tmp_path)
@@ -66,18 +45,17 @@ def test_a_place_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
-def test_a_part_of_a_run_is_not_replaced_by_a_page_or_a_table_made_of_it(tmp_path: Path) -> None:
-    for name in ("outcome.json", "record.json", "scenario.yaml", "views.parquet"):
-        (tmp_path / name).write_text("the run's")
-    (tmp_path / "link").symlink_to(tmp_path / "views.parquet")
-    for name in ("outcome.json", "views.parquet", "link"):
-        for write in (ensure_files, lambda path: write_text(path, "a page")):
-            with pytest.raises(RunError, match=r"is a part of the run in .*, which would be lost; name another file"):
-                write(tmp_path / name)
-    assert (tmp_path / "views.parquet").read_text() == (tmp_path / "outcome.json").read_text() == "the run's"
-    write_text(tmp_path / "report.html", "a page")
-    (tmp_path / "record.json").unlink()  # no run: a comparison's own outcome.json, say
-    write_text(tmp_path / "outcome.json", "anew")
+def test_a_file_that_the_command_did_not_write_is_replaced_only_where_that_is_asked(tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    page.write_text(GENERATOR + "of an earlier report")
+    ensure_files(page, replace=False, mark=GENERATOR)
+    for text, mark in (("a user's notes", GENERATOR), (GENERATOR, None), (" " * 1000 + GENERATOR, GENERATOR)):
+        page.write_text(text)
+        with pytest.raises(
+            RunError, match=r"page.html: exists already; choose another file, or replace it with --repl"
+        ):
+            ensure_files(page, replace=False, mark=mark)
+        ensure_files(page, replace=True, mark=mark)
 
 
 def test_two_outputs_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -92,6 +70,7 @@ def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
     (there / "old").touch()
     link.symlink_to(there)
     with replacing(link) as partial:
+        partial.mkdir()
         (partial / "new").touch()
     assert link.is_symlink()
     assert [p.name for p in there.iterdir()] == ["new"]
@@ -102,37 +81,21 @@ def test_a_block_that_fails_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
     path.mkdir()
     (path / "old").touch()
     with suppress(KeyError), replacing(path) as partial:
+        partial.mkdir()
         (partial / "new").touch()
         raise KeyError
     assert [p.name for p in path.iterdir()] == ["old"]
     assert [p.name for p in tmp_path.iterdir()] == ["run"], "nothing is left beside it"
 
 
-@pytest.mark.parametrize("name", ["run[1]", "run*", "a?b", "a-b"])
-def test_what_stepped_aside_comes_back_whatever_the_name(name: str, tmp_path: Path) -> None:
-    """Brackets and stars in a name are no patterns. What a process that lives is writing stays."""
-    path = tmp_path / name
-    gone, alive = f".{name}.{2**22 + 1}-01234567", f".{name}.{os.getpid()}-01234567"
-    for left in (f"{gone}.old", f"{gone}.partial", f"{alive}.partial"):
-        (tmp_path / left).mkdir()
-    (tmp_path / f"{gone}.old" / "kept").touch()
-    with suppress(KeyError), replacing(path):
-        assert sorted(p.name for p in tmp_path.iterdir() if "01234567" in p.name) == [f"{alive}.partial"]
-        raise KeyError
-    assert [p.name for p in path.iterdir()] == ["kept"]
-
-
 def test_a_section_is_put_between_its_markers_alone(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("above\n<b>\nold\n<e>\nbelow\n")
-    ensure_between(None, "<b>", "<e>")
-    ensure_between(page, "<b>", "<e>")
-    assert page.read_text() == "above\n<b>\nold\n<e>\nbelow\n"
-    put_between(page, "<b>\nnew\n<e>", "<b>", "<e>")
-    assert page.read_text() == "above\n<b>\nnew\n<e>\nbelow\n"
+    put = with_section(page, "<b>\nnew\n<e>", "<b>", "<e>")
+    assert put == "above\n<b>\nnew\n<e>\nbelow\n"
     for wrong in (tmp_path / "none.md", page):
         with pytest.raises(RunError, match=f"{wrong.name}: "):
-            ensure_between(wrong, "<x>", "<e>")
+            with_section(wrong, "", "<x>", "<e>")
     write_text(tmp_path / "deep" / "page.md", "text")
     assert (tmp_path / "deep" / "page.md").read_text() == "text"
 

@@ -151,16 +151,6 @@ def test_a_callables_file_counts_and_one_without_a_file_by_its_source() -> None:
     assert identity.own_files(scenario, resolve("worked")) == {}
 
 
-@pytest.mark.parametrize("line", ["a list that is (not closed", "it's a page", "    'a text\n  and less"])
-def test_a_function_that_names_another_file_as_its_own_has_no_source(tmp_path: Path, line: str) -> None:
-    """As in a notebook or a page's example: Python then looks for the source in a file that has none."""
-    page = tmp_path / "page.md"
-    page.write_text(f"{line}\n" * 3)
-    space: dict[str, Any] = {"__name__": "readme"}
-    exec(compile("def decide(view):\n    return []\n", str(page), "exec"), space)  # noqa: S102
-    assert list(identity.own_files(example("duration_s=1", "perception.detector=none"), space["decide"]))
-
-
 def test_a_release_that_changes_no_value_leaves_the_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = example("duration_s=1", "perception.detector=none")
     before = run_sortie(scenario)

@@ -201,7 +201,7 @@ def test_without_matplotlib_there_are_tables_alone(
 
 def test_a_folder_that_is_no_report_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(RunError, match=r"holds files but no paper\.parquet"):
+    with pytest.raises(RunError, match=r"holds thesis\.tex, which no report wrote"):
         paper.ensure_writable(tmp_path)
     with pytest.raises(RunError, match=r"thesis\.tex: is a file, a report needs a folder"):
         paper.ensure_writable(tmp_path / "thesis.tex")

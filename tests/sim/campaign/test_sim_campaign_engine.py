@@ -383,7 +383,7 @@ def test_a_drawn_value_that_the_schema_refuses_is_a_failed_run(tmp_path: Path) -
         ),
         (["--scheduler", "tcp://127.0.0.1:1"], "--scheduler tcp://127.0.0.1:1: no scheduler answers there"),
         (["--workers", "0", "--resume"], "no campaign there to resume (campaign.sqlite is missing)"),
-        (["--workers", "0", "--out", __file__ + "/a"], "/a: cannot make its folder: "),
+        (["--workers", "0", "--out", __file__ + "/a"], "/a: its folder cannot be made or written to: "),
         (["--workers", "0", "--out", "/proc/nothing/here"], "/proc/nothing/here: "),
     ],
 )

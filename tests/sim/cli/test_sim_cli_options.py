@@ -104,7 +104,7 @@ def scenario(tmp_path: Path) -> Path:
         (("compare", "example.yaml", "--policies", "silence", "--out", "."), ".: is a folder, must be a file"),
         (
             ("compare", "example.yaml", "--policies", "silence", "--recording", "example.yaml/c.rrd"),
-            "example.yaml/c.rrd: cannot make its folder",
+            "example.yaml/c.rrd: its folder cannot be made",
         ),
         (("compare", "example.yaml", "--policies", "silence", "--readme", "c.md"), "c.md: No such file or directory"),
         (("compare", "example.yaml", "--policies", "silence", "--readme", "example.yaml"), "must hold <!-- compare"),

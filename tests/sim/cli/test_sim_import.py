@@ -106,7 +106,7 @@ def test_what_cannot_be_imported_is_one_line_and_writes_nothing(tmp_path: Path) 
             CliRunner().invoke(app, ["import", *arguments, "--out", str(tmp_path / "out")], catch_exceptions=False)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/notes.txt").write_text("keep")
-    with pytest.raises(RunError, match=r"holds files but no scenario\.yaml"):
+    with pytest.raises(RunError, match=r"mine: holds notes\.txt, which no flight wrote"):
         CliRunner().invoke(app, ["import", str(log), "--out", str(tmp_path / "mine")], catch_exceptions=False)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", "short.bin"]
 

@@ -18,6 +18,7 @@ from sortie.sim.results import run_folder
 from sortie.sim.results.accuracy import both_matched
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.run_files import SCENARIO
 from sortie.sim.results.sentences import turns_in_words
 from sortie.sim.results.summary import outcome_table
 from sortie.sim.studies.compare import Contender, compare
@@ -164,7 +165,7 @@ def test_a_run_of_a_version_without_turns_keeps_what_it_found(tmp_path: Path) ->
     sets = ("fleet.drones=51", "duration_s=0.6", "perception.detector=surrogate", "fleet.formation={shape: grid, spacing_m: 40}")  # fmt: skip
     record = run_sortie(example(*sets, "perception.egos=51", "mission.phases=[{at_s: 0, phase: search}]"))
     run_folder.save(record, tmp_path / "run")
-    file = tmp_path / "run" / run_folder.SCENARIO
+    file = tmp_path / "run" / SCENARIO
     file.write_text(file.read_text().replace("  egos: 51\n", ""))
     again = run_folder.load(tmp_path / "run")
     assert again.scenario == record.scenario

@@ -389,18 +389,6 @@ def test_a_bag_begins_at_a_fraction_of_a_second_too(record: SortieRecord, tmp_pa
     assert first.log_time == 1_795_248_000_250_000_000
 
 
-def test_a_bag_may_be_the_folder_one_stands_in(
-    record: SortieRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run_folder.save(record, tmp_path / "run")
-    here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
-    said = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--mcap", "--out", "."])
-    assert said.exit_code == 0, said.exception
-    assert sorted(p.name for p in here.iterdir()) == ["foxglove_layout.json", "here.mcap", "metadata.yaml"]
-
-
 def test_a_bag_replaces_no_file_that_it_did_not_write(record: SortieRecord, tmp_path: Path) -> None:
     run_folder.save(record, tmp_path / "run")
     mine = tmp_path / "mine"  # a bag of somebody else's, with a note
@@ -408,9 +396,7 @@ def test_a_bag_replaces_no_file_that_it_did_not_write(record: SortieRecord, tmp_
     for name in ("metadata.yaml", "mine_0.mcap", "notes.txt"):
         (mine / name).write_text(name)
     said = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--mcap", "--out", str(mine)])
-    assert str(said.exception) == (
-        f"{mine}: holds mine_0.mcap and 1 more, which no bag wrote; choose another folder or move it"
-    )
+    assert str(said.exception) == f"{mine}: holds metadata.yaml, which no bag wrote; choose another folder or move it"
     assert {p.name: p.read_text() for p in mine.iterdir()} == {
         name: name for name in ("metadata.yaml", "mine_0.mcap", "notes.txt")
     }
@@ -423,7 +409,7 @@ def test_a_bag_replaces_no_file_that_it_did_not_write(record: SortieRecord, tmp_
         (["--mcap", "--begin", "1960-01-01"], r"begin is '1960-01-01', must lie from 1970 to before 2038"),
         (["--mcap", "--begin", "2050-01-01"], r"begin is '2050-01-01', must lie from 1970 to before 2038"),
         (["--tlog", "--begin", "1960-01-01"], r"begin is '1960-01-01', must lie from 1970 to before 2096"),
-        (["--mcap", "--out", "."], r"holds files but no metadata\.yaml"),
+        (["--mcap", "--out", "."], r": is the working folder or holds it, a bag would replace it"),
     ],
 )
 def test_what_a_user_gets_wrong_is_named(

@@ -19,7 +19,9 @@ from sim_examples import example
 
 from sortie.fleet.staleness import LinkHealth
 from sortie.policies.contract import Directive, Disc, FleetView, Representation, Roster
+from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.folders import RunError
 from sortie.sim.results import rosters
 from sortie.sim.results.accuracy import score
 from sortie.sim.results.box_rows import fusion_blocks, fusions_of
@@ -31,7 +33,7 @@ from sortie.sim.results.mission_outcome import _flown, _lately
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 from sortie.sim.results.regions import Regions
-from sortie.sim.results.run_folder import OtherRunError, ensure_same, in_place_of, load, save
+from sortie.sim.results.run_folder import OtherRunError, ensure_usable, load, save
 from sortie.sim.results.sightings import sightings
 from sortie.sim.results.spool import InTime, in_blocks
 from sortie.sim.results.views import Decision, Journal, decisions
@@ -267,41 +269,41 @@ def flown() -> SortieRecord:
     return run_sortie(example("duration_s=0.5", "mission.phases=[{at_s: 0, phase: search}]", "fleet.drones=2"))
 
 
-def _ensure(path: Path, flown: SortieRecord, **changes: Any) -> None:
-    given = {"scenario": flown.scenario, "seed": flown.seed, "replication": 0}
-    ensure_same(path, **(given | changes))
-
-
-def test_a_folder_takes_the_same_sortie_again_and_names_what_differs(tmp_path: Path, flown: SortieRecord) -> None:
+def test_a_folder_takes_the_same_sortie_again_and_no_other(tmp_path: Path, flown: SortieRecord) -> None:
     path = tmp_path / "run"
-    _ensure(path, flown)  # nothing there
+
+    def ensure(scenario: Scenario = flown.scenario, seed: int = flown.seed, replication: int = 0) -> None:
+        ensure_usable(path, scenario, seed, replication, replace=False)
+
+    ensure()  # nothing there
     save(flown, path)
-    _ensure(path, flown)
-    other = flown.scenario.model_copy(
-        update={"policy": flown.scenario.policy.model_copy(update={"params": {"rho": 0.5}})}
-    )
-    for changes, told in (
-        ({"seed": 9}, "seed is 1 there and 9 here"),
-        ({"replication": 2}, "replication is 0 there and 2 here"),
-        ({"scenario": other}, "policy.params.rho is 0.25 there and 0.5 here"),
-    ):
-        with pytest.raises(OtherRunError, match=re.escape(f"holds another run: {told}; ")):
-            _ensure(path, flown, **changes)
+    ensure()
+    params = flown.scenario.policy.model_copy(update={"params": {"rho": 0.5}})
+    others: list[dict[str, Any]] = [
+        {"seed": 9}, {"replication": 2}, {"scenario": flown.scenario.model_copy(update={"policy": params})}
+    ]  # fmt: skip
+    for other in others:
+        with pytest.raises(
+            OtherRunError, match=re.escape(f"{path}: holds another run; choose another folder, or repl")
+        ):
+            ensure(**other)
+    ensure_usable(path, flown.scenario, 9, 0, replace=True)
 
 
-def test_a_run_in_place_of_another_is_told_and_its_own_is_none(tmp_path: Path, flown: SortieRecord) -> None:
-    path = tmp_path / "run"
-    assert in_place_of(path, "x") == ""
-    save(flown, path)
-    assert in_place_of(path, flown.fingerprint) is None
-    assert in_place_of(path, "x") == f"a run of example under {flown.policy}, seed 1"
+def test_a_damaged_run_is_replaced_only_where_that_is_asked(tmp_path: Path, flown: SortieRecord) -> None:
+    path = save(flown, tmp_path / "run")
     (path / "outcome.json").write_text("{}")
-    assert in_place_of(path, flown.fingerprint) == "a run that cannot be read"
+    with pytest.raises(RunError, match=r"run: the run is damaged: outcome.json: fingerprint is None"):
+        ensure_usable(path, flown.scenario, flown.seed, 0, replace=False)
+    with pytest.raises(OtherRunError):
+        save(flown, path)
+    save(flown, path, replace=True)
+    assert load(path).fingerprint == flown.fingerprint
 
 
 def test_a_run_comes_back_whole(tmp_path: Path, flown: SortieRecord, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also in many row groups, and with all that is told beside the tables."""
-    monkeypatch.setattr("sortie.sim.results.run_folder._ROW_GROUP_BYTES", 100)
+    monkeypatch.setattr("sortie.sim.results.spool._ROW_GROUP_BYTES", 100)
     states = flown.tables["states"]
     cut = {**flown.tables, "states": pa.concat_tables([states.slice(k, 2) for k in range(0, states.num_rows, 2)])}
     told = replace(flown, tables=cut, calibration="fit 7", metrics={"m": None, "n": 2.0}, own_files={"a": "b"})
