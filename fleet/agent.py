@@ -7,7 +7,7 @@ It holds no other drone and no world. Each drone is one SimPy process that wakes
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -23,9 +23,8 @@ from sortie.fleet.messages.auth import Sealer
 from sortie.fleet.messages.compact import FULL, encode_compact
 from sortie.fleet.messages.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from sortie.fleet.peers import loops
-from sortie.fleet.plane import PlaneRules
+from sortie.fleet.plane import FleetRules
 from sortie.fleet.senses import Sensed
-from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age, health
 from sortie.fleet.standings import Standing
 from sortie.fleet.trust import JUDGED_EVERY_S
 from sortie.perception.budget import loops as cell_loops
@@ -45,13 +44,10 @@ from sortie.policies.contract import (
     TaskPhase,
     nothing,
 )
-from sortie.policies.damping import DampedLink, apply_hysteresis, damp
+from sortie.policies.damping import apply_hysteresis
+from sortie.policies.decision_loop import Change, DecisionLoop, Guard, OutgoingLink
 from sortie.policies.geometry import rank_loop
-from sortie.policies.verification.enforced import Steps
-from sortie.policies.verification.shield import Ceilings
-
-_FRESH = LinkHealth.FRESH
-_NOTHING = nothing(0, 1, "")[2:8]
+from sortie.policies.staleness import LinkHealth
 
 
 class Platform(NamedTuple):
@@ -107,21 +103,6 @@ class AgentLog(Protocol):
     def alert(self, t_s: float, drone: int, known: bool) -> None: ...
 
 
-Guard = Callable[[FleetView, Sequence[Steps], Ceilings], Sequence[Directive]]
-"""Judges what staleness and damping left of every link's directive, and returns what the gates are to enforce."""
-
-
-class _OutgoingLink:
-    """An outgoing link: its state of damping, what its gate enforces, and what was last asked while its peer was fresh."""
-
-    __slots__ = ("asked", "enforced", "state")
-
-    def __init__(self, me: int, peer: int) -> None:
-        self.state = DampedLink(nothing(me, peer, ""))
-        self.enforced = self.state.enforced  # before the wire rounds it
-        self.asked: Directive | None = None
-
-
 class Agent:
     """A drone from take-off until it lands, is lost, or the sortie ends."""
 
@@ -130,7 +111,7 @@ class Agent:
         env: simpy.Environment,
         memory: PeerMemory,
         *,
-        rules: PlaneRules,
+        rules: FleetRules,
         policy: Policy,
         senses: Senses,
         modem: Modem,
@@ -179,11 +160,11 @@ class Agent:
         self._sealer = sealer
         self._phase_s = phase_s
         self._handshake_bytes = handshake_bytes
-        self._guard, self._reads, self._check, self._found_last = guard, reads, check, found_last
+        self._loop = DecisionLoop(self.drone, rules, guard)
+        self._reads, self._check, self._found_last = reads, check, found_last
         self._period_s = rules.descriptor_period_s
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
-        self._links: dict[int, _OutgoingLink] = {}
         self._answer: Sequence[Directive] = ()  # what the policy answered last; it was checked
         self._asked_of: dict[int, Directive] = {}  # the same by peer
         self._ids: NDArray[np.int64] | None = None  # `memory.ids` as it was then; None: check all anew
@@ -221,14 +202,7 @@ class Agent:
 
     def _come_back(self) -> None:
         """Begin every link with nothing: the drone asked for nothing while it was away."""
-        for peer, link in self._links.items():
-            if link.state.enforced[2:8] != _NOTHING:
-                rest = nothing(self.drone, peer, "came back")
-                if self._guard is None:
-                    self._put_in_force(link, rest, rest, LinkHealth.DETACHED)
-            else:
-                rest = link.state.enforced
-            link.state, link.asked = DampedLink(rest), None
+        self._put_in_force(self._loop.come_back())
         self._ids = None  # what the policy answered then is no answer of now
 
     def _tick(self, frame: int) -> None:
@@ -362,8 +336,7 @@ class Agent:
             )
 
     def _decide(self) -> None:
-        now_s, me, links, fresh_s = self._env.now, self.drone, self._links, self._fresh_s
-        memory = self.memory
+        now_s, me, memory = self._env.now, self.drone, self.memory
         ages = memory.ages(now_s)
         heard = view = memory.view(now_s, ages)
         if self._reads is not None:
@@ -376,12 +349,12 @@ class Agent:
         elapsed_ns = time.perf_counter_ns() - begin_ns
         is_heard = view is heard
         known, changed = self._ids, None
+        peers: list[int] | None = None  # all
         if is_heard and known is not None:
             changed = differing(self._answer, directives, view, self._asked_of)
         if changed is None:
             self._check(directives, view)
             self._asked_of = {d.destination: d for d in directives}
-            peers = [peer for peer in view.age_s if peer != me]
         else:
             due = {*self._overdue(ages, now_s), *[d.destination for d in changed]}
             if known is not None and known is not memory.ids:
@@ -390,18 +363,12 @@ class Agent:
             self._asked_of.update([(d.destination, d) for d in changed])
         self._ids = memory.ids if is_heard else None
         self._answer = tuple(directives)
-        asked_of = self._asked_of
-        for peer in peers:
-            link = links.get(peer)
-            if link is None:
-                link = links[peer] = _OutgoingLink(me, peer)
-                self._gate.enforce(link.state.enforced)  # until more is asked of it, it asks for perception in full
-            asked, age_s = asked_of.get(peer) or nothing(me, peer, "the policy gave no directive"), view.age_s[peer]
-            is_new = asked is not link.asked and asked != link.asked
-            if is_new or age_s > fresh_s or link.state.proposals:
-                self._enforce(link, asked, age_s, now_s)
-        if self._guard is not None:
-            self._keep_invariants(self._guard, view, asked_of)
+        begun = len(self._loop.links)
+        decided = self._loop.decide(view, self._asked_of, now_s, peers)
+        for peer in list(self._loop.links)[begun:] if len(self._loop.links) > begun else ():
+            self._gate.enforce(nothing(me, peer, ""))  # until more is asked of it, it asks for perception in full
+        self._note_links(decided.stepped, view, now_s)
+        self._put_in_force(decided.changes)
         self.status.work.decisions += 1
         if is_heard:
             others: Ages = ages.take(memory.others)
@@ -419,57 +386,25 @@ class Agent:
         )  # fmt: skip
         return found[:count].tolist() if count else []
 
-    def _enforce(self, link: _OutgoingLink, asked: Directive, age_s: float, now_s: float) -> None:
-        """Staleness, then damping, then the wire, then the gate; nothing where nothing changed."""
-        before = link.state
-        fidelity, link.asked, capped = _FRESH, asked, asked
-        is_aged = age_s > self._fresh_s
-        if is_aged:
-            fidelity, link.asked = self._health(age_s), None
-        self._blame_clock(asked.destination, fidelity, age_s, now_s)
-        is_at_rest = not before.proposals and asked[2:8] == _NOTHING and asked == before.enforced
-        self._at_rest[asked.destination] = is_at_rest
-        if is_at_rest:
-            self._busy[asked.destination] = False
-            return  # nothing is left for age to reduce
-        if is_aged:
-            capped = cap_by_age(asked, fidelity, age_s)
-        link.state = after = damp(before, capped, now_s, self._rules.dwell_s)
-        self._busy[asked.destination] = is_aged or bool(after.proposals)
-        if self._guard is None and after.enforced is not before.enforced:
-            self._put_in_force(link, asked, after.enforced, fidelity)
+    def _note_links(self, stepped: Iterable[OutgoingLink], view: FleetView, now_s: float) -> None:
+        """Keep in the table which links may change by themselves."""
+        for link in stepped:
+            self._blame_clock(link.peer, link.health, view.age_s[link.peer], now_s)
+            self._at_rest[link.peer], self._busy[link.peer] = link.is_at_rest, link.is_busy
 
-    def _put_in_force(self, link: _OutgoingLink, asked: Directive, directive: Directive, fidelity: LinkHealth) -> None:
-        """Hand a link's gate its directive as the wire rounds it; nothing if it is in force already."""
-        before, link.enforced = link.enforced, directive
-        if directive != before:
+    def _put_in_force(self, changes: Iterable[Change]) -> None:
+        """Hand the links' gates their new directives, as the wire rounds them."""
+        for asked, directive, fidelity in changes:
             enforced = decode_directive(encode_directive(directive))
             self._gate.enforce(enforced)
             self._log.directive(self._env.now, asked, enforced, fidelity, directive.reason)
 
-    def _keep_invariants(self, guard: Guard, view: FleetView, asked_of: dict[int, Directive]) -> None:
-        """What the guard leaves of all links' directives goes to the gates, also where the policy asked nothing new."""
-        me = self.drone
-        fidelity = {peer: self._health(age_s) for peer, age_s in view.age_s.items() if peer != me}
-
-        asked = [asked_of.get(peer) or nothing(me, peer, "the policy gave no directive") for peer in fidelity]
-        steps = [
-            Steps(d, cap_by_age(d, fidelity[peer], view.age_s[peer]), self._links[peer].state.enforced)
-            for peer, d in zip(fidelity, asked, strict=True)
-        ]
-        ceilings = {peer: CEILING[link] for peer, link in fidelity.items()}
-        for step, directive in zip(steps, guard(view, steps, ceilings), strict=True):
-            peer = directive.destination
-            self._put_in_force(self._links[peer], step.asked, directive, fidelity[peer])
-
-    def _health(self, age_s: float) -> LinkHealth:
-        rules = self._rules
-        return health(age_s, self._period_s, rules.degraded_after_periods, rules.detached_after_periods)
-
     def _blame_clock(self, peer: int, fidelity: LinkHealth, age_s: float, now_s: float) -> None:
         """Report a link that begins to be reduced because a descriptor was too old by its stamp when it came."""
         heard_ago_s, before = self.memory.heard_ago_s(peer, now_s), self._blamed[peer]
-        self._blamed[peer] = is_blamed = fidelity != _FRESH and age_s - heard_ago_s > self.memory.clocks.delay_s
+        self._blamed[peer] = is_blamed = (
+            fidelity != LinkHealth.FRESH and age_s - heard_ago_s > self.memory.clocks.delay_s
+        )
         if is_blamed and not before:
             text = (
                 f"link to {peer} {fidelity.name.lower()}: its descriptor came {heard_ago_s:.2f} s ago and is {age_s:.2f} s "

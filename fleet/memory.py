@@ -17,7 +17,7 @@ from sortie.fleet.gate import Payload
 from sortie.fleet.messages.auth import Dropped, DropReason, Opened
 from sortie.fleet.messages.extensions import WIDE_FROM
 from sortie.fleet.peers import PeerTable, loops
-from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.plane import DroneStatus, FleetRules
 from sortie.fleet.probes import Probes, window_of
 from sortie.fleet.standings import STRIKES_TO_DOUBT, UNJUDGED, Standing, Standings
 from sortie.fleet.trust import (
@@ -56,7 +56,7 @@ class Received(NamedTuple):
 class PeerMemory:
     """The descriptors and payloads that one drone received, and its trust in each peer."""
 
-    def __init__(self, drone: int, rules: PlaneRules, status: DroneStatus, table: PeerTable | None = None) -> None:
+    def __init__(self, drone: int, rules: FleetRules, status: DroneStatus, table: PeerTable | None = None) -> None:
         """Args: `table` holds the times of all receivers that hear the same datagrams; None makes one for this drone alone."""
         self.drone, self.status = drone, status
         self.held: dict[int, Received] = {}

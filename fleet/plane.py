@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 from sortie.fleet.computer import Work
 from sortie.fleet.coverage import cameras_of
@@ -14,6 +14,7 @@ from sortie.perception.budget import CODE_BYTES
 from sortie.perception.files import codebook_digest
 from sortie.perception.geometry import USUAL, Cameras
 from sortie.policies.contract import Descriptor
+from sortie.policies.plane_rules import PlaneRules
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.shipped import located
@@ -49,51 +50,45 @@ def codebooks(scenario: Scenario) -> tuple[str, ...]:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class PlaneRules:
-    """The plane's periods, the same for every drone, and what drones are known to carry."""
+@dataclass(frozen=True)
+class FleetRules(PlaneRules):
+    """The plane's rules, and what drones send and are known to carry."""
 
-    period_s: float
-    frames: int
-    degraded_after_periods: float
-    detached_after_periods: float
-    dwell_s: float
-    hysteresis: float
     compute_delay_s: float
     tile_limit_bytes: int | None = None
     """Features are sent as tiles of at most this size. None sends them as one sample."""
-    trust: bool = False
-    """Whether drones check the claims of their peers (`sortie.fleet.trust`)."""
     people: bool = False
     """Whether drones have thermal cameras, so that what they know of people is logged."""
     classes: bool = False
     """Whether there are targets of several classes, so that each detection names its class."""
-    publish_every: int = 1
-    """Frames from one descriptor to the next. Staleness counts in periods of that length."""
     form: Form = FULL
     """The resolution of descriptors on the wire."""
     maps_bring_looks: bool = False
     """Whether the boxes of a drone's own look go with its maps, by which receivers correct poses."""
     code_bytes: int = CODE_BYTES
     """Of a cell that is sent as a code."""
-    roster: bool = False
-    """Whether drones publish which members of the fleet they know (`sortie.policies.contract.Roster`)."""
     makes: Mapping[int, Equipment] = field(default_factory=dict)
     """The equipment of drones; others have `compute_delay_s` and the usual cameras."""
+
+    @classmethod
+    def of(cls, scenario: Scenario, **fields: Any) -> Self:
+        """The rules of a scenario; `fields` replaces some of them."""
+        perception, radio = scenario.perception, scenario.radio
+        of_scenario = {
+            "compute_delay_s": perception.compute_delay_s,
+            "tile_limit_bytes": radio.fragment_bytes if radio.framing == "tiles" else None,
+            "people": perception.thermal is not None,
+            "classes": len(perception.classes) > 1,
+            "form": Form(**scenario.context.form.model_dump()),
+            "maps_bring_looks": perception.match_poses,
+            "code_bytes": perception.code_bytes,
+            "makes": equipment_of(scenario),
+        }
+        return super().of(scenario, **of_scenario | fields)
 
     def equipment(self, drone: int) -> Equipment:
         """What a drone carries."""
         return self.makes.get(drone) or Equipment(self.compute_delay_s)
-
-    @property
-    def descriptor_period_s(self) -> float:
-        """Time from one descriptor of a drone to its next."""
-        return self.period_s * self.publish_every
-
-    @property
-    def fresh_s(self) -> float:
-        """A descriptor up to this age is fresh."""
-        return self.descriptor_period_s * self.degraded_after_periods
 
 
 @dataclass(slots=True)

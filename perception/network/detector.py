@@ -323,7 +323,7 @@ class TorchDetector:
     ) -> tuple[Pose, list[Pose], list[SourceBoxes]]:
         """The poses of an ego and of the maps that came, and the boxes that came, where all fit together.
 
-        With a map came the boxes of the same look (`PlaneRules.maps_bring_looks`); of pictures the receiver finds them.
+        With a map came the boxes of the same look (`FleetRules.maps_bring_looks`); of pictures the receiver finds them.
         """
 
         def look(capture: Capture) -> Boxes:

@@ -23,23 +23,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.policies.decision_loop import Steps
+from sortie.policies.staleness import CEILING, Ceilings
 from sortie.policies.verification.invariants.language import Invariant, describe_directives, violations
 from sortie.policies.verification.invariants.past import Past
-from sortie.policies.verification.shield import Ceilings, enforce
+from sortie.policies.verification.shield import enforce
 
 POLICY, STALENESS, DAMPING, NO_PEER = "policy", "staleness", "damping", "no peer"
 CAUSES = (POLICY, STALENESS, DAMPING, NO_PEER)
-
-
-class Steps(NamedTuple):
-    """One link's directive on its way to the gate."""
-
-    asked: Directive
-    """From the policy."""
-    by_age: Directive
-    """After the staleness rules."""
-    damped: Directive
-    """After damping: what the gate enforces unless a shield steps in."""
 
 
 class Violation(NamedTuple):
@@ -51,6 +42,50 @@ class Violation(NamedTuple):
     cause: str
     what: str
     """The directives that break it, in words."""
+
+
+class Keeper:
+    """The guard of one drone's decision loop: judges its invariants, and with a shield keeps them.
+
+    Args:
+        rules: the invariants.
+        dwell_s: the flight's dwell time, which lines about time may name.
+        shielded: whether directives that break an invariant are replaced.
+    """
+
+    def __init__(self, rules: Sequence[Invariant], dwell_s: float, shielded: bool) -> None:
+        self.rules, self.shielded = tuple(rules), shielded
+        self.needs_fresh = any(rule.needs_fresh for rule in rules)
+        self.past = Past(self.rules, dwell_s)
+        self.replaced: dict[int, Directive] = {}
+        """What the shield put in force at the latest decision in place of what damping left, by peer."""
+        self.broken: list[Violation] = []
+        """What the gates break since the latest decision."""
+        self._fresh: Sequence[Directive] = ()
+
+    def correct(
+        self, view: FleetView, decided: Sequence[Directive], fresh: Sequence[Directive] = ()
+    ) -> Sequence[Directive]:
+        """A policy's answer; with a shield, its directives that break an invariant are replaced.
+
+        Args:
+            view: the policy's input.
+            decided: its answer, checked against the contract.
+            fresh: its answer at age 0, if `needs_fresh`.
+        """
+        self._fresh = fresh
+        return enforce(self.rules, view, decided, fresh) if self.shielded else decided
+
+    def __call__(self, view: FleetView, now_s: float, links: Sequence[Steps]) -> list[Directive]:
+        """What the gates enforce, of what staleness and damping left. The shield gives no link more than its age allows."""
+        enforced = damped = [link.damped for link in links]
+        if self.shielded:
+            ceilings = {link.damped.destination: CEILING[link.health] for link in links}
+            enforced = put_right(self.rules, view, damped, self._fresh, ceilings)
+        self.replaced = {d.destination: d for before, d in zip(damped, enforced, strict=True) if d is not before}
+        self.past.note(now_s, [effective(d) for d in enforced])
+        self.broken = judge(self.rules, view, links, enforced, self._fresh, self.past)
+        return enforced
 
 
 def effective(directive: Directive) -> Directive:

@@ -717,7 +717,7 @@ def _live() -> Tables:
 
 
 def _healths() -> Sequence[Any]:
-    from sortie.fleet.staleness import LinkHealth
+    from sortie.policies.staleness import LinkHealth
 
     return list(LinkHealth)
 

@@ -50,7 +50,7 @@ ROOMS = {
         ("tests/radio",),
     ),
     "fleet": Room(
-        ("fleet/energy/battery.py", "fleet/energy/cell.py", "fleet/staleness.py", "fleet/trust.py", "fleet/standings.py", "fleet/memory.py"),
+        ("fleet/energy/battery.py", "fleet/energy/cell.py", "policies/staleness.py", "fleet/trust.py", "fleet/standings.py", "fleet/memory.py"),
         ("tests/fleet/energy", "tests/fleet/flight", *(f"tests/fleet/test_fleet_{t}.py" for t in (
             "clock", "computer", "joints", "plane", "probes", "trust"
         ))),

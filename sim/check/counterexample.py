@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,28 +50,39 @@ def replay_scenario(
     views = [view] if raised_age_s is None else [view, view._replace(age_s=dict(raised_age_s))]
     me = view.me
     phase = "search" if me is None else PHASE_NAMES[TaskPhase(me.task_phase)]
+    return showing(
+        rule,
+        complaint,
+        views,
+        {
+            "name": policy,
+            "params": dict(params),
+            "dwell_s": 0,
+            "invariants": invariant,
+            "replays": [
+                {"at_s": period_s * (SHOWN_AT_PERIODS + k), "drone": ego, "view": to_json(v)}
+                for k, v in enumerate(views)
+            ],
+        },
+        duration_s=period_s * (SHOWN_AT_PERIODS + 5),
+        mission={"phases": [{"phase": phase if phase in ("transit", "search", "track", "return") else "search"}]},
+        context={"rate_hz": 1 / period_s},
+    )
+
+
+def showing(
+    rule: str, complaint: str, views: Sequence[FleetView], policy: Mapping[str, Any], **sections: Any
+) -> Scenario:
+    """A sortie in which a policy section shows views to a drone; it must break no invariant."""
     return Scenario.model_validate(
         {
             "name": slug(rule),
             "description": f"{rule}: {complaint}"[:2000],
-            "duration_s": period_s * (SHOWN_AT_PERIODS + 5),
-            "fleet": {"drones": max([ego, *view.descriptors]) + 1, "formation": {"shape": "grid"}},
-            "mission": {
-                "phases": [{"phase": phase if phase in ("transit", "search", "track", "return") else "search"}]
-            },
-            "context": {"rate_hz": 1 / period_s},
+            "fleet": {"drones": max(max(v.ego, *v.descriptors) for v in views) + 1, "formation": {"shape": "grid"}},
             "perception": {"detector": "none"},
-            "policy": {
-                "name": policy,
-                "params": dict(params),
-                "dwell_s": 0,
-                "invariants": invariant,
-                "replays": [
-                    {"at_s": period_s * (SHOWN_AT_PERIODS + k), "drone": ego, "view": to_json(v)}
-                    for k, v in enumerate(views)
-                ],
-            },
+            "policy": policy,
             "expect": [{"metric": "policies.invariant_violations", "equals": 0, "because": rule}],
+            **sections,
         }
     )
 

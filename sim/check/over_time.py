@@ -1,53 +1,40 @@
 """Lines about time: looked for by simulation, proved where the states are few, and shown by a flight where they fail.
 
 A line such as `when human_in_region: within 0.5 s: any_link(representation >= detections)` is about a policy, the staleness
-rules and damping together. The search drives them over drawn courses of views (`closed_loop`), keeps the courses that come
-nearest to breaking the line, and changes those. A course that breaks it becomes a scenario in which a drone is shown these
-views; it counts only if its flight breaks the line as well. With a scenario, that scenario is flown too, with other seeds
-and with links that drop.
+rules and damping together. The search drives them over drawn courses of views (`ClosedLoop`). A course that breaks the line
+is made smaller and becomes a scenario in which a drone is shown these views; it counts only if its flight breaks the line
+as well. With a scenario, that scenario is flown too, with other seeds and with links that drop.
 """
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice, takewhile
 from typing import Any, NamedTuple
 
-from sortie.policies.contract import FleetView, Policy, PolicyError
-from sortie.policies.verification.budget import Budget
-from sortie.policies.verification.invariants.language import Invariant, Recent
-from sortie.policies.verification.invariants.words import DWELL
-from sortie.policies.verification.kit.courses import (
-    Course,
-    Values,
-    changed_course,
-    draw_course,
-    shrink_course,
-)
+from sortie.policies.checks import check_directives
+from sortie.policies.contract import Directive, FleetView, Policy, PolicyError
+from sortie.policies.decision_loop import DecisionLoop
+from sortie.policies.plane_rules import PlaneRules
+from sortie.policies.verification.enforced import Keeper, Violation
+from sortie.policies.verification.invariants.language import Invariant, Recent, just_heard
+from sortie.policies.verification.invariants.words import seconds
+from sortie.policies.verification.kit.courses import Course, draw_course, shrink_course, values_at
 from sortie.policies.verification.kit.views import to_json
 from sortie.policies.verification.proof.proof import Outcome
-from sortie.policies.verification.proof.search import Stopped
 from sortie.policies.verification.subject import constants_of
+from sortie.scenarios.plugins.reference import describe_error
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
-from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes, first_break
-from sortie.sim.check.counterexample import shows_in_flight, slug
+from sortie.sim.check.counterexample import showing, shows_in_flight
 from sortie.sim.check.few_states import NotFinite, prove_over_time
 from sortie.sim.engine.sortie import run_sortie
 
-BUDGET_S = 60.0
-"""Processor time for the proofs of all lines about time if nothing else is asked for, and again for courses and flights."""
 COURSES = 400
 """How many courses are tried for each line."""
-_FROM_BEST = 0.6
-"""Share of courses that change one of the best."""
-_BEST = 8
 _LONGEST = 600
 """Decisions of the longest course: as many views as a scenario may show."""
-DROPS = 3
 
 
 class TimeVerdict(NamedTuple):
@@ -75,11 +62,9 @@ def judge_over_time(
     rules: Sequence[Invariant],
     *,
     drones: int,
-    budget_s: float,
     scenario: Scenario | None = None,
     courses: int = COURSES,
     flights: int = 0,
-    seed: int = 0,
 ) -> list[TimeVerdict]:
     """The verdict on each line about time.
 
@@ -87,167 +72,132 @@ def judge_over_time(
         subject: the policy.
         rules: lines about time.
         drones: the largest fleet of courses and proofs; two at least, because one drone has no link.
-        budget_s: processor time for the proofs of all lines together, and again for all courses and flights.
         scenario: whose dwell time, staleness rules and shield apply, and which is flown too; None takes the defaults.
         courses: how many for each line.
         flights: how many of the scenario.
-        seed: of the courses.
     """
     base, drones = loads("name: verify") if scenario is None else scenario, max(2, drones)
-    times, proving = PlaneTimes.of(base), Budget(budget_s)
+    plane, flown = PlaneRules.of(base), 0 if scenario is None else flights
+    kept = f"{courses} courses of up to {drones} drones{f' and {flown} flights' if flown else ''} keep it"
+    kept += f", at a dwell time of {plane.dwell_s:g} s{', with the shield' if plane.shielded else ''}"
     verdicts = []
-    for rule, spent in zip(rules, Budget(budget_s).shares(len(rules)), strict=True):
-        found, tried = _search(subject, rule, base, times, drones, courses, spent, seed)
-        flown = 0
-        if found is None and scenario is not None:
-            found, flown = _fly(subject, rule, scenario, flights, spent)
-        if found is not None:
-            verdicts.append(found)
-            continue
-        of_all = "" if tried == courses else f" of {courses}"
-        said = f"{tried}{of_all} courses of up to {drones} drones" + (
-            f" and {flown} flights keep it" if flown else " keep it"
-        )
-        said += f", at a dwell time of {times.dwell_s:g} s" + (", with the shield" if times.shielded else "")
-        try:
-            covered = prove_over_time(subject.policy, rule, times, drones, proving)
-            verdicts.append(TimeVerdict(rule.text, "proved", f"{covered}; {said}"))
-        except NotFinite as why:
-            verdicts.append(TimeVerdict(rule.text, "tried", f"{said}; not proved: {why}"))
+    for rule in rules:
+        found = _search(subject, rule, base, drones, courses) or _fly(subject, rule, base, flown)
+        if found is None:
+            try:
+                covered = prove_over_time(subject.policy, rule, plane, drones)
+                found = TimeVerdict(rule.text, "proved", f"{covered}; {kept}")
+            except NotFinite as why:
+                found = TimeVerdict(rule.text, "tried", f"{kept}; not proved: {why}")
+        verdicts.append(found)
     return verdicts
 
 
 # --- courses -------------------------------------------------------------------------------------
 
 
-def _search(
-    subject: Subject,
-    rule: Invariant,
-    base: Scenario,
-    times: PlaneTimes,
-    drones: int,
-    courses: int,
-    budget: Budget,
-    seed: int,
-) -> tuple[TimeVerdict | None, int]:
-    """The verdict if a course breaks the line, and how many courses were tried to their end."""
-    decisions = min(_LONGEST, math.ceil((3 * _longest_s(rule, times) + 2 * times.dwell_s + 1.0) / times.frame_s))
-    values = Values.of(constants_of(subject.policy, [rule]))
-    best: list[tuple[float, int, Course]] = []
-    for number in range(courses):
-        rng = stream(seed, number, (), "verify.over_time")
-        if best and rng.random() < _FROM_BEST:
-            course = changed_course(best[int(rng.integers(len(best)))][2], seed, number, values)
-        else:
-            size, limit = int(rng.integers(2, drones + 1)), times.detached_after_periods
-            still = Course(size, decisions, times.frame_s, times.period_s, limit, {}, {})
-            course = draw_course(seed, number, still, values)
-        pressure = _run(subject.policy, rule, times, course, budget)
-        if pressure == math.inf:
-            verdict = _refuted(subject, rule, base, times, course, budget)
-            if verdict is not None:
-                return verdict, number + 1
-        if budget.is_spent:
-            return None, number
-        heapq.heappush(best, (pressure, number, course))
-        if len(best) > _BEST:
-            heapq.heappop(best)
-    return None, courses
+class ClosedLoop:
+    """Drone 0's decisions on views, from its policy to its gates, without a clock, a radio or a battery.
 
+    A flight in which a drone is shown the same views (`policy.replays`, `read_by: drone`) enforces the same directives.
+    """
 
-def _longest_s(rule: Invariant, times: PlaneTimes) -> float:
-    spans = [n.span for n in rule.nodes if isinstance(n, Recent)] + ([] if rule.within is None else [rule.within])
-    return max(times.dwell_s if span == DWELL else span for span in spans)
+    def __init__(self, policy: Policy, rules: Sequence[Invariant], plane: PlaneRules) -> None:
+        self._policy, self._keeper = policy, Keeper(rules, plane.dwell_s, plane.shielded)
+        self._loop = DecisionLoop(0, plane, self._keeper)
 
+    def step(self, view: FleetView, now_s: float) -> list[Violation]:
+        """Decide on one view, and return the lines that the gates now break.
 
-def _views(course: Course, budget: Budget) -> Iterator[FleetView]:
-    """The views of a course, as far as the time goes."""
-    return takewhile(lambda view: not budget.is_spent, course.views())
+        Raises:
+            PolicyError: the policy fails, or returns something else than valid directives.
+        """
+        view = view.frozen
+        decided = self._ask(view)
+        fresh = self._ask(just_heard(view)) if self._keeper.needs_fresh else ()
+        directives = self._keeper.correct(view, decided, fresh)
+        self._loop.decide(view, {d.destination: d for d in directives}, now_s)
+        return self._keeper.broken
 
-
-def _run(policy: Policy, rule: Invariant, times: PlaneTimes, course: Course, budget: Budget) -> float:
-    """How near a course comes to breaking a line; infinite if it does, or if the policy fails."""
-    loop, pressure = ClosedLoop(policy, [rule], times), 0.0
-    for k, view in enumerate(_views(course, budget)):
+    def _ask(self, view: FleetView) -> Sequence[Directive]:
         try:
-            if loop.step(view, k * times.frame_s):
-                return math.inf
+            directives = self._policy(view)
         except PolicyError:
-            return math.inf
-        pressure = max(pressure, loop.past.pressure())
-    return pressure
+            raise
+        except Exception as error:
+            raise PolicyError(f"raises {describe_error(error)}") from error
+        check_directives(directives, view)
+        return tuple(directives)
 
 
-def _refuted(
-    subject: Subject, rule: Invariant, base: Scenario, times: PlaneTimes, course: Course, budget: Budget
-) -> TimeVerdict | None:
-    """The verdict with the smallest course found; None if a flight of it keeps the line."""
-    course = shrink_course(course, lambda c: first_break(subject.policy, rule, times, _views(c, budget)) is not None)
-    broken = first_break(subject.policy, rule, times, course.views())
-    if broken is None:  # it decides otherwise than before
-        return None
-    views = list(islice(course.views(), broken.decisions))
-    scenario = course_scenario(subject, rule, broken.what, base, views)
-    shown = shows_in_flight(scenario)
-    return TimeVerdict(rule.text, "refuted", broken.what, broken.view, scenario) if shown else None
+def first_break(policy: Policy, rule: Invariant, plane: PlaneRules, course: Course) -> tuple[int, str]:
+    """How many decisions a course has up to the one at which the gates break a line or the policy fails, and what fails.
+
+    0 where nothing does.
+    """
+    loop = ClosedLoop(policy, [rule], plane)
+    for k, view in enumerate(course.views()):
+        at = f"after {k * plane.period_s:.2f} s of a course"
+        try:
+            broken = loop.step(view, k * plane.period_s)
+        except PolicyError as error:
+            return k + 1, f"the policy fails {at}: {error}"
+        if broken:
+            return k + 1, f"broken by {broken[0].cause} {at}: {broken[0].what}"
+    return 0, ""
+
+
+def _search(subject: Subject, rule: Invariant, base: Scenario, drones: int, courses: int) -> TimeVerdict | None:
+    """The verdict with a small course, if one breaks the line and its flight does too."""
+    plane, policy = PlaneRules.of(base), subject.policy
+    spans = [n.span for n in rule.nodes if isinstance(n, Recent)] + ([] if rule.within is None else [rule.within])
+    longest_s = max(seconds(span, plane.dwell_s) for span in spans)
+    decisions = min(_LONGEST, math.ceil((3 * longest_s + 2 * plane.dwell_s + 1.0) / plane.period_s))
+    values, limit = values_at(constants_of(policy, [rule])), plane.detached_after_periods
+    for number in range(courses):
+        still = Course(2 + number % (drones - 1), decisions, plane.period_s, plane.descriptor_period_s, limit, {})
+        course = draw_course(number, still, values)
+        if not first_break(policy, rule, plane, course)[0]:
+            continue
+        course = shrink_course(course, lambda smaller: first_break(policy, rule, plane, smaller)[0])
+        _, what = first_break(policy, rule, plane, course)
+        if what:  # else it decides otherwise than before
+            views = list(course.views())
+            scenario = course_scenario(subject, rule, what, base, views)
+            if shows_in_flight(scenario):
+                return TimeVerdict(rule.text, "refuted", what, views[-1], scenario)
+    return None
 
 
 def course_scenario(
     subject: Subject, rule: Invariant, what: str, base: Scenario, views: Sequence[FleetView]
 ) -> Scenario:
     """A sortie in which drone 0 reads these views, one a frame, under the dwell time, ages and shield of `base`."""
-    period_s = base.frame_s
-    return Scenario.model_validate(
-        {
-            "name": slug(rule.text),
-            "description": f"{rule.text}: {what}"[:2000],
-            "duration_s": period_s * (len(views) + 0.5),
-            "fleet": {"drones": max(len(v.descriptors) for v in views), "formation": {"shape": "grid"}},
-            "context": base.context.model_dump(
-                include={"rate_hz", "publish_every", "degraded_after_periods", "detached_after_periods"}
-            ),
-            "perception": {"detector": "none"},
-            "policy": {
-                "name": subject.name,
-                "params": dict(subject.params),
-                "dwell_s": base.policy.dwell_s,
-                "shield": base.policy.shield,
-                "invariants": rule.text,
-                "replays": [
-                    {"at_s": k * period_s, "drone": 0, "view": to_json(view), "read_by": "drone"}
-                    for k, view in enumerate(views)
-                ],
-            },
-            "expect": [{"metric": "policies.invariant_violations", "equals": 0, "because": rule.text}],
-        }
-    )
+    settings = {"rate_hz", "publish_every", "degraded_after_periods", "detached_after_periods"}
+    context = base.context.model_dump(include=settings)
+    policy: dict[str, Any] = base.policy.model_dump(include={"dwell_s", "shield"})
+    policy |= {"name": subject.name, "params": dict(subject.params), "invariants": rule.text}
+    shown = enumerate(map(to_json, views))
+    policy["replays"] = [{"at_s": k * base.frame_s, "drone": 0, "view": v, "read_by": "drone"} for k, v in shown]
+    return showing(rule.text, what, views, policy, duration_s=base.frame_s * (len(views) + 0.5), context=context)
 
 
 # --- flights -------------------------------------------------------------------------------------
 
 
-def _fly(
-    subject: Subject, rule: Invariant, scenario: Scenario, flights: int, budget: Budget
-) -> tuple[TimeVerdict | None, int]:
-    """The verdict if the policy fails or breaks the line in a flight of the scenario, and how many were flown."""
-
-    def each_second(t_s: float) -> None:
-        if budget.is_spent:
-            raise Stopped
-
-    for number, flown in enumerate(flights_of(subject, rule, scenario, flights)):
+def _fly(subject: Subject, rule: Invariant, scenario: Scenario, flights: int) -> TimeVerdict | None:
+    """The verdict if the policy fails or breaks the line in a flight of the scenario."""
+    for flown in flights_of(subject, rule, scenario, flights):
         try:
-            record = run_sortie(flown, progress=each_second)
-        except Stopped:
-            return None, number
+            record = run_sortie(flown)
         except PolicyError as error:
             what = f"the policy fails in a flight of {scenario.name}: {error}"
-            return TimeVerdict(rule.text, "refuted", what, None, flown), number + 1
+            return TimeVerdict(rule.text, "refuted", what, None, flown)
         if record.totals["invariant_violations"]:
             first = min(record.tables["violations"].to_pylist(), key=lambda row: (row["t_s"], row["drone"]))
             what = f"broken by {first['cause']} at {first['t_s']:.2f} s of a flight of {scenario.name}: {first['text']}"
-            return TimeVerdict(rule.text, "refuted", what, None, flown), number + 1
-    return None, flights
+            return TimeVerdict(rule.text, "refuted", what, None, flown)
+    return None
 
 
 def flights_of(subject: Subject, rule: Invariant, scenario: Scenario, count: int) -> Iterator[Scenario]:
@@ -264,7 +214,7 @@ def flights_of(subject: Subject, rule: Invariant, scenario: Scenario, count: int
     for number in range(count):
         rng = stream(scenario.seed, number, (), "verify.flights")
         drops = []
-        for _ in range(int(rng.integers(1, DROPS + 1)) if number else 0):
+        for _ in range(int(rng.integers(1, 4)) if number else 0):
             at_s, lasts_s = rng.uniform(0, scenario.duration_s), rng.uniform(0.2, 4.0)
             drops.append(
                 {

@@ -32,7 +32,6 @@ from sortie.scenarios.schema import PolicySection, Scenario
 from sortie.sim.check.counterexample import raised_ages, replay_scenario, shows_in_flight, slug, unused
 from sortie.sim.check.kits import KITS
 from sortie.sim.check.kits import verify as verify_model
-from sortie.sim.check.over_time import BUDGET_S as OVER_TIME_S
 from sortie.sim.check.over_time import COURSES, Subject, TimeVerdict, judge_over_time
 from sortie.sim.cli.console import out, print_failure, print_written
 from sortie.sim.cli.options import refuse
@@ -74,7 +73,7 @@ def verify(
     budget: Annotated[
         float | None,
         typer.Option(
-            help=f"Processor time for the proofs of all properties together, s, and again for random views; default: {PLANE_S:g} s, and {SEARCH_S:g} s for each invariant. Lines about time get as much for their proofs, and again for courses and flights.",
+            help=f"Processor time for the proofs of all properties together, s, and again for random views; default: {PLANE_S:g} s, and {SEARCH_S:g} s for each invariant.",
             min=0,
         ),
     ] = None,
@@ -126,7 +125,6 @@ def verify(
                 subject,
                 over_time,
                 drones=drones,
-                budget_s=OVER_TIME_S if budget is None else budget,
                 scenario=flown,
                 courses=courses,
                 flights=flights,

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import simpy
 
-from sortie.fleet.agent import Guard
 from sortie.policies.checks import check_directives, check_reposition
 from sortie.policies.contract import (
     PHASE_NAMES,
@@ -27,8 +26,9 @@ from sortie.policies.contract import (
     TaskPhase,
     Viewpoint,
 )
+from sortie.policies.decision_loop import Guard, Steps
 from sortie.policies.registry import describe_error, handshake_bytes, resolve, viewpoint_of
-from sortie.policies.verification.enforced import Steps, effective, judge, put_right
+from sortie.policies.verification.enforced import Keeper
 from sortie.policies.verification.invariants.language import (
     Invariant,
     InvariantError,
@@ -37,10 +37,9 @@ from sortie.policies.verification.invariants.language import (
     parse,
     violations,
 )
-from sortie.policies.verification.invariants.past import Past
 from sortie.policies.verification.kit.age_rule import raised_part
 from sortie.policies.verification.kit.views import ViewError, from_json
-from sortie.policies.verification.shield import MARK, Ceilings, check_shieldable, enforce
+from sortie.policies.verification.shield import MARK, check_shieldable
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.scenarios.schema import PolicyChange, PolicySection, Scenario
@@ -212,15 +211,12 @@ class Pilot:
         changes = enumerate(plan.changes)
         self._by_phase = {PHASE_OF[c.phase]: (place, then) for place, (c, then) in changes if c.phase is not None}
         self._place = -1  # in the list of changes, of the last one since the last decision
-        self._rules, self._shielded, self._audit = plan.rules, plan.shielded, audit
-        self._asks_fresh = any(rule.needs_fresh for rule in plan.rules)
+        self._audit, self._keeper = audit, Keeper(plan.rules, plan.dwell_s, plan.shielded)
         self._phase: TaskPhase | None = None
-        self._past = Past(plan.rules, plan.dwell_s)
         self._shown: Replay | None = None
         self._is_shown = any(r.to_drone and r.drone == drone for r in plan.replays)
         self._last_shown: tuple[FleetView, Sequence[Directive]] | None = None
         self._fresh: Sequence[Directive] = ()  # of the latest decision, where an invariant asks for it
-        self._replaced: dict[int, Directive] = {}  # by the shield at the gate, by peer
 
     def take_over(self, policy: NamedPolicy, reason: str, place: int) -> None:
         """From the next decision on, `policy` decides; `place` is the change's in the scenario's list."""
@@ -269,7 +265,7 @@ class Pilot:
         if self._keep is not None:
             self.check(directives, read)  # before its parts are read
             self._keep(self.drone, self.policy.name, read, directives, asked)
-        if self._rules or shown is not None:
+        if self._keeper.rules or shown is not None:
             directives = self._within_rules(read, directives)
         if shown is not None:
             self._judge_shown(shown.view, directives)
@@ -295,39 +291,34 @@ class Pilot:
                 self.take_over(policy, f"phase {PHASE_NAMES[TaskPhase(me.task_phase)]}", place)
 
     def _within_rules(self, view: FleetView, directives: Sequence[Directive]) -> Sequence[Directive]:
-        name, audit = self.policy.name, self._audit
+        name, keeper = self.policy.name, self._keeper
         self.check(directives, view)  # before the rules read them
-        self._fresh = ask(self.policy, just_heard(view)) if self._asks_fresh else ()
-        if self._shielded:
-            directives = enforce(self._rules, view, directives, self._fresh)
-            for d in directives:
-                if d.reason.startswith(MARK):
-                    audit.stepped_in(name, d, "policy")
+        self._fresh = ask(self.policy, just_heard(view)) if keeper.needs_fresh else ()
+        directives = keeper.correct(view, directives, self._fresh)
+        for d in directives if keeper.shielded else ():
+            if d.reason.startswith(MARK):
+                self._audit.stepped_in(name, d, "policy")
         return directives
 
     @property
     def guard(self) -> Guard | None:
         """Has the last word on what the gates enforce; None where there are no invariants."""
-        return self._keep_invariants if self._rules else None
+        return self._keep_invariants if self._keeper.rules else None
 
-    def _keep_invariants(self, view: FleetView, links: Sequence[Steps], ceilings: Ceilings) -> Sequence[Directive]:
-        """Judge what the gates are to enforce. With a shield, links are put right within what their ages allow."""
-        damped = [link.damped for link in links]
-        enforced = put_right(self._rules, view, damped, self._fresh, ceilings) if self._shielded else damped
-        replaced = {d.destination: d for before, d in zip(damped, enforced, strict=True) if d is not before}
-        for peer, directive in replaced.items():
-            if directive != self._replaced.get(peer):
+    def _keep_invariants(self, view: FleetView, now_s: float, links: Sequence[Steps]) -> Sequence[Directive]:
+        """Judge what the gates are to enforce, and record each intervention and each break."""
+        before = self._keeper.replaced
+        enforced = self._keeper(view, now_s, links)
+        for peer, directive in self._keeper.replaced.items():
+            if directive != before.get(peer):
                 self._audit.stepped_in(self.policy.name, directive, "gate")
-        self._replaced = replaced
-        self._past.note(self._audit.now_s, [effective(d) for d in enforced])
-        broken = judge(self._rules, view, links, enforced, self._fresh, self._past)
-        self._audit.judged(self.drone, self.policy.name, broken)
+        self._audit.judged(self.drone, self.policy.name, self._keeper.broken)
         return enforced
 
     def _judge_shown(self, shown: FleetView, directives: Sequence[Directive]) -> None:
         """The invariants; one directive a link; and where ages alone rose since the last view shown, none may have risen."""
         failed = partial(self._audit.failed, self.drone)
-        for rule in (r for r in self._rules if not r.over_time):
+        for rule in (r for r in self._keeper.rules if not r.over_time):
             for d in violations(rule, shown, directives, self._fresh):
                 failed(
                     -1 if d is None else d.destination, self.policy.name, rule.text,

@@ -19,9 +19,8 @@ from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.gate import Gate
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
-from sortie.fleet.messages.compact import Form
 from sortie.fleet.peers import PeerTable
-from sortie.fleet.plane import DroneStatus, PlaneRules, codebooks, equipment_of
+from sortie.fleet.plane import DroneStatus, FleetRules, codebooks
 from sortie.fleet.probes import window_of
 from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.traces import flown_motion
@@ -193,7 +192,7 @@ def build(
 ) -> Parts:
     """Wire the parts of a sortie, and put the scenario's events and changes of policy on its clock."""
     env, recorder = EventLoop(), Recorder(classes=len(scenario.perception.classes) > 1)
-    drones, rules = range(scenario.fleet.drones), _rules(scenario)
+    drones, rules = range(scenario.fleet.drones), FleetRules.of(scenario)
     statuses = [
         DroneStatus(space, looks=not blind, codebook=codebook)
         for space, codebook, blind in zip(
@@ -365,29 +364,6 @@ def _decided(journal: Journal, policies: PolicyPlan, scenario: Scenario) -> dict
         pairs = disagreement.measure(decisions(views), lambda d: known[d.policy].decide, scenario.frame_s)
         tables[disagreement.TABLE] = disagreement.pairs_table(pairs)
     return tables
-
-
-def _rules(scenario: Scenario) -> PlaneRules:
-    context = scenario.context
-    return PlaneRules(
-        period_s=scenario.frame_s,
-        frames=scenario.frames,
-        degraded_after_periods=context.degraded_after_periods,
-        detached_after_periods=context.detached_after_periods,
-        dwell_s=scenario.policy.dwell_s,
-        hysteresis=scenario.policy.hysteresis,
-        compute_delay_s=scenario.perception.compute_delay_s,
-        tile_limit_bytes=scenario.radio.fragment_bytes if scenario.radio.framing == "tiles" else None,
-        trust=context.trust,
-        people=scenario.perception.thermal is not None,
-        classes=len(scenario.perception.classes) > 1,
-        maps_bring_looks=scenario.perception.match_poses,
-        code_bytes=scenario.perception.code_bytes,
-        publish_every=context.publish_every,
-        form=Form(**context.form.model_dump()),
-        roster=scenario.publishes_rosters,
-        makes=equipment_of(scenario),
-    )
 
 
 def _rates_mbps(scenario: Scenario) -> Sequence[float]:

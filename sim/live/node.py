@@ -26,11 +26,11 @@ from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Dropped, DropReason, Opened
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES, decode_directive, encode_directive
-from sortie.fleet.plane import PlaneRules
-from sortie.fleet.staleness import LinkHealth, health
+from sortie.fleet.plane import FleetRules
 from sortie.fleet.standings import Standing
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView
+from sortie.policies.staleness import LinkHealth
 from sortie.scenarios.representation import NAME_OF
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.sortie import latest_phase_s
@@ -144,7 +144,7 @@ class LiveNode:
         return heard and all(w.listeners >= 2 for w in others)
 
     def fly(
-        self, clock: WallClock, memory: PeerMemory, rules: PlaneRules, goodput_mbps: Callable[..., tuple[float, ...]]
+        self, clock: WallClock, memory: PeerMemory, rules: FleetRules, goodput_mbps: Callable[..., tuple[float, ...]]
     ) -> None:
         """Begin the flight: what comes in goes to `memory`, and processor time counts from here."""
         self._clock, self._memory, self._rules = clock, memory, rules
@@ -370,7 +370,7 @@ class LiveNode:
         rules, now_s = self._rules, self._clock.now
         for peer in view.peers:
             age_s = view.age_s[peer]
-            found = health(age_s, rules.descriptor_period_s, rules.degraded_after_periods, rules.detached_after_periods)
+            found = rules.health(age_s)
             if found != self._health.get(peer, LinkHealth.DETACHED):
                 self._health[peer] = found
                 self._new.health.append(HealthChange(now_s, self.drone, peer, found, age_s))

@@ -15,7 +15,7 @@ from sortie.fleet.coverage import Poses, footprint_radius_m, views
 from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
-from sortie.fleet.plane import PlaneRules
+from sortie.fleet.plane import FleetRules
 from sortie.fleet.senses import Sensed
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Disc, TaskPhase
@@ -122,12 +122,12 @@ class MavlinkSenses:
         self._link, self._replay, self._drone, self._note = link, replay, drone, note
         self._hysteresis, self._soc = hysteresis, math.inf
         self._offset_s = 0.0
-        self._rules: PlaneRules | None = None
+        self._rules: FleetRules | None = None
         self._stale = self._doubted = False
         self.muted = False
         """Whether telemetry is so old that the drone publishes and sends nothing."""
 
-    def begin(self, offset_s: float, rules: PlaneRules) -> None:
+    def begin(self, offset_s: float, rules: FleetRules) -> None:
         """Args: `offset_s` from the host's monotonic clock to the flight's clock."""
         self._offset_s, self._rules = offset_s, rules
 

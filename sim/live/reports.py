@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from sortie.fleet.staleness import LinkHealth
+from sortie.policies.staleness import LinkHealth
 from sortie.scenarios.errors import SortieError
 from sortie.sim.export.topics import TopicKind
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sortie.fleet.staleness import LinkHealth
+from sortie.policies.staleness import LinkHealth
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.pilot import named_policy
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind

@@ -27,9 +27,9 @@ from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.senses import Sensed
-from sortie.fleet.staleness import cap_by_age, health
 from sortie.perception.types import Capture
 from sortie.policies.contract import Descriptor, Directive, FleetView
+from sortie.policies.staleness import cap_by_age
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import phase_of
 from sortie.sim.live.clock import WallClock
@@ -200,8 +200,7 @@ class RoleNode:
         rules, view = self._rules, self._memory.view(self._clock.now)
         for directive in self._fallback.directives(view, "the policy node is silent"):
             age_s = view.age_s[directive.destination]
-            link = health(age_s, rules.descriptor_period_s, rules.degraded_after_periods, rules.detached_after_periods)
-            self.node.gate.apply(cap_by_age(directive, link, age_s))
+            self.node.gate.apply(cap_by_age(directive, rules.health(age_s), age_s))
 
     def _sensed(self, own: Descriptor) -> Sensed:
         """The drone as its own descriptor states it; the look's coverage is the publisher's."""

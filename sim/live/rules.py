@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import simpy
 
-from sortie.fleet.agent import Guard
-from sortie.fleet.plane import PlaneRules, equipment_of
+from sortie.fleet.messages.compact import FULL
+from sortie.fleet.plane import FleetRules
 from sortie.policies.catalogue.baselines import silence
+from sortie.policies.decision_loop import Guard
 from sortie.policies.verification.invariants.language import parse
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.audit import Audit
@@ -14,23 +15,15 @@ from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan
 from sortie.sim.results.record import Recorder
 
 
-def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> PlaneRules:
+def rules_of(scenario: Scenario, begin_s: float, end_s: float) -> FleetRules:
     """The plane's rules on the bus: samples go whole, descriptors in full."""
-    return PlaneRules(
-        period_s=scenario.frame_s,
+    return FleetRules.of(
+        scenario,
         frames=scenario.model_copy(update={"duration_s": end_s - begin_s}).frames,
-        degraded_after_periods=scenario.context.degraded_after_periods,
-        detached_after_periods=scenario.context.detached_after_periods,
-        dwell_s=scenario.policy.dwell_s,
         hysteresis=0.0,  # replayed values went through the band in the simulated flight
-        compute_delay_s=scenario.perception.compute_delay_s,
-        code_bytes=scenario.perception.code_bytes,
-        publish_every=scenario.context.publish_every,
-        trust=scenario.context.trust,
-        roster=scenario.publishes_rosters,
-        makes=equipment_of(scenario),
-        people=scenario.perception.thermal is not None,
-        classes=len(scenario.perception.classes) > 1,
+        tile_limit_bytes=None,
+        form=FULL,
+        maps_bring_looks=False,
     )
 
 

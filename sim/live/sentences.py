@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from sortie.fleet.staleness import LinkHealth
+from sortie.policies.staleness import LinkHealth
 from sortie.sim.live.result import LiveResult, Noticed
 
 

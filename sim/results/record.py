@@ -22,9 +22,9 @@ import pyarrow.compute as pc
 
 from sortie.fleet.agent import Ages
 from sortie.fleet.messages.wire import directive_bytes
-from sortie.fleet.staleness import LinkHealth
 from sortie.fleet.standings import Standing
 from sortie.policies.contract import PHASE_NAMES, Descriptor, Directive
+from sortie.policies.staleness import LinkHealth
 from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.scenarios import scratch
 from sortie.scenarios.disc import LISTED_IDS

@@ -11,9 +11,9 @@ import pyarrow.compute as pc
 
 from sortie.fleet.energy.battery import CAUSES as ENERGY_CAUSES
 from sortie.fleet.energy.battery import RECORDED
-from sortie.fleet.staleness import LinkHealth
 from sortie.perception.classes import TargetClass
 from sortie.policies.contract import COVERAGE_BYTES, DIRECTIVE_BOUNDS, PHASE_OF, Representation, TaskPhase
+from sortie.policies.staleness import LinkHealth
 from sortie.policies.verification.enforced import CAUSES
 from sortie.radio.transmission import Status
 from sortie.scenarios.disc import LISTED_IDS

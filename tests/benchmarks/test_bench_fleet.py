@@ -13,7 +13,7 @@ from sortie.fleet.memory import PeerMemory, hear
 from sortie.fleet.messages.auth import Sealer, open_datagram
 from sortie.fleet.messages.wire import decode_descriptor, decode_directive, encode_descriptor, encode_directive
 from sortie.fleet.peers import PeerTable
-from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.plane import DroneStatus, FleetRules
 from sortie.scenarios.schema import Battery, Fleet, Route
 
 pytestmark = pytest.mark.slow
@@ -49,7 +49,7 @@ def test_open_sealed_once_a_broadcast(benchmark: Any) -> None:
 
 @pytest.mark.parametrize("receivers", [4, 99])
 def test_a_descriptor_at_all_that_hear_it(benchmark: Any, receivers: int) -> None:
-    rules = PlaneRules(0.1, 1000, 3.0, 10.0, 0.3, 0.2, 0.04)
+    rules = FleetRules(0.1, 1000, 3.0, 10.0, 0.3, 0.2, 0.04)
     table = PeerTable(receivers, 10)
     memories = [PeerMemory(i, rules, DroneStatus(), table) for i in range(receivers)]
     opened = open_datagram(encode_descriptor(DESCRIPTOR._replace(agent_id=receivers)), None)

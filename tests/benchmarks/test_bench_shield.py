@@ -1,7 +1,6 @@
 """How long a shield takes for one decision: ten lines, five fields, 20 drones.
 
-`make bench-all` prints it. A decision takes a few milliseconds where each line bounds one field, and some tens where each link
-breaks lines that tie fields together. With `ten lines and a choice` two ways to keep a line change equally many fields.
+`make bench-all` prints it. With `ten lines and a choice` two ways to keep a line change equally many fields.
 """
 
 from __future__ import annotations
@@ -12,9 +11,9 @@ from collections.abc import Iterator, Sequence
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import POLICIES
+from sortie.policies.staleness import CEILING, LinkHealth, cap_by_age
 from sortie.policies.verification.enforced import put_right
 from sortie.policies.verification.invariants.language import parse
 from sortie.policies.verification.kit.conformance import full_view

@@ -48,11 +48,11 @@ from sortie.fleet.messages.wire import decode_descriptor
 from sortie.fleet.plane import Equipment, equipment_of
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.sensor_faults import sensor_errors
-from sortie.fleet.staleness import DEGRADED_RATE_HZ, LinkHealth, cap_by_age
 from sortie.fleet.trust import Arrival, goodput_doubt, judge
 from sortie.perception.geometry import USUAL
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.policies.contract import Directive, Disc, FleetView, Representation
+from sortie.policies.staleness import DEGRADED_RATE_HZ, LinkHealth, cap_by_age
 from sortie.scenarios.link_state import heard_share
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import (

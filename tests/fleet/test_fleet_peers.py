@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 from sortie.fleet.memory import PeerMemory, hear
 from sortie.fleet.messages.auth import Opened
 from sortie.fleet.peers import PeerTable, loops
-from sortie.fleet.plane import DroneStatus, PlaneRules
-from sortie.fleet.staleness import LinkHealth, health
+from sortie.fleet.plane import DroneStatus, FleetRules
 from sortie.policies.contract import FleetView
 from sortie.policies.geometry import note_circles, peers_by_overlap
+from sortie.policies.staleness import LinkHealth, health
 from sortie.scenarios.link_state import probed_mbps
 
 PERIOD_S = 0.1
 
 
 def fleet(drones: int, periods: float = 10.0) -> list[PeerMemory]:
-    rules = PlaneRules(PERIOD_S, 1000, 3.0, periods, 0.3, 0.2, 0.04)
+    rules = FleetRules(PERIOD_S, 1000, 3.0, periods, 0.3, 0.2, 0.04)
     table = PeerTable(drones, max(1, round(periods)))
     return [PeerMemory(i, rules, DroneStatus(), table) for i in range(drones)]
 

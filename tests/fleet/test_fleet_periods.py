@@ -20,9 +20,9 @@ from sortie.fleet.flight.viewpoints import Move, Plan, bounds_of, course_of, gra
 from sortie.fleet.gate import Gate
 from sortie.fleet.memory import Received
 from sortie.fleet.messages.wire import decode_descriptor
-from sortie.fleet.staleness import LinkHealth
 from sortie.fleet.traces import DroneTrace, PoseTrace, follow
 from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.policies.staleness import LinkHealth
 from sortie.scenarios.schema import Fleet
 
 FULL = Directive(0, 1, Representation.FEATURES, 0.5, None, 10.0)

@@ -11,8 +11,8 @@ from sortie.fleet import gate
 from sortie.fleet.coverage import footprint_radius_m, pack_grid, unpack_grid
 from sortie.fleet.gate import Gate, make_payload
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
-from sortie.fleet.staleness import CEILING, LinkHealth, cap_by_age, health
 from sortie.policies.contract import Directive, Disc, Representation
+from sortie.policies.staleness import CEILING, LinkHealth, cap_by_age, health
 from sortie.policies.verification.invariants.language import COMPARE
 from sortie.policies.verification.invariants.words import DECISIONS
 

@@ -29,7 +29,7 @@ from sortie.fleet.messages.auth import Opened
 from sortie.fleet.messages.compact import Form
 from sortie.fleet.messages.wire import decode_descriptor
 from sortie.fleet.peers import PeerTable
-from sortie.fleet.plane import DroneStatus, Equipment, PlaneRules, codebooks
+from sortie.fleet.plane import DroneStatus, Equipment, FleetRules, codebooks
 from sortie.fleet.senses import FlightSenses, Sensed, believed
 from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.standings import Standing
@@ -310,7 +310,7 @@ def test_what_was_told_is_known_although_a_peer_knew_it_first() -> None:
 def test_an_offset_shows_by_the_listener_s_own_clock(mine_s: float, theirs_s: float) -> None:
     """Of datagrams as they come in, at two listeners of one table whose clocks differ."""
     table = PeerTable(2, 10, 0)
-    rules = PlaneRules(0.1, 100, 3.0, 10.0, 0.3, 0.2, 0.04)
+    rules = FleetRules(0.1, 100, 3.0, 10.0, 0.3, 0.2, 0.04)
     true, wrong = (
         PeerMemory(i, rules, DroneStatus(clock_skew_s=skew_s), table) for i, skew_s in ((0, 0.0), (1, mine_s))
     )

@@ -19,10 +19,10 @@ from sortie.fleet.messages.wire import (
     encode_directive,
 )
 from sortie.fleet.plane import DroneStatus
-from sortie.fleet.staleness import LinkHealth, cap_by_age
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, FleetView, PolicyError, Representation, boxes_across_networks
 from sortie.policies.damping import DampedLink, damp, lower_of
+from sortie.policies.staleness import LinkHealth, cap_by_age
 from sortie.policies.verification.invariants.language import parse, violations
 from sortie.policies.verification.shield import shield
 from sortie.scenarios.representation import MAPS, NAME_OF, REPRESENTATION_OF

@@ -13,16 +13,16 @@ from sortie.fleet.coverage import View
 from sortie.fleet.gate import Gate, Payload
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import DropReason, Opened
-from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.plane import DroneStatus, FleetRules
 from sortie.fleet.senses import Sensed
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Representation, TaskPhase
 
-RULES = PlaneRules(0.1, 1000, 3.0, 10.0, 0.3, 0.2, 0.04, trust=True)
+RULES = FleetRules(0.1, 1000, 3.0, 10.0, 0.3, 0.2, 0.04, trust=True)
 
 
 def memory(drone: int = 0, **changes: Any) -> PeerMemory:
-    rules = PlaneRules(**{f: getattr(RULES, f) for f in RULES.__dataclass_fields__} | changes)
+    rules = FleetRules(**{f: getattr(RULES, f) for f in RULES.__dataclass_fields__} | changes)
     return PeerMemory(drone, rules, DroneStatus())
 
 

@@ -8,7 +8,7 @@ from unittest import mock
 
 from sim_examples import example
 
-from sortie.fleet.staleness import LinkHealth
+from sortie.policies.staleness import LinkHealth
 from sortie.sim.live import session
 from sortie.sim.live.bench import FleetReports
 from sortie.sim.live.reports import Report

@@ -10,7 +10,8 @@ from policies_examples import fleet_of
 from sortie.policies.catalogue.deputies import deputies
 from sortie.policies.contract import PERSON_FLAG, Directive, FleetView, Representation
 from sortie.policies.damping import DampedLink, damp
-from sortie.policies.verification.enforced import Steps, effective, judge
+from sortie.policies.decision_loop import Steps
+from sortie.policies.verification.enforced import effective, judge
 from sortie.policies.verification.invariants.language import parse
 from sortie.policies.verification.invariants.past import Past
 from sortie.scenarios.disc import Disc

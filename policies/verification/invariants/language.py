@@ -166,6 +166,11 @@ class Invariant:
         return _is_of_link(self)
 
     @property
+    def over_links(self) -> bool:
+        """Whether it has a function over all links."""
+        return _is_over_links(self)
+
+    @property
     def when_of_link(self) -> bool:
         """Whether its condition is one of each link."""
         return _is_when_of_link(self)
@@ -179,6 +184,11 @@ class Invariant:
 @lru_cache(maxsize=1024)
 def _is_of_link(rule: Invariant) -> bool:
     return any(_needs_link(n) for n in (rule.when, rule.then) if n is not None)
+
+
+@lru_cache(maxsize=1024)
+def _is_over_links(rule: Invariant) -> bool:
+    return any(isinstance(n, LinksTerm) for n in rule.nodes)
 
 
 @lru_cache(maxsize=1024)

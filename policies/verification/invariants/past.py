@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol, TypeVar
 from sortie.policies.contract import Directive, nothing
 from sortie.policies.damping import is_climb, is_switch
 from sortie.policies.verification.invariants.language import Invariant, Recent
-from sortie.policies.verification.invariants.words import DWELL, Span
+from sortie.policies.verification.invariants.words import Span, seconds
 
 ROUNDING_S = 1e-6
 """Tolerance of times: frames of 0.1 s are not exactly as long."""
@@ -46,14 +46,11 @@ class Past:
         spans: dict[str, float] = {}
         for node in (n for rule in rules for n in rule.nodes):
             if isinstance(node, Recent):
-                spans[node.change] = max(spans.get(node.change, 0.0), self._seconds(node.span))
+                spans[node.change] = max(spans.get(node.change, 0.0), seconds(node.span, dwell_s))
         self._spans = spans
         self._links: dict[int, Directive] = {}
         self._changed_s: dict[tuple[str, int], list[float]] = {}
         self._lasting: dict[tuple[str, int], _Lasting] = {}
-
-    def _seconds(self, span: Span) -> float:
-        return self._dwell_s if span == DWELL else span
 
     def note(self, now_s: float, acting: Sequence[Directive]) -> None:
         """Take in what the gates enforce from now on; call once a decision, before lines are judged."""
@@ -73,13 +70,8 @@ class Past:
 
     def count(self, change: str, peer: int, span: Span) -> int:
         """How often a link changed in the last time, now included."""
-        since_s = self.now_s - self._seconds(span) + ROUNDING_S
+        since_s = self.now_s - seconds(span, self._dwell_s) + ROUNDING_S
         return sum([1 for t_s in self._changed_s.get((change, peer), ()) if t_s > since_s])
-
-    def pressure(self) -> float:
-        """How near the lines are to being broken: a search looks for courses on which this is high."""
-        lasting_s = [self.now_s - one.since_s for one in self._lasting.values()]
-        return max([*map(float, map(len, self._changed_s.values())), *lasting_s], default=0.0)
 
     def overdue(self, rule: Invariant, broken: Sequence[AnyBroken]) -> list[AnyBroken]:
         """Of a line `within T s: …`, what has been broken for more than T s without a break.
@@ -94,7 +86,7 @@ class Past:
         if rule.within is None:
             return list(broken)
         now = {(b.line, b.peer): b for b in broken}
-        limit_s, found = self._seconds(rule.within) + ROUNDING_S, []
+        limit_s, found = seconds(rule.within, self._dwell_s) + ROUNDING_S, []
         for key, lasting in [(k, v) for k, v in self._lasting.items() if k[0] == rule.text]:
             if self.now_s - lasting.since_s > limit_s:
                 found.append(now.get(key, lasting.latest))

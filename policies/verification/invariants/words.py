@@ -186,6 +186,13 @@ LINK_FUNCTIONS: dict[str, tuple[Kind, Kind]] = {
 """Functions over all links: the kind of the argument, and of the result."""
 
 DWELL: Literal["dwell"] = "dwell"
+
+
+def seconds(span: Span, dwell_s: float) -> float:
+    """A time in s, where the dwell time of the flight is known."""
+    return dwell_s if span == DWELL else span
+
+
 CHANGES = ("climbs_in", "switches_in")
 """Words that count changes of a link in the last so many seconds."""
 TIME_WORDS: dict[str, tuple[str, str]] = {

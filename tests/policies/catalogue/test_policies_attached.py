@@ -6,9 +6,9 @@ import pytest
 from policies_examples import fleet_of
 from sim_examples import example
 
-from sortie.fleet.staleness import LinkHealth, health
 from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.registry import POLICIES
+from sortie.policies.staleness import LinkHealth, health
 from sortie.policies.verification.kit.views import draw_view
 from sortie.sim.engine.sortie import run_sortie
 

@@ -2,7 +2,7 @@
 
 1. Signals become views: charge never rises, a lost descriptor grows older and stays as it was, the ego hears itself.
 2. Numbers in a policy's code are found wherever its code keeps them, and drawn values lie on both sides of them.
-3. Each number of a seed is another course, and one that is changed begins at its first decision as before.
+3. Each number is another course.
 4. Shrinking leaves what the failure needs, and ends at the decision that shows it.
 """
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import pytest
 
@@ -19,17 +18,16 @@ from sortie.policies.contract import COVERAGE_BYTES, PERSON_FLAG, Directive, Dis
 from sortie.policies.verification.invariants.language import parse
 from sortie.policies.verification.kit.courses import (
     Course,
-    Values,
-    changed_course,
     draw_course,
     shrink_course,
+    values_at,
 )
 from sortie.policies.verification.kit.drawn import views_at
 from sortie.policies.verification.shield import shield
 from sortie.policies.verification.subject import constants_of
 
-STILL = Course(3, 20, 0.1, 0.1, 10.0, {}, {})
-VALUES = Values.of(())
+STILL = Course(3, 20, 0.1, 0.1, 10.0, {})
+VALUES = values_at(())
 COURSE = Course(
     drones=3,
     decisions=6,
@@ -48,8 +46,11 @@ COURSE = Course(
         ("targets", 1, -1): ((0, 1.0),),
         ("goodput", 0, 2): ((0, 20.0),),
         ("goodput", 2, 0): ((0, 5.0),),
+        ("x_m", 1, -1): ((0, 10.0),),
+        ("y_m", 1, -1): ((0, 20.0),),
+        ("vx_mps", 1, -1): ((0, 1.0),),
+        ("vy_mps", 1, -1): ((0, -2.0),),
     },
-    places={1: (10.0, 20.0, 1.0, -2.0)},
 )
 
 
@@ -78,11 +79,11 @@ def test_the_views_of_a_course_by_hand() -> None:
 
 
 def test_drawn_values_lie_on_both_sides_of_a_constant_that_can_be_one() -> None:
-    usual, values = Values.of(()), Values.of({0.25, 8.0, -1.0, 1e6})
-    assert set(values.soc) - set(usual.soc) == {0.25 - 1e-4, 0.25, 0.25 + 1e-4}
+    usual, values = values_at(()), values_at({0.25, 8.0, -1.0, 1e6})
+    assert set(values["soc"]) - set(usual["soc"]) == {0.25 - 1e-4, 0.25, 0.25 + 1e-4}
     rates = {0.9 * 0.25, 0.25, 1.2 * 0.25, 0.9 * 8.0, 8.0, 1.2 * 8.0}
-    assert set(values.goodput_mbps) - set(usual.goodput_mbps) == rates
-    assert set(Values.of({0.0, 1.0}).soc) - set(usual.soc) == {0.0, 1e-4, 1.0 - 1e-4}
+    assert set(values["goodput"]) - set(usual["goodput"]) == rates
+    assert set(values_at({0.0, 1.0})["cpu"]) - set(usual["cpu"]) == {0.0, 1e-4, 1.0 - 1e-4}
 
 
 AT_MODULE = {"a": 0.1357, 0.9753: "b"}
@@ -99,63 +100,51 @@ def test_the_numbers_of_a_policy_are_found_wherever_its_code_keeps_them() -> Non
     assert constants_of(shield(_decide, parse("rho <= 1"))) >= {0.1357, 0.5566}
 
 
-def _lines(course: Course) -> Any:
-    return course.signals, course.places
-
-
-def test_each_number_of_a_seed_is_another_course_and_the_same_again() -> None:
-    drawn = [_lines(draw_course(3, n, STILL, VALUES)) for n in range(8)]
-    assert drawn == [_lines(draw_course(3, n, STILL, VALUES)) for n in range(8)]
+def test_each_number_is_another_course_and_the_same_again() -> None:
+    drawn = [draw_course(n, STILL, VALUES).signals for n in range(8)]
+    assert drawn == [draw_course(n, STILL, VALUES).signals for n in range(8)]
     assert all(a != b for k, a in enumerate(drawn) for b in drawn[:k])
-    assert all(_lines(draw_course(4, n, STILL, VALUES)) != drawn[n] for n in range(8))
-    course = draw_course(3, 0, STILL, VALUES)
-    changed = [changed_course(course, 3, n, VALUES).signals for n in range(8)]
-    assert changed == [changed_course(course, 3, n, VALUES).signals for n in range(8)]
-    assert len({str(c) for c in changed}) > 4
 
 
 def test_every_signal_is_drawn_and_begins_at_the_first_decision() -> None:
-    keys, phases, flags = set(), set(), set()
+    keys, values = set(), dict[str, set[float]]()
     for number in range(60):
-        course = draw_course(1, number, STILL, VALUES)
-        for one in (course, changed_course(course, 1, number, VALUES), changed_course(course, 2, number, VALUES)):
-            keys |= one.signals.keys()
-            for (name, _, _), steps in one.signals.items():
-                times = [k for k, _ in steps]
-                assert times[0] == 0
-                assert times == sorted(set(times))
-                phases |= {v for _, v in steps if name == "phase"}
-                flags |= {v for _, v in steps if name in ("region", "targets", "person", "lost")}
-    names = ("soc", "cpu", "gpu", "phase", "region", "targets", "person", "lost")
-    wanted = {(name, i, -1) for name in names for i in range(3)} - {("lost", 0, -1)}
-    assert keys == wanted | {("goodput", i, j) for i in range(3) for j in range(3) if i != j}
-    assert phases == {float(p) for p in TaskPhase}
-    assert flags == {0.0, 1.0}
+        for (name, i, j), steps in draw_course(number, STILL, VALUES).signals.items():
+            times = [k for k, _ in steps]
+            assert times[0] == 0
+            assert times == sorted(set(times))
+            keys.add((name, i, j))
+            values.setdefault(name, set()).update(v for _, v in steps)
+    goodput = {("goodput", i, j) for i in range(3) for j in range(3) if i != j}
+    assert (
+        keys == {(name, i, -1) for name in VALUES if name != "goodput" for i in range(3)} - {("lost", 0, -1)} | goodput
+    )
+    assert values == {name: set(one) for name, one in VALUES.items()}
 
 
 def test_shrinking_leaves_what_the_failure_needs() -> None:
     steps = ((0, 0.9), (3, 0.6), (7, 0.2), (12, 0.1))
-    others = {("cpu", 1, -1): ((0, 0.5), (4, 0.2)), ("goodput", 0, 3): ((0, 5.0),)}
-    course = Course(4, 30, 0.1, 0.1, 10.0, {("soc", 0, -1): steps, **others}, {2: (1.0, 2.0, 3.0, 4.0)})
-    tried = []
+    others = {("cpu", 1, -1): ((0, 0.5), (4, 0.2)), ("goodput", 0, 3): ((0, 5.0),), ("x_m", 2, -1): ((0, 9.0),)}
+    course, tried = Course(4, 30, 0.1, 0.1, 10.0, {("soc", 0, -1): steps, **others}), []
 
-    def fails(candidate: Course) -> bool:
+    def failing(candidate: Course) -> int:
         tried.append(candidate)
-        return any(v.descriptors[0].battery_soc < 0.3 for v in candidate.views())
+        return next((k + 1 for k, v in enumerate(candidate.views()) if v.descriptors[0].battery_soc < 0.3), 0)
 
-    small = shrink_course(course, fails)
-    assert small == Course(2, 8, 0.1, 0.1, 10.0, {("soc", 0, -1): ((0, 0.9), (7, 0.2))}, {})
+    small = shrink_course(course, failing)
+    assert small == Course(2, 8, 0.1, 0.1, 10.0, {("soc", 0, -1): ((0, 0.9), (7, 0.2))})
     assert all(candidate.drones >= 2 for candidate in tried)
 
 
 def test_shrinking_keeps_the_drones_and_the_places_that_the_failure_needs() -> None:
-    course = Course(5, 9, 0.1, 0.1, 10.0, {("lost", 2, -1): ((0, 0.0), (4, 1.0))}, {2: (50.0, 0.0, 0.0, 0.0)})
+    signals = {("lost", 2, -1): ((0, 0.0), (4, 1.0)), ("x_m", 2, -1): ((0, 50.0),)}
+    course = Course(5, 9, 0.1, 0.1, 10.0, signals)
 
-    def fails(candidate: Course) -> bool:
-        views = candidate.views()
-        return any(v.age_s.get(2, 0.0) > 0.2 and v.descriptors[2].position_m[0] > 0 for v in views)
+    def failing(candidate: Course) -> int:
+        views = enumerate(candidate.views())
+        return next((k + 1 for k, v in views if v.age_s.get(2, 0.0) > 0.2 and v.descriptors[2].position_m[0] > 0), 0)
 
-    assert shrink_course(course, fails) == course._replace(drones=3, decisions=6)
+    assert shrink_course(course, failing) == course._replace(drones=3, decisions=6)
 
 
 # --- views at constants ---------------------------------------------------------------------------

@@ -9,23 +9,23 @@
 
 from __future__ import annotations
 
-import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, Disc, FleetView, Representation
+from sortie.policies.decision_loop import Steps
+from sortie.policies.staleness import Ceilings
 from sortie.policies.verification.enforced import (
     DAMPING,
     NO_PEER,
     POLICY,
     STALENESS,
-    Steps,
     effective,
     judge,
     put_right,
 )
 from sortie.policies.verification.invariants.language import parse, violations
 from sortie.policies.verification.invariants.past import Past
-from sortie.policies.verification.shield import Ceilings, enforce, shield
+from sortie.policies.verification.shield import enforce, shield
 
 NONE, DETECTIONS, FEATURES = Representation.NONE, Representation.DETECTIONS, Representation.FEATURES
 VIEW = fleet_of(4)
@@ -130,18 +130,6 @@ def test_two_lines_that_count_changes_each_reach_back_as_far_as_they_say() -> No
         assert [past.count("climbs_in", peer, 1.0) for peer in (1, 2, 3)] == [2, 1, 0]
         assert [past.count("climbs_in", peer, 0.2) for peer in (1, 2, 3)] == [0, 0, 0]
         assert past.count("climbs_in", 1, "dwell") == 2
-        assert past.pressure() == 2.0
-
-
-def test_a_break_presses_the_more_the_longer_it_lasts() -> None:
-    (rule,) = parse("within 0.5 s: rate_hz >= 5")
-    past, pressed = Past([rule], 1.0), []
-    for k in range(10, 14):
-        acting = [link(1, rate_hz=1.0)]
-        past.note(0.1 * k, acting)
-        judge([rule], VIEW, [Steps(d, d, d) for d in acting], acting, (), past)
-        pressed.append(past.pressure())
-    assert pressed == pytest.approx([0.0, 0.1, 0.2, 0.3])
 
 
 # --- the shield's joints ---------------------------------------------------------------------------

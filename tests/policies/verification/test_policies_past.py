@@ -12,7 +12,8 @@ from policies_examples import fleet_of
 from sortie.policies.catalogue.baselines import silence
 from sortie.policies.contract import Directive, Representation
 from sortie.policies.damping import DampedLink, damp, is_climb
-from sortie.policies.verification.enforced import Steps, judge
+from sortie.policies.decision_loop import Steps
+from sortie.policies.verification.enforced import judge
 from sortie.policies.verification.invariants.language import InvariantError, parse, violations
 from sortie.policies.verification.invariants.past import Past
 from sortie.policies.verification.invariants.words import TIME_WORDS, WORDS

@@ -18,11 +18,11 @@ from sortie.fleet.gate import Gate
 from sortie.fleet.messages.auth import Dropped, Sealer, open_datagram
 from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES
 from sortie.fleet.messages.wire import decode_directive, encode_descriptor, encode_directive
-from sortie.fleet.staleness import cap_by_age, health
 from sortie.policies.checks import check_directives, find_inexact
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, PolicyError, Representation
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.registry import POLICIES
+from sortie.policies.staleness import cap_by_age, health
 from sortie.policies.verification.kit.age_rule import raised_part, without_detached
 from sortie.policies.verification.kit.conformance import RULES, full_view
 from sortie.policies.verification.kit.views import draw_view

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from random import Random
 
@@ -13,10 +14,11 @@ from sortie.policies.catalogue.baselines import everyone, silence
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, Disc, FleetView, Policy, Representation, TaskPhase
 from sortie.policies.verification.invariants.language import InvariantError, just_heard, parse, violations
+from sortie.policies.verification.invariants.words import DECISIONS
 from sortie.policies.verification.kit.conformance import conform, failing
 from sortie.policies.verification.kit.views import draw_views
 from sortie.policies.verification.proof.proof import prove
-from sortie.policies.verification.shield import MARK, _distance, enforce, interventions, shield
+from sortie.policies.verification.shield import HIGHEST, MARK, enforce, interventions, shield
 
 HUMANE = "when target_in_region and peers >= 1: any_link(representation >= detections)"
 SPARING = """
@@ -160,6 +162,12 @@ def a_bound(draw: Random) -> str:
     return f"{word} {draw.choice(['<=', '>=', '<=', '>=', '=='])} {draw.choice(FIELDS[word]):g}"
 
 
+def distance(a: Directive, b: Directive) -> tuple[int, float]:
+    """How many fields differ, and by how much in all."""
+    away = [abs(word.raw(a) - word.raw(b)) / HIGHEST[name] for name, word in DECISIONS.items() if word.raw is not None]
+    return sum(1 for x in away if x > 0), math.fsum(away)
+
+
 def some_lines(draw: Random) -> str:
     """Lines that bound fields one by one, by alternatives, and by sums of two."""
     kinds = (
@@ -193,7 +201,7 @@ def test_no_directive_that_keeps_the_lines_is_nearer(seed: int) -> None:
         # A lower rung takes the cells with it, and a raised link gets a rate: these changes are not the lines'.
         follows = after._replace(rho=before.rho if after.rho == 0 else after.rho)
         follows = follows._replace(rate_hz=before.rate_hz if before.rate_hz == 0 else follows.rate_hz)
-        away = [_distance(before, d) for d in (follows, after, *keep)]
+        away = [distance(before, d) for d in (follows, after, *keep)]
         assert min(away[:2]) <= min(away[2:]), text
 
 

@@ -124,14 +124,6 @@ def test_lines_that_cannot_be_kept_are_named_together() -> None:
     ]
 
 
-def test_a_product_of_two_fields_that_are_both_zero_can_rise() -> None:
-    lines = ["rate_hz * rho > 1 and rho + fusion_weight >= 1"]
-    (after,) = shielded(lines, [link(1, 5, 0.0, 0.3)])
-    assert keeps_all(lines, [after]), after
-    (plain,) = shielded(["rate_hz * rho > 1"], [link(1, 5, 0.0)])
-    assert plain.rate_hz * plain.rho > 1
-
-
 @pytest.mark.parametrize("low", [1, 2])
 def test_links_that_differ_for_another_line_are_each_tried(low: int) -> None:
     """Both links have the same directive. Only that whose peer has charge left may be raised."""

@@ -13,12 +13,12 @@ from policies_examples import fleet_of
 from sim_examples import example
 
 from sortie.policies.contract import Directive, FleetView, Representation
+from sortie.policies.plane_rules import PlaneRules
 from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants.language import parse
 from sortie.policies.verification.kit.views import from_json
 from sortie.scenarios.schema import DecisionExpectation, Expectation
 from sortie.sim.check.checking import Checked
-from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes
 from sortie.sim.check.counterexample import replay_scenario, unused
 from sortie.sim.check.discovery import is_scenario
 from sortie.sim.check.expectations import Verdict, check
@@ -27,7 +27,7 @@ from sortie.sim.check.junit import Suite, junit
 from sortie.sim.check.model_rules import Subject as RuleSubject
 from sortie.sim.check.model_rules import conform
 from sortie.sim.check.once import Flown, flown_once
-from sortie.sim.check.over_time import Subject, course_scenario, flights_of
+from sortie.sim.check.over_time import ClosedLoop, Subject, course_scenario, flights_of
 
 
 def _record_of_decisions() -> Any:
@@ -239,14 +239,14 @@ def test_a_file_whose_name_begins_with_another_file_s_name_is_renamed_whole(tmp_
 
 
 def test_a_period_is_that_of_publishing_and_a_frame_that_of_deciding() -> None:
-    times = PlaneTimes.of(example("context.rate_hz=5", "context.publish_every=3"))
-    assert (times.frame_s, times.period_s) == pytest.approx((0.2, 0.6))
+    times = PlaneRules.of(example("context.rate_hz=5", "context.publish_every=3"))
+    assert (times.period_s, times.descriptor_period_s) == pytest.approx((0.2, 0.6))
 
 
 @pytest.mark.parametrize(("age_s", "cause"), [(0.1, "policy"), (5.0, "staleness")])
 def test_the_step_that_breaks_a_line_is_named_in_a_closed_loop_too(age_s: float, cause: str) -> None:
     """A policy that sends at 5 Hz, and where its peer's descriptor is too old nothing is sent."""
-    times = PlaneTimes(0.1, 0.1, 0.0, 3.0, 10.0, shielded=False)
+    times = PlaneRules(0.1, 100, 3.0, 10.0, 0.0, 0.0)
     line = "rate_hz <= 4" if cause == "policy" else "rate_hz >= 4"
 
     def policy(view: FleetView) -> list[Directive]:

@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from sortie.policies.contract import Directive, FleetView, PolicyError, Representation
+from sortie.policies.plane_rules import PlaneRules
 from sortie.policies.registry import resolve
-from sortie.policies.verification import budget
-from sortie.policies.verification.budget import Budget
 from sortie.policies.verification.invariants.language import parse
-from sortie.policies.verification.kit.courses import Course, Values, draw_course
+from sortie.policies.verification.kit.courses import Course, draw_course, values_at
 from sortie.policies.verification.subject import constants_of
 from sortie.scenarios.plugins.user_calls import watched
 from sortie.scenarios.reading.load import loads
-from sortie.scenarios.schema import Scenario
 from sortie.sim.check import over_time
-from sortie.sim.check.closed_loop import ClosedLoop, PlaneTimes
 from sortie.sim.check.few_states import NotFinite, prove_over_time
-from sortie.sim.check.over_time import Subject, course_scenario, flights_of, judge_over_time
+from sortie.sim.check.over_time import ClosedLoop, Subject, course_scenario, flights_of, judge_over_time
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.record import SortieRecord
 
 pytestmark = pytest.mark.slow
 
-TIMES = PlaneTimes(0.1, 0.1, 0.4, 3.0, 10.0, shielded=False)
-STILL = Course(3, 30, 0.1, 0.1, 10.0, {}, {})
+TIMES = PlaneRules(0.1, 100, 3.0, 10.0, 0.4, 0.0)
+STILL = Course(3, 30, 0.1, 0.1, 10.0, {})
 POLICIES = """
 from sortie import Directive, Representation, TaskPhase
 
@@ -91,12 +86,12 @@ def test_a_flight_of_a_course_enforces_what_the_loop_enforces(policy: str, shiel
     decide, (rule,) = resolve(policy), parse("when human: within 0.3 s: any_link(rate_hz >= 5)")
     base = loads("name: base", overrides=["policy.dwell_s=0.4"])
     base = base.model_copy(update={"policy": base.policy.model_copy(update={"shield": shield})})
-    course = draw_course(5, number, STILL, Values.of(constants_of(decide)))
-    views, loop, times = list(course.views()), ClosedLoop(decide, [rule], PlaneTimes.of(base)), PlaneTimes.of(base)
+    course = draw_course(number, STILL, values_at(constants_of(decide)))
+    views, loop, times = list(course.views()), ClosedLoop(decide, [rule], PlaneRules.of(base)), PlaneRules.of(base)
     expected, last, breaks = [], {}, []
     for k, view in enumerate(views):
-        breaks += [k] * bool(loop.step(view, k * times.frame_s))
-        for d in loop.enforced:
+        breaks += [k] * bool(loop.step(view, k * times.period_s))
+        for d in (link.enforced for link in loop._loop.links.values()):
             if d != last.get(d.destination, d._replace(representation=0, rho=0.0, rate_hz=0.0, roi=None)):
                 expected.append((k, d.destination, int(d.representation), round(d.rate_hz, 3)))
             last[d.destination] = d
@@ -104,9 +99,11 @@ def test_a_flight_of_a_course_enforces_what_the_loop_enforces(policy: str, shiel
     rows = [row for row in record.tables["directives"].to_pylist() if row["drone"] == 0]
     rungs = ["none", "tracks", "detections", "features", "raw"]
     flown = [(int(r["t_s"] / 0.1), r["peer"], rungs.index(r["representation"]), round(r["rate_hz"], 3)) for r in rows]
+    flown = [row for row in flown if row[0] < len(views)]
     assert flown == expected
     assert flown
-    assert record.totals["violated_ticks"] == len(breaks)
+    after = record.totals["violated_ticks"] - len(breaks)
+    assert after in (0, 1), "after the course, the flight has one more decision, at which a break may end"
 
 
 @pytest.mark.parametrize(
@@ -126,7 +123,7 @@ def test_the_verdict_of_a_line_about_time(name: str, line: str, outcome: str, fi
     reference = f"{file}:{name}"
     subject = Subject(resolve(reference), reference, {})
     base = loads("name: base", overrides=["policy.dwell_s=1.0"])
-    (verdict,) = judge_over_time(subject, parse(line), drones=2, budget_s=60, scenario=base, courses=150)
+    (verdict,) = judge_over_time(subject, parse(line), drones=2, scenario=base, courses=150)
     assert verdict.outcome == outcome, verdict.what
     if outcome == "refuted":
         assert verdict.scenario is not None
@@ -139,7 +136,7 @@ def test_the_verdict_of_a_line_about_time(name: str, line: str, outcome: str, fi
 
 def test_a_largest_fleet_of_one_drone_counts_as_two_because_one_has_no_link(file: Path) -> None:
     subject = Subject(resolve(f"{file}:by_charge"), f"{file}:by_charge", {})
-    (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=1, budget_s=60, courses=3)
+    (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=1, courses=3)
     assert verdict.what.startswith("3 courses of up to 2 drones keep it")
 
 
@@ -161,7 +158,7 @@ def test_a_largest_fleet_of_one_drone_counts_as_two_because_one_has_no_link(file
 )
 def test_what_no_proof_is_given_for(name: str, line: str, why: str, file: Path) -> None:
     with pytest.raises(NotFinite, match=why):
-        prove_over_time(resolve(f"{file}:{name}"), parse(line)[0], TIMES, 2, Budget(60))
+        prove_over_time(resolve(f"{file}:{name}"), parse(line)[0], TIMES, 2)
 
 
 @pytest.mark.parametrize(
@@ -172,9 +169,7 @@ def test_no_proof_follows_what_a_scenario_adds(overrides: str, why: str, file: P
     value = 20 if overrides.startswith("context.detached") else "true"
     scenario = loads("name: base", overrides=[f"{overrides}={value}", "policy.invariants='rate_hz <= 30'"])
     with pytest.raises(NotFinite, match=f"no proof follows {why}"):
-        prove_over_time(
-            resolve(f"{file}:two_rates"), parse("climbs_in(dwell) <= 1")[0], PlaneTimes.of(scenario), 2, Budget(60)
-        )
+        prove_over_time(resolve(f"{file}:two_rates"), parse("climbs_in(dwell) <= 1")[0], PlaneRules.of(scenario), 2)
 
 
 def test_the_policies_of_a_scenario_do_not_fly_for_the_one_that_is_verified() -> None:
@@ -195,7 +190,7 @@ def test_the_longest_wait_for_a_link_is_proved_to_the_frame(limit_s: float, is_p
     (rule,) = parse(f"when age_periods <= 3: within {limit_s} s: rate_hz > 0")
     decide = resolve(f"{file}:two_rates")
     try:
-        prove_over_time(decide, rule, TIMES, 2, Budget(60))
+        prove_over_time(decide, rule, TIMES, 2)
         proved = True
     except NotFinite:
         proved = False
@@ -204,42 +199,11 @@ def test_the_longest_wait_for_a_link_is_proved_to_the_frame(limit_s: float, is_p
 
 @pytest.mark.parametrize("every", [1, 3])
 def test_views_of_a_course_come_frame_by_frame_and_count_in_the_plane_s_periods(every: int) -> None:
-    course = Course(2, 4, 0.1, 0.1 * every, 10.0, {("lost", 1, -1): ((0, 0.0), (2, 1.0))}, {})
+    course = Course(2, 4, 0.1, 0.1 * every, 10.0, {("lost", 1, -1): ((0, 0.0), (2, 1.0))})
     views = list(course.views())
     assert [view.period_s for view in views] == [0.1 * every] * 4
     assert [view.descriptors[0].stamp_ns for view in views] == [0, 100_000_000, 200_000_000, 300_000_000]
     assert [view.age_s[1] for view in views] == pytest.approx([0.02, 0.02, 0.12, 0.22])
-
-
-def test_courses_end_with_their_time_and_each_line_gets_a_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    now_s = [0.0]
-    monkeypatch.setattr(budget, "process_time", lambda: now_s[0])
-
-    def slow(view: FleetView) -> list[Directive]:
-        now_s[0] += 0.3
-        return [Directive(view.ego, p, Representation.DETECTIONS, rate_hz=2.0, reason="r") for p in view.peers]
-
-    rules = parse("climbs_in(dwell) <= 1\nclimbs_in(60) <= 2")
-    verdicts = judge_over_time(Subject(slow, "slow", {}), rules, drones=2, budget_s=60.0, courses=90)
-    assert now_s[0] < 60 + 1
-    assert verdicts[0].what.startswith("1 of 90 courses of up to 2 drones keep it")
-    assert verdicts[1].what.startswith("0 of 90 courses of up to 2 drones keep it")
-
-
-def test_a_course_of_a_slow_policy_is_made_smaller_as_far_as_the_time_allows(monkeypatch: pytest.MonkeyPatch) -> None:
-    now_s = [0.0]
-    monkeypatch.setattr(budget, "process_time", lambda: now_s[0])
-    monkeypatch.setattr(over_time, "shows_in_flight", lambda scenario: True)
-
-    def silent(view: FleetView) -> list[Directive]:
-        now_s[0] += 1.0
-        return [Directive(view.ego, p, reason="r") for p in view.peers]
-
-    rules = parse("when peers >= 1: within 0.5 s: any_link(rate_hz > 0)")
-    (verdict,) = judge_over_time(Subject(silent, "silent", {}), rules, drones=2, budget_s=30.0, courses=90)
-    assert now_s[0] < 30 + 50
-    assert verdict.outcome == "refuted"
-    assert "after 0.60 s of a course" in verdict.what
 
 
 def test_a_break_that_does_not_come_again_refutes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -253,7 +217,7 @@ def test_a_break_that_does_not_come_again_refutes_nothing(monkeypatch: pytest.Mo
         return [Directive(view.ego, p, kind, rate_hz=rate_hz, reason="r") for p in view.peers]
 
     rules = parse("when age_s < 0.5: within 1.5 s: rate_hz > 0")
-    (verdict,) = judge_over_time(Subject(once, "once", {}), rules, drones=2, budget_s=60.0, courses=2)
+    (verdict,) = judge_over_time(Subject(once, "once", {}), rules, drones=2, courses=2)
     assert verdict.outcome == "tried"
 
 
@@ -276,7 +240,7 @@ def test_a_policy_that_fails_in_a_course_is_refuted_by_a_flight_of_it(error: str
     path.write_text(RAISES.format(limit=0.3137, error=error))
     subject = Subject(resolve(f"{path}:decide"), f"{path}:decide", {})
     with watched(10.0):
-        (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=2, budget_s=60)
+        (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=2)
     assert verdict.outcome == "refuted", verdict.what
     assert verdict.what.startswith("the policy fails after ")
     assert said in verdict.what
@@ -293,30 +257,10 @@ def test_a_policy_that_fails_in_a_flight_of_the_scenario_is_refuted_by_it(tmp_pa
         loads("name: base", overrides=["duration_s=7"]),
     )
     rules = parse("climbs_in(0.1) <= 1")
-    (verdict,) = judge_over_time(subject, rules, drones=2, budget_s=60, scenario=base, courses=1, flights=1)
+    (verdict,) = judge_over_time(subject, rules, drones=2, scenario=base, courses=1, flights=1)
     assert verdict.outcome == "refuted"
     assert verdict.what.startswith("the policy fails in a flight of base: policy ")
     assert verdict.what.endswith("raises LookupError: gone (mine.py, line 6)")
-
-
-def test_a_flight_of_the_scenario_ends_with_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    now_s = [0.0]
-    monkeypatch.setattr(budget, "process_time", lambda: now_s[0])
-    flown_s: list[float] = []
-
-    def fly(scenario: Scenario, *, progress: Callable[[float], None]) -> SortieRecord:
-        for second in range(3600):
-            flown_s.append(second)
-            now_s[0] += 20.0
-            progress(second)
-        raise AssertionError("the flight has no end")
-
-    monkeypatch.setattr(over_time, "run_sortie", fly)
-    rules, base = parse("climbs_in(dwell) <= 1"), loads("name: base")
-    subject = Subject(resolve("silence"), "silence", {})
-    (verdict,) = judge_over_time(subject, rules, drones=2, budget_s=60, scenario=base, courses=1, flights=5)
-    assert len(flown_s) == 3
-    assert verdict.what.startswith("1 courses of up to 2 drones keep it, at")
 
 
 def test_an_error_of_the_contract_keeps_its_text_in_the_loop() -> None:

@@ -163,7 +163,7 @@ def test_verify(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (subject.policy, subject.name, subject.params) == (decide, "best-2", {"received_budget": 0.25})
     given = seen["judge_over_time"].kwargs
     assert given.pop("scenario").name == "example"
-    assert given == {"drones": 3, "budget_s": 4.0, "courses": 6, "flights": 7}
+    assert given == {"drones": 3, "courses": 6, "flights": 7}
 
 
 @pytest.mark.parametrize(

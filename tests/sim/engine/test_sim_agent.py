@@ -8,7 +8,7 @@ import pytest
 from sim_examples import PATIENT
 
 import sortie.fleet.agent
-from sortie.fleet.agent import Agent
+from sortie.policies.decision_loop import DecisionLoop
 from sortie.scenarios.reading.load import load
 from sortie.sim.engine.sortie import run_sortie
 
@@ -32,13 +32,13 @@ def test_what_goes_to_four_peers_is_made_once(monkeypatch: pytest.MonkeyPatch) -
 def test_a_directive_that_is_asked_again_is_enforced_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The worked policy makes new directives in every frame; they are equal to the last ones."""
     asked: list[Any] = []
-    plain = Agent._enforce
+    plain = DecisionLoop._step
 
-    def counted(self: Agent, *what: Any) -> None:
+    def counted(self: DecisionLoop, *what: Any) -> None:
         asked.append(what[1])
         plain(self, *what)
 
-    monkeypatch.setattr(Agent, "_enforce", counted)
+    monkeypatch.setattr(DecisionLoop, "_step", counted)
     decisions = run_sortie(load("track_target", [*SETS, "duration_s=8"]), "worked").totals["decisions"]
     assert decisions == 400
     # two peers a decision; they are looked at in every frame only while an upgrade waits for its dwell time

@@ -12,7 +12,7 @@ from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import DropReason, Opened
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
 from sortie.fleet.peers import PeerTable
-from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.plane import DroneStatus, FleetRules
 from sortie.policies.contract import Descriptor, Roster
 from sortie.scenarios.disc import LISTED_IDS, LISTED_MEMBERS
 from sortie.scenarios.errors import SortieError
@@ -90,7 +90,7 @@ def test_the_same_again_is_the_same_record(flown: SortieRecord) -> None:
 
 def test_who_hears_more_than_a_descriptor_can_list_lists_the_nearest() -> None:
     """Claims decide how near a drone is; a fleet of ids below 200 lists all."""
-    rules = PlaneRules(0.1, 10, 3.0, 10.0, 1.0, 0.0, 0.05)
+    rules = FleetRules(0.1, 10, 3.0, 10.0, 1.0, 0.0, 0.05)
     here_m = (0.0, 0.0, 60.0)
 
     def members(ids: range, me: int) -> tuple[int, ...]:
@@ -108,7 +108,7 @@ def test_who_hears_more_than_a_descriptor_can_list_lists_the_nearest() -> None:
 
 
 def test_an_id_that_no_drone_of_the_fleet_has_is_refused() -> None:
-    memory = PeerMemory(1, PlaneRules(0.1, 10, 3.0, 10.0, 1.0, 0.0, 0.05), DroneStatus())
+    memory = PeerMemory(1, FleetRules(0.1, 10, 3.0, 10.0, 1.0, 0.0, 0.05), DroneStatus())
     stranger = _at(4000, 5.0)._replace(roster=Roster(1, (4000,)))
     assert memory.hear(Opened(stranger, None, 0), 0.1) == DropReason.MALFORMED
     assert memory.hear(Opened(_at(254, 5.0), None, 0), 0.1) is None

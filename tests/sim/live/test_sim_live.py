@@ -24,8 +24,8 @@ from typer.testing import CliRunner
 from sortie.fleet.messages.auth import Dropped, Opened
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.wire import DESCRIPTOR_NAME, DIRECTIVE_NAME, encode_descriptor, encode_directive
-from sortie.fleet.staleness import LinkHealth
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, TaskPhase
+from sortie.policies.staleness import LinkHealth
 from sortie.sim.cli.app import app
 from sortie.sim.export.topics import BYTES_NAME, CONTEXT, Topic, TopicKind, links
 from sortie.sim.folders import RunError

@@ -17,10 +17,10 @@ from rich.console import Console
 from sim_examples import example
 
 from sortie.fleet.memory import PeerMemory
-from sortie.fleet.plane import PlaneRules
-from sortie.fleet.staleness import LinkHealth
+from sortie.fleet.plane import FleetRules
 from sortie.perception.types import Capture
 from sortie.policies.contract import Directive, Representation
+from sortie.policies.staleness import LinkHealth
 from sortie.sim.cli import live as live_command
 from sortie.sim.export.topics import CONTEXT, PAYLOADS, Topic, TopicKind
 from sortie.sim.live.bench import Bench, FleetReports
@@ -266,7 +266,7 @@ def test_the_rules_on_the_bus_are_the_scenario_s_own() -> None:
         "perception.thermal={}", "perception.scene.trucks=0.1", "fleet.makes=[{name: slow, drones: [1], compute_delay_s: 0.5}]",
     )  # fmt: skip
     rules = rules_of(scenario, 1.0, 4.0)
-    assert rules == PlaneRules(
+    assert rules == FleetRules(
         period_s=0.2, frames=15, degraded_after_periods=4, detached_after_periods=17, dwell_s=0.7, hysteresis=0.0,
         compute_delay_s=0.06, code_bytes=3, publish_every=2, trust=False, roster=True, makes=rules.makes, people=True, classes=True,
     )  # fmt: skip
@@ -293,7 +293,7 @@ def test_a_guard_judges_by_the_scenario_s_invariants_and_its_own_make_s_policy()
     )  # fmt: skip
     guards = [guard_of(scenario, drone, simpy.Environment(), Recorder()) for drone in range(3)]
     assert [guard.__self__.policy.name for guard in guards] == ["silence", "boxes", "silence"]  # type: ignore[union-attr]
-    assert [guard.__self__._shielded for guard in guards] == [True] * 3  # type: ignore[union-attr]
+    assert [guard.__self__._keeper.shielded for guard in guards] == [True] * 3  # type: ignore[union-attr]
     assert guard_of(example("policy={name: silence}"), 0, simpy.Environment(), Recorder()) is None
 
 

@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from sortie.fleet.logs.geodesy import Origin, geodetic, local_enu
 from sortie.fleet.logs.mavlink import Companion, Listener, Transmitter, messages
 from sortie.fleet.logs.vehicle import WANTED_HZ, VehicleState, after
-from sortie.fleet.staleness import LinkHealth
 from sortie.policies.contract import TaskPhase
+from sortie.policies.staleness import LinkHealth
 from sortie.sim.cli.app import app
 from sortie.sim.export.origin import ORIGIN
 from sortie.sim.folders import RunError

@@ -12,8 +12,8 @@ from live_flights import PATIENT, Seen, fly_until
 from sim_examples import example
 
 from sortie.fleet.messages.auth import Opened
-from sortie.fleet.staleness import LinkHealth
 from sortie.policies.contract import Descriptor
+from sortie.policies.staleness import LinkHealth
 from sortie.sim.export.topics import CONTEXT, PAYLOADS
 from sortie.sim.folders import RunError
 from sortie.sim.live import session

@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.wire import encode_descriptor
 from sortie.fleet.plane import DroneStatus
-from sortie.fleet.staleness import LinkHealth
 from sortie.policies.contract import PERSON_FLAG, Representation, TaskPhase
+from sortie.policies.staleness import LinkHealth
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli.app import app

@@ -14,7 +14,7 @@ from cli_examples import command
 import sortie
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.compact import FULL
-from sortie.fleet.plane import DroneStatus, PlaneRules
+from sortie.fleet.plane import DroneStatus, FleetRules
 from sortie.fleet.trust import discounted
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Representation, nothing
 from sortie.policies.damping import apply_hysteresis
@@ -179,7 +179,7 @@ def rehearse(policy: str, seed: int, *, delay_s: float, loss: float = 0.0) -> tu
     Every descriptor that is not lost arrives within `delay_s`. The memories are those that fly.
     """
     rng = random.Random(seed)
-    rules = PlaneRules(PERIOD_S, FRAMES, 3.0, 10.0, 1.0, 0.2, 0.03, form=FULL)
+    rules = FleetRules(PERIOD_S, FRAMES, 3.0, 10.0, 1.0, 0.2, 0.03, form=FULL)
     memories = [PeerMemory(i, rules, DroneStatus()) for i in range(DRONES)]
     contexts = [_context(rng, i) for i in range(DRONES)]
     on_the_way: list[tuple[float, int, Descriptor]] = []

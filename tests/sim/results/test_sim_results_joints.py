@@ -17,8 +17,8 @@ import simpy
 from policies_examples import fleet_of
 from sim_examples import example
 
-from sortie.fleet.staleness import LinkHealth
 from sortie.policies.contract import Directive, Disc, FleetView, Representation, Roster
+from sortie.policies.staleness import LinkHealth
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError

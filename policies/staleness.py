@@ -6,13 +6,24 @@ A descriptor older than 3 periods degrades the link to its peer, one older than 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
+from typing import Any
 
 from sortie.policies.contract import ROUNDING_PERIODS, Directive, Representation
-from sortie.policies.verification.shield import Ceiling, nothing_but_duty
 
 DEGRADED_RATE_HZ = 2.0
 """A degraded link carries detections at most this often, as the worked policy's lowest rung does."""
+
+
+_REST = Directive(0, 0)
+
+Limit = tuple[str, str, Any]
+"""A field of a directive as invariants name it, a sign, and the other side."""
+Ceiling = tuple[Limit, ...]
+"""What a link may carry at most, by the age of what is known about its peer."""
+Ceilings = Mapping[int, Ceiling]
+"""By peer."""
 
 
 class LinkHealth(IntEnum):
@@ -41,7 +52,12 @@ CEILING: dict[LinkHealth, Ceiling] = {
         ("representation", "<=", Representation.DETECTIONS.level),
         ("rate_hz", "<=", DEGRADED_RATE_HZ),
     ),
-    LinkHealth.DETACHED: nothing_but_duty(),
+    LinkHealth.DETACHED: (
+        ("representation", "==", Representation.NONE.level),
+        ("rate_hz", "==", 0.0),
+        *((word, "==", float(getattr(_REST, word))) for word in ("rho", "deadline_s", "fusion_weight")),
+        ("roi", "==", 0.0),
+    ),  # its sender's duty cycle is still free
 }
 """What a shield may give a link: nothing else than what `cap_by_age` leaves as it is."""
 
