@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import compress
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -247,7 +248,7 @@ def _compares(value: Any, low: float, high: float) -> bool:
     return isinstance(value, _NUMBERS) and not isinstance(value, np.timedelta64)
 
 
-_NUMBERS = (float, int, np.floating, np.integer, np.bool_)
+_NUMBERS = (Real, np.bool_)
 
 
 _HONEST = frozenset({"builtins", "numpy", "sortie"})
@@ -273,9 +274,8 @@ def _reason_fault(reason: object) -> str | None:
         return f"reason is {text_of(reason)}, must be text"
     if _HALF_PAIR.search(reason):
         return f"reason is {reason!r:.200}, must be text that UTF-8 can write"
-    length = str.__len__(reason)  # `verification.symbols.Text` refuses `len`
-    if length > MAX_REASON:
-        return f"reason has {length} characters, must have at most {MAX_REASON}"
+    if len(reason) > MAX_REASON:
+        return f"reason has {len(reason)} characters, must have at most {MAX_REASON}"
     return None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from math import hypot
 from operator import is_
@@ -30,9 +30,11 @@ def peers_by_overlap(view: FleetView, receiver: int | None = None) -> list[int]:
         receiver: the drone whose peers are ranked; None is the ego.
     """
     of = view.ego if receiver is None else receiver
+    return ranking(view, of) if of in view.descriptors else []
+
+
+def _by_footprints(view: FleetView, of: int) -> list[int]:
     known = view.descriptors
-    if of not in known:
-        return []
     whole, noted, at, circles = _latest
     if known is whole:
         ids = at
@@ -46,6 +48,9 @@ def peers_by_overlap(view: FleetView, receiver: int | None = None) -> list[int]:
     ranked: list[int] = rank_loop()(of, ids, at, circles).tolist()
     return ranked
 
+
+ranking: Callable[[FleetView, int], list[int]] = _by_footprints
+"""Ranks the peers of a drone in the view; a proof searches every order in place of positions."""
 
 _Noted = tuple[Mapping[int, Descriptor] | None, Mapping[int, Descriptor], NDArray[np.int64], NDArray[np.float64]]
 _latest: _Noted = None, {}, np.zeros(0, np.int64), np.zeros((0, 3))

@@ -27,7 +27,7 @@ def among_attached(policy: Decide) -> Decide:
         if attached is view or attached.me is None:
             return directives
         duty = directives[0].duty_percent if directives else 100
-        away = sorted(view.descriptors.keys() - attached.descriptors.keys())
+        away = [p for p in view.peers if p not in attached.descriptors]
         gone = nothing_to_all(view.ego, tuple(away), DETACHED)
         return [*directives, *(gone if duty == 100 else [d._replace(duty_percent=duty) for d in gone])]
 

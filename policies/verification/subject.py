@@ -9,10 +9,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sortie.policies.contract import Policy, PolicyError
+from sortie.policies.contract import Policy
 from sortie.policies.verification.invariants.language import Invariant, Number
 from sortie.policies.verification.shield import Shielded
-from sortie.scenarios.plugins.reference import describe_error
 from sortie.scenarios.plugins.user_calls import Guarded
 
 OWN_INVARIANTS = "INVARIANTS"
@@ -43,25 +42,9 @@ def function_of(policy: Policy) -> Any:
 
 
 def own_invariants(policy: Policy) -> object:
-    """What a policy's file keeps under `INVARIANTS`, however the policy itself was made; empty text where there are none.
-
-    Raises:
-        PolicyError: the file is asked for them, and fails.
-    """
+    """What a policy's file keeps under `INVARIANTS`, however the policy itself was made; empty text where there are none."""
     found = function_of(policy)
-    if not isinstance(found, Guarded) or found.source is None:
-        return ""
-    names = found.source.names
-    if OWN_INVARIANTS in names or "__getattr__" not in names:
-        return names.get(OWN_INVARIANTS, "")
-    try:
-        return names["__getattr__"](OWN_INVARIANTS)  # type: ignore[operator]  # as Python asks a module for any name
-    except AttributeError:
-        return ""
-    except Exception as error:
-        raise PolicyError(
-            f"{found.source.file}: __getattr__({OWN_INVARIANTS!r}) raises {describe_error(error)}"
-        ) from error
+    return "" if not isinstance(found, Guarded) or found.source is None else found.source.names.get(OWN_INVARIANTS, "")
 
 
 def constants_of(policy: Policy, rules: Sequence[Invariant] = ()) -> set[float]:

@@ -20,7 +20,7 @@ from sortie.policies.verification.invariants.promises import PROMISES
 from sortie.policies.verification.kit.conformance import VIEWS, Check, conform, failing
 from sortie.policies.verification.kit.single_view import PLANE
 from sortie.policies.verification.kit.views import LARGEST, to_json
-from sortie.policies.verification.proof.proof import DRONES, PLANE_S, SEARCH_S, ProofVerdict, prove
+from sortie.policies.verification.proof.proof import DRONES, PLANE_CELLS, RULE_CELLS, ProofVerdict, prove
 from sortie.policies.verification.shield import check_shieldable
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
 from sortie.scenarios.exit_codes import FAILED
@@ -71,9 +71,9 @@ def verify(
         ),
     ] = DRONES,
     budget: Annotated[
-        float | None,
+        int | None,
         typer.Option(
-            help=f"Processor time for the proofs of all properties together, s, and again for random views; default: {PLANE_S:g} s, and {SEARCH_S:g} s for each invariant.",
+            help=f"Cells of views that the proofs of all properties together may visit; default: {PLANE_CELLS:,}, and {RULE_CELLS:,} for each invariant.",
             min=0,
         ),
     ] = None,
@@ -159,7 +159,7 @@ def _try(
     decide: Policy,
     rules: Sequence[Invariant],
     drones: int,
-    budget: float | None,
+    budget: int | None,
     views: int,
     has_more: bool,
 ) -> tuple[int, list[Kept]]:
@@ -169,7 +169,7 @@ def _try(
     for check in checks:
         table.add_row(check.name, _verdict(_word(check)), check.what)
     out.print(table)
-    verdicts = prove(decide, rules, max_drones=drones, budget_s=budget)
+    verdicts = prove(decide, rules, max_drones=drones, cells=budget)
     out.print(_verdicts(f"{policy}: proofs", verdicts))
     if not rules and not has_more:
         out.print("No invariants: the plane's rules alone were checked. --invariants FILE names some.", soft_wrap=True)

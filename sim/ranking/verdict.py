@@ -9,8 +9,8 @@ from sortie.policies.verification.kit.conformance import conform, failing
 from sortie.policies.verification.proof.proof import prove
 from sortie.scenarios.plugins.user_calls import DECISION_S, watched
 
-SEARCH_S = 10.0
-"""Processor time that the search for views that break the plane's rules may take, s."""
+SEARCH_CELLS = 40_000
+"""Cells that the search for views that break the plane's rules may visit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +50,13 @@ WORDS = ("refuted", "tried", "proved")
 _STORED = {"drawn": "tried", "searched": "tried", "proved over the reals": "proved"}
 
 
-def verify(policy: Policy, budget_s: float = SEARCH_S) -> Verified:
-    """Try a policy against the conformance kit, and prove the two rules of the plane as far as the time allows.
+def verify(policy: Policy, cells: int = SEARCH_CELLS) -> Verified:
+    """Try a policy against the conformance kit, and prove the two rules of the plane as far as the budget goes.
 
     Args:
-        budget_s: processor time for the search, s.
+        cells: how many the search may visit.
     """
     with watched(DECISION_S):
         checks = conform(policy)
-        contract, monotone = (v.outcome for v in prove(policy, [], budget_s=budget_s)[:2])
+        contract, monotone = (v.outcome for v in prove(policy, [], cells=cells)[:2])
     return Verified(len(checks), tuple(c.name for c in failing(checks)), contract, monotone)

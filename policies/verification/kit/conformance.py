@@ -32,8 +32,8 @@ from sortie.scenarios.plugins.user_calls import Guarded, text_of
 from sortie.scenarios.plugins.user_code import load
 
 VIEWS, LONG_VIEWS = 300, 100
-KIT_S = 60.0
-"""Processor time for all rules together. A rule that then was not tried on all views is unfinished: it does not hold."""
+SHRINK_VIEWS = 1000
+"""So many smaller views are tried at most, for all rules together, to make failing ones smaller."""
 DECISION_LIMIT_S = 0.010
 """A tenth of a frame at 10 Hz, at 20 drones. The limit is generous, because machines differ; the time is reported."""
 SHUFFLED = 100
@@ -83,7 +83,7 @@ def conform(
     """
     tried = list(draw_views(seed, count) if views is None else views)
     rank_loop()  # compiled before anything is measured
-    budget = Budget(KIT_S)
+    budget = Budget(SHRINK_VIEWS)
     some = tried[:LONG_VIEWS] if views is None else tried
     checks = [_check_rule(n, rule, policy, some if n in _LONG else tried, budget) for n, rule in RULES.items()]
     return [*checks, _keeps_no_memory(policy, tried), _decides_in_time(policy)]
@@ -96,15 +96,14 @@ def failing(checks: Sequence[Check]) -> list[Check]:
 
 def _check_rule(name: str, rule: Rule, policy: Policy, views: Sequence[FleetView], budget: Budget) -> Check:
     def complaint(view: FleetView) -> str | None:
+        budget.spend()
         try:
             return rule(policy, copied(view))
         except NoDirectives:
             return None
 
     judged = 0
-    for number, view in enumerate(views):
-        if budget.is_spent:
-            return Check(name, False, f"{number} of {len(views)} views in {KIT_S:g} s", unfinished=True)
+    for view in views:
         try:
             found = rule(policy, copied(view))
         except NoDirectives:

@@ -7,8 +7,9 @@ guesses, so some views lie at these.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,10 +30,12 @@ TRIED_LISTED = 2
 """So many drawn views have `LISTED_IDS` drones, the most with which descriptors list goodput to everyone."""
 TRIED_LARGEST = (0.02, 1.0)
 """Drawn views of the largest fleet, each with the share of the others that the ego hears."""
-LEAST_S = 8.0
-"""The least processor time for all properties together."""
-LARGE_S = 5.0
-"""Larger fleets than `LISTED_IDS` are not tried where a property would take more processor time than this."""
+TRIED_READS = 1_000_000
+"""A property is tried on views until its decisions have read so many descriptors."""
+LARGE_READS = 500_000
+"""Larger fleets than `LISTED_IDS` are not tried where a property would read more descriptors than this on one view."""
+DECISION_READS = 20
+"""A decision counts as so many descriptors more."""
 MOST_SIZES, MOST_LARGE_SIZES = 24, 6
 """So many sizes of fleets are tried, and so many more of those whose drones have rosters, which take long to draw."""
 MOVED_SIZES = 3
@@ -69,38 +72,77 @@ class Drawn:
         self._views = sorted(views, key=lambda view: max(len(view.descriptors), LISTED_IDS))
         self._answers: dict[int, Any] = {}
 
-    def first_faults(self, properties: Sequence[Property], budget_s: float) -> dict[Property, Tried]:
+    def first_faults(self, properties: Sequence[Property]) -> dict[Property, Tried]:
         """For each property, the first view on which it fails, or how many views keep it."""
-        ordered = sorted(properties, key=lambda p: p is PLANE[1])  # raised ages cost most: they get what others leave
-        shares = Budget(max(LEAST_S, budget_s)).shares(len(ordered))
-        return {prop: self._first_fault(prop, share) for prop, share in zip(ordered, shares, strict=True)}
+        ordered = sorted(properties, key=lambda p: p is PLANE[1])  # raised ages take most decisions
+        return {prop: self._first_fault(prop) for prop in ordered}
 
-    def _first_fault(self, prop: Property, budget: Budget) -> Tried:
-        took_s, at = 0.0, LISTED_IDS
+    def _first_fault(self, prop: Property) -> Tried:
+        took, at, budget = 0.0, LISTED_IDS, Budget(TRIED_READS)
         for number, view in enumerate(self._views):
-            size = len(view.descriptors)
-            if budget.is_spent or took_s * (size / at) ** 2 > LARGE_S:
+            size, before = len(view.descriptors), budget.used
+            if budget.is_spent or took * (size / at) ** 2 > LARGE_READS:
                 return Tried(None, f"tried on {number} of {len(self._views)} views")
-            shown, spent = RepeatableView(view), Budget(LARGE_S)
+            shown = RepeatableView(view)
             now = shown.now()
 
             def decide(other: FleetView, /, now: FleetView = now, number: int = number) -> Any:
                 if other is not now:
-                    return self._policy(other)
+                    return self._counted(other, budget)
                 if number not in self._answers:
-                    self._answers[number] = self._policy(now)
+                    self._answers[number] = self._counted(now, budget)
                 return self._answers[number]
 
             if complaint_of(prop, decide, shown) is not None:
                 if check_property(prop, self._policy, view) is None:
                     return Tried(view.frozen, "")  # it fails only sometimes: it is not the same for the same view
-                return Tried(shrink(view, lambda v: not budget.is_spent and self._fails(prop, v)), "")
+                return Tried(shrink(view, lambda v: not budget.is_spent and self._fails(prop, v, budget)), "")
             if size >= LISTED_IDS:
-                took_s, at = max(took_s, spent.used_s), size
+                took, at = max(took, budget.used - before), size
         return Tried(None, f"tried on {len(self._views)} views of up to {LARGEST if self._views else 0:,} drones")
 
-    def _fails(self, prop: Property, view: FleetView) -> bool:
-        return check_property(prop, self._policy, view) is not None
+    def _fails(self, prop: Property, view: FleetView, budget: Budget) -> bool:
+        return check_property(prop, lambda v: self._counted(v, budget), view) is not None
+
+    def _counted(self, view: FleetView, budget: Budget) -> Any:
+        """The policy's decision, at the cost of the descriptors that it reads."""
+        budget.spend(DECISION_READS)
+        return self._policy(view._replace(descriptors=MappingProxyType(_Reads(view.descriptors, budget))))
+
+
+class _Reads(dict[int, Any]):
+    """Descriptors that count how often they are read: the same on every machine, and nearly as the time of a decision."""
+
+    def __init__(self, content: Mapping[int, Any], budget: Budget) -> None:
+        super().__init__(content)
+        self._budget = budget
+
+    def copy(self) -> _Reads:
+        return _Reads(self, self._budget)
+
+    def __getitem__(self, key: int) -> Any:
+        self._budget.spend()
+        return super().__getitem__(key)
+
+    def get(self, key: int, default: Any = None) -> Any:
+        self._budget.spend()
+        return super().get(key, default)
+
+    def _all(self, name: str) -> Any:
+        self._budget.spend(len(self))
+        return getattr(dict, name)(self)
+
+    def __iter__(self) -> Any:
+        return self._all("__iter__")
+
+    def keys(self) -> Any:
+        return self._all("keys")
+
+    def values(self) -> Any:
+        return self._all("values")
+
+    def items(self) -> Any:
+        return self._all("items")
 
 
 @lru_cache(maxsize=TRIED_LISTED + len(TRIED_LARGEST))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sortie.policies.checks import check_directives, find_inexact, find_wrong_type
-from sortie.policies.contract import Directive, FleetView, Policy, PolicyError
+from sortie.policies.contract import FleetView, Policy, PolicyError
 from sortie.policies.verification.invariants.language import (
     Invariant,
     describe_directives,
@@ -65,7 +65,7 @@ def keeps_contract(policy: Policy, view: Any) -> str | None:
 
 def only_falls_with_age(policy: Policy, view: Any) -> str | None:
     """Raising any ages raises no directive's representation, budget or rate (the kit's rule `age-monotone`)."""
-    before = _exactly(policy(view.now()))
+    before = policy(view.now())
     for older in view.older():
         after = policy(older)
         if raised_part(before, after) is None:
@@ -77,24 +77,12 @@ def only_falls_with_age(policy: Policy, view: Any) -> str | None:
     return None
 
 
-def _exactly(answer: Any) -> list[Directive]:
-    """An answer whose directives cannot read differently than they are.
-
-    Raises:
-        PolicyError: it is no list or tuple of exactly `Directive`, or a field is of a type of the policy's own.
-    """
-    wrong = find_inexact(answer)
-    if wrong is not None:
-        raise PolicyError(wrong)
-    return list(answer)
-
-
 def property_of(invariant: Invariant) -> Property:
     """An invariant as a property to prove."""
 
     def complaint(policy: Policy, view: Any) -> str | None:
-        directives = _exactly(policy(view.now()))
-        fresh = _exactly(policy(view.just_heard())) if invariant.needs_fresh else []
+        directives = policy(view.now())
+        fresh = policy(view.just_heard()) if invariant.needs_fresh else ()
         for broken in violations(invariant, view.now(), directives, fresh):
             return f"decided {describe_directives(directives if broken is None else [broken])}"
         return None

@@ -12,7 +12,8 @@ does. Python asks objects in many other ways, so a policy is proved only if its 
 | at module level | numbers, texts, tuples, and tables that are only looked up; nothing that changes |
 | f-strings with values | as a `reason`, or under the name `reason` or `why` on the way to one |
 
-Everything else is no fault: such a policy is tried on drawn views. Sortie's own policies are not walked.
+A simple rule that refuses a little more is better here than a clever one: such a policy is no worse, it is tried on drawn
+views. Sortie's own policies are not walked.
 """
 
 from __future__ import annotations
@@ -20,21 +21,20 @@ from __future__ import annotations
 import ast
 import builtins
 import functools
-import importlib
 import inspect
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import FunctionType, ModuleType
+from typing import Any
 
 from sortie.policies import contract
-from sortie.policies.catalogue.attached import among_attached
+from sortie.policies.catalogue import attached
 from sortie.policies.catalogue.prior.full import full_sharing
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Policy, Reposition
 from sortie.policies.geometry import footprint_overlap, peers_by_overlap
 from sortie.policies.registry import POLICIES
-from sortie.policies.verification.shield import Shielded
+from sortie.policies.verification.subject import function_of
 from sortie.scenarios import link_state
 from sortie.scenarios.disc import disc_overlap
 from sortie.scenarios.plain_sum import plain_sum
@@ -42,267 +42,151 @@ from sortie.scenarios.plugins.user_calls import Guarded
 from sortie.scenarios.representation import Representation
 
 NO_FILE = "is not a policy of Sortie's nor a function in a file that was named as file.py:function"
-_BUILTINS = frozenset(
-    [
-        "abs",
-        "all",
-        "any",
-        "bool",
-        "dict",
-        "divmod",
-        "enumerate",
-        "filter",
-        "float",
-        "int",
-        "iter",
-        "len",
-        "list",
-        "map",
-        "max",
-        "min",
-        "next",
-        "range",
-        "reversed",
-        "round",
-        "sorted",
-        "str",
-        "sum",
-        "tuple",
-        "zip",
-        "ValueError",
-        "KeyError",
-        "IndexError",
-        "TypeError",
-        "RuntimeError",
-        "AssertionError",
-        "NotImplementedError",
-    ]
+_OF_NUMBERS = frozenset({"abs", "float", "int", "max", "min", "round"})
+"""What may be called at module level, beside `math` and Sortie's types."""
+_BUILTIN_NAMES = (
+    "all any bool dict divmod enumerate filter iter len list map next range reversed sorted str sum tuple zip "
+    "ValueError KeyError IndexError TypeError RuntimeError AssertionError NotImplementedError"
 )
+_BUILTINS = _OF_NUMBERS | frozenset(_BUILTIN_NAMES.split())
 _ENUMS = (Representation, contract.TaskPhase, contract.Coverage, link_state.LinkState)
-_SORTIES: dict[int, Any] = {
-    id(known): known
-    for known in (
-        Directive, Disc, Reposition, *_ENUMS, contract.nothing, contract.nothing_to_all, full_sharing, footprint_overlap,
-        peers_by_overlap, disc_overlap, plain_sum, link_state.state_of, link_state.is_tried, link_state.probed_mbps,
-        link_state.heard_share, contract.looks_from, contract.boxes_across_networks, among_attached, *POLICIES.values(),
-    )
-}  # fmt: skip
-_DECORATORS = (contract.looks_from, contract.boxes_across_networks, among_attached)
-_OF_OBJECTS = (
-    "append clear copy extend get index insert items join pop remove reverse setdefault sort update values "  # lists, tables
-    "name value level _replace attached full_sharing_maps human_in_region me members peers shares_codes_with "
-    "shares_features_with counts coverage_corner goodput_to link_state"
+_DECORATORS = (contract.looks_from, contract.boxes_across_networks, attached.among_attached)
+_FUNCTIONS = (
+    *(contract.nothing, contract.nothing_to_all, full_sharing, footprint_overlap, peers_by_overlap, disc_overlap),
+    *(plain_sum, link_state.state_of, link_state.is_tried, link_state.probed_mbps, link_state.heard_share),
 )
-_ATTRIBUTES = frozenset({
-    *_OF_OBJECTS.split(), *Directive._fields, *Disc._fields, *Reposition._fields, *FleetView._fields, *Descriptor._fields
-})  # fmt: skip
+_SORTIES = (Directive, Disc, Reposition, *_ENUMS, *_DECORATORS, *_FUNCTIONS, *POLICIES.values())
+_DECIDED = frozenset({*Directive._fields, *Disc._fields, *Reposition._fields})
+_METHODS = (
+    "append clear copy extend get index insert items join keys pop remove reverse setdefault sort update values name value level _replace attached "
+    "full_sharing_maps human_in_region me members peers shares_codes_with shares_features_with counts coverage_corner "
+    "goodput_to link_state"
+)
+_ATTRIBUTES = frozenset({*_METHODS.split(), *_DECIDED, *FleetView._fields, *Descriptor._fields})
 _REASONS = frozenset({"reason", "why"})
 """Names of texts with numbers: variables, parameters, and functions that return one."""
-_STATEMENTS = (
-    ast.Assign, ast.AnnAssign, ast.AugAssign, ast.Delete, ast.For, ast.While, ast.If, ast.Return, ast.Expr, ast.Pass, ast.Break,
-    ast.Continue, ast.Assert, ast.Raise, ast.Match, ast.match_case, ast.MatchValue, ast.MatchSingleton, ast.MatchOr, ast.MatchAs,
-)  # fmt: skip
-_CONSTANTS = (
-    ast.Constant, ast.Name, ast.Attribute, ast.Tuple, ast.UnaryOp, ast.BinOp, ast.Compare, ast.IfExp, ast.BoolOp, ast.JoinedStr,
-    ast.FormattedValue, ast.Call, ast.expr_context, ast.operator, ast.boolop, ast.unaryop, ast.cmpop,
-)  # fmt: skip
-"""What a constant at module level may be made of."""
-_EXPRESSIONS = (
-    *_CONSTANTS, ast.Lambda, ast.NamedExpr, ast.ListComp, ast.DictComp, ast.GeneratorExp, ast.comprehension, ast.Dict, ast.List,
-    ast.Subscript, ast.Slice, ast.Starred, ast.keyword,
-)  # fmt: skip
-_OF_NUMBERS = (abs, min, max, round, int, float, Disc, *_ENUMS)
-"""What may be called at module level, beside `math`."""
-_WORDS: dict[type[ast.AST], str] = {
-    ast.Try: "a try statement", ast.With: "a with statement", ast.ClassDef: "a class", ast.Set: "a set", ast.SetComp: "a set",
-    ast.Yield: "yield", ast.YieldFrom: "yield",
-}  # fmt: skip
-_COMPREHENSIONS = (ast.ListComp, ast.DictComp, ast.GeneratorExp)
+_HAND_ON = "Return If For While Match match_case IfExp BoolOp BinOp List Tuple ListComp GeneratorExp Starred JoinedStr"
+"""What hands a text on: where one may be a reason, so may the parts."""
+_OF_CONSTANTS = "Constant Name Attribute Tuple List Dict UnaryOp BinOp Compare Call"
+"""What a constant or a table at module level may be made of."""
+_OTHERS = (
+    "Assign AnnAssign AugAssign Expr Pass Break Continue Assert Raise MatchValue MatchSingleton MatchOr MatchAs FunctionDef "
+    "Lambda arguments arg NamedExpr DictComp comprehension Subscript Slice keyword FormattedValue"
+)
+_ALLOWED = frozenset(f"{_HAND_ON} {_OF_CONSTANTS} {_OTHERS}".split())
+_SIGNS = (ast.expr_context, ast.operator, ast.boolop, ast.unaryop, ast.cmpop)
+_WORDS = {"Try": "a try statement", "ClassDef": "a class", "Set": "a set"}
+_INSIDE = object()
+"""The meaning of everything that is no name of a module."""
 
 
 class NotAllowed(Exception):
     """The source has more than a proof follows; the message says what, and in which line."""
 
-    def __init__(self, what: str, node: ast.AST | None = None) -> None:
-        line = getattr(node, "lineno", 0)
-        super().__init__(f"{what} in line {line}" if line else what)
+    def __init__(self, what: str, node: ast.AST) -> None:
+        super().__init__(f"{what} in line {getattr(node, 'lineno', 1)}")
 
 
 def why_not_provable(policy: Policy) -> str:
     """What a policy's source has that no proof follows; empty where a proof may follow it."""
-    found: Any = policy
-    while isinstance(found, functools.partial | Shielded):
-        if isinstance(found, functools.partial) and not all(map(_is_fixed, (*found.args, *found.keywords.values()))):
-            return "has a parameter that is more than numbers and texts"
-        found = found.func if isinstance(found, functools.partial) else found.policy
+    found = function_of(policy)
+    if isinstance(policy, functools.partial) and not all(map(_is_fixed, (*policy.args, *policy.keywords.values()))):
+        return "has a parameter that is more than numbers and texts"
     if not isinstance(found, Guarded) or found.source is None:
-        is_sorties = str(getattr(found, "__module__", "")).startswith("sortie.policies.")
-        return "" if is_sorties and not isinstance(found, Guarded) else NO_FILE
+        return "" if str(getattr(found, "__module__", "")).startswith("sortie.policies.") else NO_FILE
+    waiting, done = [_undecorated(found.source.names.get(found.source.name))], list[Any]()
+    if not _is_plain(waiting[0]):
+        return f"is no plain function ({found.source.name})"
     try:
-        own = _meaning(_File(found.source.file), found.source.name, None)
-        if not isinstance(own, _Own):
-            return f"is no plain function ({found.source.name})"
-        waiting, done = [own], list[_Own]()
         while waiting:
-            one = waiting.pop()
-            if one not in done:
-                done.append(one)
-                waiting += _Walk(one).reached
+            function = waiting.pop()
+            if function not in done:
+                done.append(function)
+                waiting += _Walk(function).reached
     except (NotAllowed, SyntaxError, RecursionError, OSError) as error:
         return str(error)
     return ""
+
+
+def _undecorated(found: Any) -> Any:
+    """The function under Sortie's own decorators."""
+    sorties = (contract.__file__, attached.__file__)
+    while getattr(getattr(found, "__code__", None), "co_filename", "") in sorties and hasattr(found, "__wrapped__"):
+        found = found.__wrapped__
+    return found
+
+
+def _is_plain(found: object) -> bool:
+    return isinstance(found, FunctionType) and not found.__closure__
 
 
 def _is_fixed(value: object) -> bool:
     """Whether a value can never change."""
     if isinstance(value, tuple):
         return all(map(_is_fixed, value))
-    return value is None or isinstance(value, Enum) or type(value) in (bool, int, float, str, bytes)
+    return value is None or isinstance(value, Enum | bool | int | float | str | bytes)
 
 
-# --- the meanings of names -----------------------------------------------------------------------
+def _is_table(value: object) -> bool:
+    """Whether a value is a list or a dictionary of values that never change."""
+    return isinstance(value, list | dict) and all(map(_is_fixed, value.values() if isinstance(value, dict) else value))
 
 
-class _Import(NamedTuple):
-    module: str
-    item: str
-    """Empty for the module itself."""
-    level: int
+def _is_home(name: str) -> bool:
+    return name == "math" or name.partition(".")[0] == "sortie"
 
 
-class _File:
-    """A source file, and what gives its names a meaning at module level; None is a meaning that no proof follows."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, tree = path, ast.parse(path.read_bytes())
-        self.meanings: dict[str, list[Any]] = {}
-        self.postpones_annotations = False
-        for node in _outside_functions(tree):
-            for name, meaning in _given(node):
-                self.meanings.setdefault(name, []).append(meaning)
-            if isinstance(node, ast.ImportFrom) and node.module == "__future__":
-                self.postpones_annotations |= any(alias.name == "annotations" for alias in node.names)
-        for node in ast.walk(tree):
-            for name in node.names if isinstance(node, ast.Global) else ():
-                self.meanings.setdefault(name, []).append(None)
+def _is_listed(found: Any) -> bool:
+    """Whether an object is `math`, Sortie, or one of theirs that a policy may use."""
+    is_module = isinstance(found, ModuleType) and _is_home(found.__name__)
+    of_math = getattr(found, "__module__", "") == "math" and found.__name__ != "sumprod"
+    return is_module or of_math or any(found is known for known in _SORTIES)
 
 
-def _outside_functions(node: ast.AST) -> Iterator[ast.AST]:
-    for below in ast.iter_child_nodes(node):
-        yield below
-        if not isinstance(below, (ast.FunctionDef, ast.Lambda, ast.ClassDef, *_COMPREHENSIONS)):
-            yield from _outside_functions(below)
+@functools.lru_cache(maxsize=64)
+def _parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_bytes())
 
 
-def _given(node: ast.AST) -> Iterator[tuple[str, Any]]:
-    """The names that a statement gives a meaning."""
+def _is_constant(path: Path, name: str, names: Mapping[str, Any]) -> bool:
+    """Whether a file sets a name once, at module level, to an expression of constants, or imports such a name.
+
+    Args:
+        path: the file.
+        name: the name.
+        names: all names of the file with their values; without them, a constant is made of none of these.
+    """
+    bindings = [node for node in ast.walk(_parsed(path)) if name in _bound_by(node)]
+    for node in _parsed(path).body if len(bindings) == 1 else ():
+        if all(part is not bindings[0] for part in ast.walk(node)):
+            continue
+        if isinstance(node, ast.ImportFrom) and isinstance(bindings[0], ast.alias) and node.module:
+            beside = path.parent.joinpath(*node.module.split(".")).with_suffix(".py")
+            return _is_home(node.module) or (beside.is_file() and _is_constant(beside, bindings[0].name, {}))
+        is_set = isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None
+        return is_set and _is_of_constants(path, node.value, names)  # type: ignore[attr-defined]
+    return False
+
+
+def _is_of_constants(path: Path, node: ast.expr, names: Mapping[str, Any]) -> bool:
+    parts = [part for part in ast.walk(node) if not isinstance(part, _SIGNS)]
+    used = {part.id for part in parts if isinstance(part, ast.Name)} - (_OF_NUMBERS - names.keys())
+    is_plain = all(type(part).__name__ in _OF_CONSTANTS.split() for part in parts)
+    return is_plain and all(_is_listed(names.get(n)) or _is_constant(path, n, names) for n in used)
+
+
+def _bound_by(node: ast.AST) -> tuple[str, ...]:
+    """The names that a part binds by itself."""
     match node:
-        case ast.FunctionDef(name=name):
-            yield name, node
-        case ast.Import(names=aliases):
-            for alias in aliases:
-                yield alias.asname or alias.name.partition(".")[0], _Import(alias.name, "", 0)
-        case ast.ImportFrom(module=module, names=aliases, level=level):
-            for alias in aliases:
-                yield alias.asname or alias.name, _Import(module or "", alias.name, level)
-        case (
-            ast.Assign(targets=[ast.Name(id=name)], value=value) | ast.AnnAssign(target=ast.Name(id=name), value=value)
-        ):
-            yield name, value
-        case ast.Assign(targets=[ast.Tuple(elts=targets)], value=ast.Tuple(elts=values)) if len(targets) == len(values):
-            for target, value in zip(targets, values, strict=True):
-                yield from ((name, value if isinstance(target, ast.Name) else None) for name in _names_in(target))
-        case ast.stmt() | ast.NamedExpr() | ast.withitem() | ast.MatchAs() | ast.MatchStar() | ast.ExceptHandler():
-            yield from ((name, None) for name in (getattr(node, "name", None),) if name)
-            for part in ast.iter_child_nodes(node) if not isinstance(node, ast.ClassDef) else ():
-                yield from ((name, None) for name in _names_in(part) if not isinstance(part, ast.stmt))
-
-
-def _names_in(target: ast.AST) -> list[str]:
-    return [node.id for node in ast.walk(target) if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load)]
-
-
-@dataclass(frozen=True, eq=False)
-class _Own:
-    """A function of the policy's."""
-
-    file: _File
-    function: ast.FunctionDef
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Own) and (self.file.path, self.function.name) == (
-            other.file.path,
-            other.function.name,
-        )
-
-
-class _Constant(NamedTuple):
-    """What stands at module level under a name."""
-
-    is_table: bool
-
-
-def _meaning(file: _File, name: str, node: ast.AST | None) -> Any:
-    """An `_Own`, a `_Constant`, or an object of Python's or Sortie's."""
-    meanings = file.meanings.get(name)
-    if meanings is None and name in _BUILTINS:
-        return getattr(builtins, name)
-    if meanings is None or len(meanings) > 1 or meanings[0] is None:
-        raise NotAllowed(f"uses {name}", node)
-    meaning = meanings[0]
-    if isinstance(meaning, ast.FunctionDef):
-        return _Own(file, meaning)
-    if not isinstance(meaning, _Import):
-        return _constant(file, meaning, name)
-    module, item, level = meaning
-    if module == "math" or module.partition(".")[0] == "sortie":
-        found = importlib.import_module(module if item else module.partition(".")[0] if name == "sortie" else module)
-        return _listed(getattr(found, item, None), item, node) if item else found
-    path = file.path.parents[max(level, 1) - 1].joinpath(*module.split(".")).with_suffix(".py")
-    if not item or not module or not path.is_file():
-        raise NotAllowed(f"uses {name}", node)
-    return _meaning(_File(path), item, node)
-
-
-def _listed(found: Any, name: str, node: ast.AST | None) -> Any:
-    """An object of a module's, if a policy may use it."""
-    of_math = getattr(found, "__module__", "") == "math" and name != "sumprod"
-    if id(found) not in _SORTIES and not _is_fixed(found) and not inspect.ismodule(found) and not of_math:
-        raise NotAllowed(f"uses {name}", node)
-    return found
-
-
-def _object(file: _File, node: ast.AST) -> Any:
-    """What a dotted name at module level means."""
-    match node:
-        case ast.Name(id=name):
-            return _meaning(file, name, node)
-        case ast.Attribute(value=base, attr=attr):
-            owner = _object(file, base)
-            if inspect.ismodule(owner) or any(owner is kind for kind in _ENUMS):
-                return _listed(getattr(owner, attr, None), attr, node)
-    raise NotAllowed(f"uses {ast.unparse(node)}", node)
-
-
-def _constant(file: _File, node: ast.expr, name: str) -> _Constant:
-    """Check that an expression at module level is a constant, or a table of constants."""
-    match node:
-        case ast.List(elts=parts):
-            pass
-        case ast.Dict(keys=keys, values=values) if None not in keys:
-            parts = [*filter(None, keys), *values]
-        case _:
-            parts = [node]
-    for part in (below for top in parts for below in ast.walk(top)):
-        found = _object(file, part) if isinstance(part, ast.Name | ast.Attribute) else None
-        is_known = any(found is known for known in _OF_NUMBERS) or getattr(found, "__module__", "") == "math"
-        is_fixed = _is_fixed(found) or found == _Constant(False) or is_known or inspect.ismodule(found)
-        if not isinstance(part, _CONSTANTS) or not is_fixed or (isinstance(part, ast.Call) and part.keywords):
-            raise NotAllowed(f"sets {name} to more than a constant", part)
-    return _Constant(parts != [node])
-
-
-# --- the walk ------------------------------------------------------------------------------------
+        case ast.Name(id=name, ctx=ast.Store() | ast.Del()) | ast.arg(arg=name) | ast.MatchAs(name=str(name)):
+            return (name,)
+        case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+            return (name,)
+        case ast.alias(name=name, asname=other):
+            return (other or name.partition(".")[0],)
+        case ast.Global(names=names):
+            return tuple(names)
+    return ()
 
 
 class _Walk:
@@ -312,250 +196,142 @@ class _Walk:
         NotAllowed: it has something that is not listed.
     """
 
-    def __init__(self, own: _Own) -> None:
-        self._file, function = own.file, own.function
-        self.reached: list[_Own] = []
-        self._scopes: list[set[str]] = []
-        for decorator in function.decorator_list:
-            called = _object(self._file, decorator.func if isinstance(decorator, ast.Call) else decorator)
+    def __init__(self, function: FunctionType) -> None:
+        self._names, self._path = function.__globals__, Path(function.__code__.co_filename)
+        self.reached: list[FunctionType] = []
+        found = [n for n in _parsed(self._path).body if isinstance(n, ast.FunctionDef) and n.name == function.__name__]
+        if len(found) != 1:
+            raise NotAllowed(f"is no plain function ({function.__name__})", ast.Pass())
+        (node,) = found
+        parts = [part for top in (node.args, *node.body) for part in ast.walk(top)]
+        self._local = {name for part in parts for name in _bound_by(part)}
+        self._only_looked_up = {id(one) for part in parts for one in _looked_up_in(part)}
+        for name in sorted(self._local & (self._names.keys() | _BUILTINS)):
+            raise NotAllowed(f"gives {name} another meaning", node)
+        for decorator in node.decorator_list:
+            called = self._meaning(decorator.func if isinstance(decorator, ast.Call) else decorator)
             if not any(called is known for known in _DECORATORS):
                 raise NotAllowed(f"has the decorator {ast.unparse(decorator)}", decorator)
-        for default in (*function.args.defaults, *filter(None, function.args.kw_defaults)):
-            if _constant(self._file, default, "a default value").is_table:
-                raise NotAllowed("has a default value that may change", default)
-        self._function(function)
+        values = (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values())
+        for default in (*node.args.defaults, *filter(None, node.args.kw_defaults)):
+            if not all(map(_is_fixed, values)) or not _is_of_constants(self._path, default, self._names):
+                raise NotAllowed("has a default value that is more than a constant", default)
+        for part in node.body:
+            self._visit(part, node.name in _REASONS)
 
-    def _function(self, node: ast.FunctionDef | ast.Lambda) -> None:
-        parts = node.body if isinstance(node, ast.FunctionDef) else [node.body]
-        arguments = {part.arg for part in ast.walk(node.args) if isinstance(part, ast.arg)}
-        self._scopes.append(arguments | {name for part in parts for name in _bound(part)})
-        for part in parts:
-            self._visit(part, getattr(node, "name", "") in _REASONS)
-        self._scopes.pop()
+    def _meaning(self, node: ast.AST) -> Any:
+        """What a name, or a dotted name, of a module means; `_INSIDE` for everything else."""
+        if isinstance(node, ast.Attribute):
+            owner = self._meaning(node.value)
+            if not isinstance(owner, ModuleType) and not any(owner is kind for kind in _ENUMS):
+                return _INSIDE
+            found = getattr(owner, node.attr, _INSIDE)
+            if _is_fixed(found) or _is_listed(found):
+                return found
+        elif not isinstance(node, ast.Name) or node.id in self._local:
+            return _INSIDE
+        else:
+            is_builtin = node.id in _BUILTINS and node.id not in self._names
+            found = getattr(builtins, node.id) if is_builtin else self._names.get(node.id, _INSIDE)
+            if is_builtin or _is_listed(found) or _is_plain(_undecorated(found)):
+                return found
+            if (_is_fixed(found) or _is_table(found)) and _is_constant(self._path, node.id, self._names):
+                return found
+        raise NotAllowed(f"uses {ast.unparse(node)}", node)
 
-    def _visit(self, node: ast.AST | None, may_be_text: bool = False) -> None:
-        """Check a part. A text with numbers may only be where it becomes a reason."""
-        if node is None:
+    def _visit(self, node: ast.AST, is_text: bool = False) -> None:
+        """Check a part; `is_text` where it becomes a reason, so that it may be a text with numbers."""
+        kind = type(node).__name__
+        if isinstance(node, _SIGNS):
             return
-        if not isinstance(node, (*_STATEMENTS, *_EXPRESSIONS, ast.FunctionDef)):
-            raise NotAllowed(f"has {_WORDS.get(type(node), type(node).__name__)}", node)
-        visit = getattr(self, f"_{type(node).__name__.lower()}", None)
+        if kind not in _ALLOWED:
+            raise NotAllowed(f"has {_WORDS.get(kind, kind)}", node)
+        visit = getattr(self, f"_{kind.lower()}", None)
         if visit is not None:
-            visit(node, may_be_text)
+            visit(node, is_text)
             return
-        texts = {id(part) for part in _texts_in(node)} if may_be_text else set()
+        if (
+            isinstance(node, ast.BinOp)
+            and isinstance(node.op, ast.Mod)
+            and isinstance(node.left, ast.Constant | ast.JoinedStr)
+        ):
+            raise NotAllowed("has % on a constant or a text", node)
+        hands_on = getattr(node, "name", "") in _REASONS or (is_text and kind in _HAND_ON.split())
         for part in ast.iter_child_nodes(node):
-            self._visit(part, id(part) in texts)
+            self._visit(part, hands_on)
 
-    # --- statements
+    def _assign(self, node: ast.Assign | ast.AnnAssign | ast.AugAssign, _: bool) -> None:
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        are_reasons = all(isinstance(target, ast.Name) and target.id in _REASONS for target in targets)
+        for part in (*targets, node.value):
+            if part is not None:
+                self._visit(part, are_reasons)
 
-    def _functiondef(self, node: ast.FunctionDef, _: bool) -> None:
-        annotations = [node.returns, *(part.annotation for part in ast.walk(node.args) if isinstance(part, ast.arg))]
-        if node.decorator_list or (any(annotations) and not self._file.postpones_annotations):
-            raise NotAllowed("has a decorator, or an annotation that is evaluated, on a function in a function", node)
-        self._lambda(node, False)
+    _annassign = _augassign = _assign
 
-    def _assign(self, node: ast.Assign, _: bool) -> None:
-        for target in node.targets:
-            if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
-                for one, value in zip(target.elts, node.value.elts, strict=False):
-                    self._sets(one, value)
-            else:
-                self._sets(target, node.value)
-
-    def _annassign(self, node: ast.AnnAssign | ast.AugAssign | ast.NamedExpr, _: bool) -> None:
-        self._sets(node.target, node.value)
-
-    _augassign = _annassign
-
-    def _namedexpr(self, node: ast.NamedExpr, may_be_text: bool) -> None:
-        self._sets(node.target, node.value)
-        self._name(ast.copy_location(ast.Name(node.target.id), node), may_be_text)
-
-    def _sets(self, target: ast.expr, value: ast.expr | None) -> None:
-        """A value goes to a local name, or into what a local name means."""
-        root = target
-        while isinstance(root, ast.Subscript):
-            self._visit(root.slice)
-            root = root.value
-        names = [root] if isinstance(root, ast.Name) else getattr(target, "elts", [None])
-        for name in (one.value if isinstance(one, ast.Starred) else one for one in names):
-            if (
-                not isinstance(name, ast.Name)
-                or not self._is_local(name.id)
-                or (root is target and len(names) != 1 and name.id in _REASONS)
-            ):
-                raise NotAllowed(f"sets {ast.unparse(target)}", target)
-        self._visit(value, isinstance(target, ast.Name) and target.id in _REASONS)
-
-    def _delete(self, node: ast.Delete, _: bool) -> None:
-        for target in node.targets:
-            self._sets(target, None)
-
-    def _return(self, node: ast.Return, may_be_text: bool) -> None:
-        self._visit(node.value, may_be_text)
-
-    def _raise(self, node: ast.Raise, _: bool) -> None:
-        if node.cause is not None or not isinstance(node.exc, ast.Call) or node.exc.keywords:
-            raise NotAllowed("raises more than an error with a text", node)
-        self._visit(node.exc.func)
-        for part in node.exc.args:
-            self._visit(part, True)
-
-    def _assert(self, node: ast.Assert, _: bool) -> None:
-        if any(isinstance(part, ast.NamedExpr) for part in ast.walk(node.test)):
-            raise NotAllowed("sets a name in an assert", node)
-        self._visit(node.test)
-        self._visit(node.msg, True)
-
-    # --- expressions
-
-    def _lambda(self, node: ast.Lambda | ast.FunctionDef, _: bool) -> None:
-        for default in (*node.args.defaults, *node.args.kw_defaults):
-            self._visit(default)
-        self._function(node)
-
-    def _listcomp(self, node: Any, may_be_text: bool) -> None:
-        self._scopes.append({name for generator in node.generators for name in _names_in(generator.target)})
-        for generator in node.generators:
-            self._sets(generator.target, None)
-            self._looked_up(generator.iter)
-            for part in generator.ifs:
-                self._visit(part)
-        self._visit(getattr(node, "key", None))
-        self._visit(node.value if isinstance(node, ast.DictComp) else node.elt, may_be_text)
-        self._scopes.pop()
-
-    _dictcomp = _generatorexp = _listcomp
-
-    def _for(self, node: ast.For, may_be_text: bool) -> None:
-        self._sets(node.target, None)
-        self._looked_up(node.iter)
-        for part in (*node.body, *node.orelse):
-            self._visit(part, may_be_text)
-
-    def _joinedstr(self, node: ast.JoinedStr, may_be_text: bool) -> None:
-        for part in node.values:
-            if isinstance(part, ast.FormattedValue):
-                computes = part.format_spec is not None and not isinstance(part.format_spec.values[0], ast.Constant)  # type: ignore[attr-defined]
-                if not may_be_text or part.conversion != -1 or computes:
-                    raise NotAllowed("uses an f-string with values for more than `reason` or `why`", node)
-                self._visit(part.value, True)
+    def _formattedvalue(self, node: ast.FormattedValue, is_text: bool) -> None:
+        if not is_text or node.conversion != -1:
+            raise NotAllowed("uses an f-string with values for more than `reason` or `why`", node)
+        self._visit(node.value, True)
+        if node.format_spec is not None:
+            self._visit(node.format_spec)
 
     def _compare(self, node: ast.Compare, _: bool) -> None:
         for op, side in zip(node.ops, node.comparators, strict=True):
-            if isinstance(op, ast.Is | ast.IsNot) and not self._is_single(side):
+            is_single = isinstance(side, ast.Constant) and (side.value is None or isinstance(side.value, bool))
+            if isinstance(op, ast.Is | ast.IsNot) and not is_single and not isinstance(self._meaning(side), Enum):
                 raise NotAllowed("compares by `is` with more than None, a truth value or an enum", node)
-            self._looked_up(side)
-        self._visit(node.left)
+        for side in (node.left, *node.comparators):
+            self._visit(side)
 
-    def _is_single(self, node: ast.expr) -> bool:
-        """Whether there is only one object of this value."""
-        if isinstance(node, ast.Constant):
-            return node.value is None or isinstance(node.value, bool)
-        return (
-            isinstance(node, ast.Attribute) and self._is_outside(node) and isinstance(_object(self._file, node), Enum)
-        )
-
-    def _binop(self, node: ast.BinOp, may_be_text: bool) -> None:
-        is_text = isinstance(node.left, ast.JoinedStr) or isinstance(getattr(node.left, "value", None), str)
-        if isinstance(node.op, ast.MatMult) or (isinstance(node.op, ast.Mod) and is_text):
-            raise NotAllowed("has % on a text, or the operator @", node)
-        for part in (node.left, node.right):
-            self._visit(part, may_be_text and isinstance(node.op, ast.Add))
-
-    def _is_local(self, name: str) -> bool:
-        return any(name in scope for scope in self._scopes)
-
-    def _is_outside(self, node: ast.AST) -> bool:
-        """Whether a dotted name is one of a module or an enum."""
-        while isinstance(node, ast.Attribute):
-            node = node.value
-        return (
-            isinstance(node, ast.Name)
-            and not self._is_local(node.id)
-            and not isinstance(_meaning(self._file, node.id, node), _Constant)
-        )
-
-    def _name(self, node: ast.Name, may_be_text: bool = False, looked_up: bool = False) -> None:
-        if node.id in _REASONS and not may_be_text:
+    def _name(self, node: ast.Name, is_text: bool) -> None:
+        if node.id in _REASONS and not is_text:
             raise NotAllowed(f"uses {node.id} for more than a reason", node)
-        if not self._is_local(node.id):
-            found = _meaning(self._file, node.id, node)
-            if isinstance(found, _Own):
-                self.reached.append(found)
-            elif found is str or found is sum or (found == _Constant(True) and not looked_up):
-                raise NotAllowed(f"hands on {node.id}", node)
+        found = self._meaning(node)
+        if found is str or found is sum or (_is_table(found) and id(node) not in self._only_looked_up):
+            raise NotAllowed(f"hands on {node.id}", node)
+        if isinstance(found, FunctionType) and not _is_listed(found):
+            self.reached.append(_undecorated(found))
 
-    def _looked_up(self, node: ast.expr) -> None:
-        """A part of which nothing but its items is used: it may be a table."""
-        if isinstance(node, ast.Name):
-            self._name(node, False, looked_up=True)
-        else:
-            self._visit(node)
-
-    def _subscript(self, node: ast.Subscript, may_be_text: bool) -> None:
-        self._looked_up(node.value)
-        self._visit(node.slice)
-
-    def _attribute(self, node: ast.Attribute, may_be_text: bool) -> None:
-        if self._is_outside(node):
-            _object(self._file, node)
+    def _attribute(self, node: ast.Attribute, is_text: bool) -> None:
+        if not isinstance(node.ctx, ast.Load):
+            raise NotAllowed(f"sets {ast.unparse(node)}", node)
+        if self._meaning(node) is not _INSIDE:
             return
-        if node.attr not in _ATTRIBUTES or (node.attr == "reason" and not may_be_text):
+        if node.attr not in _ATTRIBUTES or (node.attr == "reason" and not is_text):
             raise NotAllowed(f"uses .{node.attr}", node)
-        self._looked_up(node.value) if node.attr in ("get", "items", "values") else self._visit(node.value)
+        self._visit(node.value)
 
-    def _call(self, node: ast.Call, may_be_text: bool) -> None:
-        found: Any = None
-        if isinstance(node.func, ast.Name) and not self._is_local(node.func.id):
-            found = _meaning(self._file, node.func.id, node)
-        elif isinstance(node.func, ast.Attribute) and self._is_outside(node.func):
-            found = _object(self._file, node.func)
-        parameters = list[str]()
-        if isinstance(found, _Own):
-            parameters = [part.arg for part in (*found.function.args.posonlyargs, *found.function.args.args)]
-        elif id(found) in _SORTIES:
-            parameters = list(inspect.signature(found).parameters)
-        if found is sum and not isinstance(node.args[0], ast.GeneratorExp | ast.ListComp):  # may round otherwise
+    def _call(self, node: ast.Call, is_text: bool) -> None:
+        found, method = self._meaning(node.func), getattr(node.func, "attr", "")
+        if found is sum and not (node.args and isinstance(node.args[0], ast.GeneratorExp | ast.ListComp)):
             raise NotAllowed("adds with sum(…) in place of sortie.scenarios.plain_sum.plain_sum", node)
-        if found is str and not may_be_text:
+        if found is str and not is_text:
             raise NotAllowed("uses str(…) for more than a reason", node)
         if found is not sum and found is not str:
-            self._visit(node.func, may_be_text)
-        joins = isinstance(node.func, ast.Attribute) and node.func.attr == "join"
+            self._visit(node.func, is_text)
+        is_error = isinstance(found, type) and issubclass(found, Exception)
+        takes_texts = is_error or (is_text and (found is str or method == "join"))
+        named = list[str]()
+        if isinstance(found, FunctionType) or any(found is known for known in _SORTIES):
+            named = list(inspect.signature(found).parameters)
+        if any(isinstance(part, ast.Starred) for part in node.args):
+            named = []
         for place, part in enumerate(node.args):
-            named = parameters[place] if place < len(parameters) else ""
-            self._visit(part, named in _REASONS or (may_be_text and (joins or found is str)))
+            self._visit(part, takes_texts or (place < len(named) and named[place] in _REASONS))
         for keyword in node.keywords:
+            if keyword.arg is None or (method == "_replace" and keyword.arg not in _DECIDED):
+                raise NotAllowed(f"hands {keyword.arg or '**'} to a function", node)
             self._visit(keyword.value, keyword.arg in _REASONS)
 
 
-def _texts_in(node: ast.AST) -> Iterable[ast.AST]:
-    """The parts of which an expression or a statement is made, where these may be texts."""
+def _looked_up_in(node: ast.AST) -> list[ast.expr]:
+    """The parts of which nothing but items is used: they may be tables."""
     match node:
-        case ast.BoolOp(values=[*_, last]):
-            return (last,)
-        case ast.IfExp(body=body, orelse=other):
-            return (body, other)
-        case ast.If(body=parts, orelse=others) | ast.While(body=parts, orelse=others):
-            return (*parts, *others)
-        case ast.Match(cases=cases):
-            return cases
-        case ast.match_case(body=parts):
+        case ast.Subscript(value=part, ctx=ast.Load()) | ast.For(iter=part) | ast.comprehension(iter=part):
+            return [part]
+        case ast.Attribute(value=part, attr="get" | "items" | "keys" | "values"):
+            return [part]
+        case ast.Compare(comparators=parts):
             return parts
-        case ast.List(elts=parts) | ast.Tuple(elts=parts):
-            return parts
-    return ()
-
-
-def _bound(node: ast.AST, within: bool = False) -> Iterator[str]:
-    """The names that a part of a function binds in it; `within` a comprehension only `:=` does."""
-    match node:
-        case ast.Name(id=name, ctx=ast.Store() | ast.Del()) if not within:
-            yield name
-        case ast.NamedExpr(target=ast.Name(id=name)) | ast.FunctionDef(name=name) | ast.MatchAs(name=str(name)):
-            yield name
-    if not isinstance(node, ast.FunctionDef | ast.Lambda):
-        for part in ast.iter_child_nodes(node):
-            yield from _bound(part, within or isinstance(node, _COMPREHENSIONS))
+    return []

@@ -36,16 +36,16 @@ from sortie.policies.verification.invariants.language import Invariant, Invarian
 from sortie.policies.verification.kit.drawn import TRIED_VIEWS, Drawn
 from sortie.policies.verification.kit.single_view import PLANE, Property, check_property, property_of
 from sortie.policies.verification.proof.allowed import why_not_provable
-from sortie.policies.verification.proof.search import Found, Searched, Stopped, search_size
+from sortie.policies.verification.proof.search import Found, MakePath, Searched, Stopped, search_size
 from sortie.policies.verification.proof.solver import solver_paths
-from sortie.policies.verification.proof.symbols import Combined, Refused
+from sortie.policies.verification.proof.symbols import Combined, Path, Refused
 
 DRONES = 5
 """The largest fleet that a proof covers if nothing else is asked for."""
-PLANE_S, SEARCH_S = 4.0, 7.0
-"""Processor time for the search of the plane's properties, and of each invariant, if nothing else is asked for."""
-WITH_FAULT_S = 6.0
-"""Processor time for the whole search once it has found a fault."""
+PLANE_CELLS, RULE_CELLS = 25_000, 40_000
+"""Cells for the search of the plane's properties, and for each invariant, if nothing else is asked for."""
+WITH_FAULT_CELLS = 20_000
+"""Cells for the whole search once it has found a fault."""
 
 Outcome = Literal["proved", "refuted", "tried"]
 _NOT_REPEATED = "not the same for the same view: it fails on this view only sometimes"
@@ -69,7 +69,7 @@ def prove(
     *,
     max_drones: int = DRONES,
     period_s: float = 0.1,
-    budget_s: float | None = None,
+    cells: int | None = None,
     seed: int = 0,
     views: int = TRIED_VIEWS,
 ) -> list[ProofVerdict]:
@@ -80,8 +80,8 @@ def prove(
         invariants: what it must keep too.
         max_drones: fleets of 1 to this many drones are searched; each drone multiplies the cells by about ten.
         period_s: the plane's period.
-        budget_s: processor time for the search of all properties together; None: `PLANE_S`, and `SEARCH_S` for each
-            invariant. Drawn views of all properties get as much again, and at least `drawn.LEAST_S`.
+        cells: how many the search of all properties together may visit; None: `PLANE_CELLS`, and `RULE_CELLS` for each
+            invariant.
         seed: of the drawn views on which every property is tried that no search refuted.
         views: how many of them, besides a few of large fleets; 0 for none at all.
 
@@ -95,12 +95,12 @@ def prove(
         if rule.over_time:
             raise InvariantError(f"{rule.text!r} is about time: a single view does not decide it")
     properties = [*PLANE, *(property_of(i) for i in invariants)]
-    budget_s = PLANE_S + SEARCH_S * len(invariants) if budget_s is None else budget_s
+    budget = Budget(PLANE_CELLS + RULE_CELLS * len(invariants) if cells is None else cells)
     drawn = Drawn(policy, invariants, seed, views)
     searched = {prop: Searched(prop.name) for prop in properties}
-    coverage = _search(policy, searched, max_drones, period_s, budget_s)
+    coverage = _search(policy, searched, max_drones, period_s, budget)
     left = [prop for prop in properties if searched[prop].fault is None]
-    faults = drawn.first_faults(left, budget_s)
+    faults = drawn.first_faults(left)
     verdicts = []
     for prop, found in searched.items():
         shown = None if found.fault is not None else faults[prop].view
@@ -125,7 +125,7 @@ class _Coverage:
         """Why nothing is proved."""
 
     def text(self, found: Searched) -> str:
-        ended = "" if self.drones == self.asked else f"; the time ended in fleets of {self.drones + 1}"
+        ended = "" if self.drones == self.asked else f"; the budget ended in fleets of {self.drones + 1}"
         reals = "" if self.exact else ", sums and products without rounding"
         return (
             f"all views of up to {self.drones} drones, at a period of {self.period_s:g} s, detached after "
@@ -134,9 +134,9 @@ class _Coverage:
 
 
 def _search(
-    policy: Policy, properties: Mapping[Property, Searched], max_drones: int, period_s: float, budget_s: float
+    policy: Policy, properties: Mapping[Property, Searched], max_drones: int, period_s: float, budget: Budget
 ) -> _Coverage:
-    """Search fleet by fleet until all is covered, the time is over, or the policy cannot be followed."""
+    """Search fleet by fleet until all is covered, the budget is spent, or the policy cannot be followed."""
     coverage = _Coverage(max_drones, period_s)
     coverage.why = why_not_provable(policy)
     if coverage.why:
@@ -147,10 +147,10 @@ def _search(
         prop = next(p for p, s in properties.items() if s is searched)
         shows = check_property(prop, policy, fault.view, fault.raised_age_s) is not None
         if shows:  # a faulty policy will be searched again
-            budget.budget_s = min(budget.budget_s, WITH_FAULT_S)
+            budget.units = min(budget.units, WITH_FAULT_CELLS)
         return shows
 
-    make, budget = None, Budget(budget_s)
+    make: MakePath = Path
     try:
         for drones in range(1, max_drones + 1):
             try:
@@ -162,7 +162,7 @@ def _search(
             coverage.drones = drones
     except Stopped:
         if coverage.drones < min(2, max_drones):
-            coverage.why = f"has more cells than {budget_s:g} s of processor time reach"
+            coverage.why = f"has more cells than the budget of {budget.units:,.0f}"
     except Refused as refused:
         coverage.why = str(refused)
     return coverage

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, NoReturn
 
-import numpy as np
-
 from sortie.policies import geometry
 from sortie.policies.contract import COVERAGE_BYTES, Descriptor, Disc, FleetView, LinkState, TaskPhase
-from sortie.policies.geometry import peers_by_overlap
 from sortie.policies.verification.kit.views import LONGEST_S, OTHER_CODEBOOK
 from sortie.policies.verification.proof.stand_ins import (
     FLAGS,
@@ -23,9 +19,7 @@ from sortie.policies.verification.proof.stand_ins import (
     InAnyOrder,
     Space,
     TargetIds,
-    Unsearchable,
     flag_axis,
-    is_blind,
     orders,
     space_of,
 )
@@ -50,7 +44,13 @@ class FleetOfRanges:
         self.path, self.drones, self.ego, self.heard, self.period_s = path, drones, ego, heard, period_s
         self.peers = tuple(i for i in heard if i != ego)
         self.is_older = False
-        self._descriptors: Mapping[int, Any] | None = None
+        self.shows_order = True
+        """Whether the run forks where the order of the drones in the view is read."""
+        self._descriptors = self.in_any_order({i: DescriptorOfRanges(self, i) for i in heard})
+
+    def in_any_order(self, content: Mapping[int, Any]) -> Mapping[int, Any]:
+        """A mapping by drone that can be read only."""
+        return MappingProxyType(InAnyOrder(self, content))
 
     def view(self) -> FleetView:
         """The view; its mappings can be read only, as in flight."""
@@ -61,9 +61,7 @@ class FleetOfRanges:
         return self._view(dict.fromkeys(self.heard, 0.0))
 
     def _view(self, age_s: dict[int, Any]) -> FleetView:
-        if self._descriptors is None:
-            self._descriptors = _in_any_order(self, {i: DescriptorOfRanges(self, i) for i in self.heard})
-        return ViewOfRanges(self.ego, self.period_s, self._descriptors, _in_any_order(self, age_s))
+        return ViewOfRanges(self.ego, self.period_s, self._descriptors, self.in_any_order(age_s))
 
     def _age(self, i: int) -> Ranged:
         return self.path.number(f"age_s of drone {i}", 0.0, _SEARCHED_UP_TO["age"])
@@ -83,23 +81,26 @@ class FleetOfRanges:
 
     @contextmanager
     def ranked(self) -> Iterator[None]:
-        """Within it, `peers_by_overlap` ranks plain views as this run ranked its own.
+        """Within it, `peers_by_overlap` ranks views by the orders of this run: stand-ins fork it, plain views follow it.
 
-        A run may rank the peers of several drones. The positions of its example show the first of these orders.
+        A run may rank the peers of several drones. The positions of its example show the first of these orders, the
+        others are searched as if they were independent of it. Some pairs of orders have no geometry.
         """
-        picks, usual, placed = self.path.picks, geometry.rank_loop, self._placed
+        usual, placed = geometry.ranking, self._placed
 
-        def ranked(of: int, ids: Any, *circles: Any) -> Any:
-            label = _order_of(of)
-            if label == placed or label not in picks:
-                return usual()(of, ids, *circles)
-            return np.array([p for p in picks[label] if p in ids])
+        def ranking(view: FleetView, of: int) -> list[int]:
+            label, picks = _order_of(of), self.path.picks
+            if isinstance(view, ViewOfRanges):
+                self.path.pick(label, orders(tuple(i for i in self.heard if i != of)))
+            elif label == placed or label not in picks:
+                return usual(view, of)
+            return [p for p in picks[label] if p in view.descriptors]
 
-        geometry.rank_loop = lambda: ranked  # type: ignore[assignment]
+        geometry.ranking = ranking
         try:
             yield
         finally:
-            geometry.rank_loop = usual
+            geometry.ranking = usual
 
     @property
     def _placed(self) -> str:
@@ -176,87 +177,59 @@ class FleetOfRanges:
         return raised
 
 
-def _refused(name: str) -> Any:
-    """A field that cannot be searched."""
-    return property(lambda descriptor: _refusing(descriptor, name))
+class DescriptorOfRanges:
+    """A descriptor with ranges as fields. Fields without order fork the run; fields that cannot be searched refuse."""
 
-
-def _share(name: str) -> Any:
-    """A field between 0 and 1."""
-    return property(lambda descriptor: descriptor._number(name, 0.0, 1.0))
-
-
-class DescriptorOfRanges(Descriptor):
-    """A descriptor with ranges as fields. Fields without order fork the run; fields that cannot be searched raise `Refused`.
-
-    It is a `Descriptor`, so indices, patterns, its length and assignments answer as in flight. What is stored in the
-    tuple itself refuses every use; all reading goes through the properties.
-    """
-
-    __slots__ = ()
-
-    def __new__(cls, system: FleetOfRanges, agent_id: int) -> DescriptorOfRanges:
-        stored = [Unsearchable(system, agent_id, name) for name in Descriptor._fields]
-        return tuple.__new__(cls, stored)
-
-    @property
-    def _origin(self) -> Unsearchable:
-        found: Unsearchable = tuple.__getitem__(self, 0)  # type: ignore[assignment]
-        return found
+    def __init__(self, system: FleetOfRanges, agent_id: int) -> None:
+        self._system, self.agent_id = system, agent_id
 
     def _number(self, name: str, low: float, high: float) -> Any:
-        origin = self._origin
-        return origin.system.path.number(f"{name} of drone {origin.drone}", low, high)
+        return self._system.path.number(f"{name} of drone {self.agent_id}", low, high)
 
     @property
-    def agent_id(self) -> int:
-        return self._origin.drone
+    def battery_soc(self) -> Any:
+        return self._number("battery_soc", 0.0, 1.0)
 
-    battery_soc = _share("battery_soc")
-    cpu_headroom = _share("cpu_headroom")
-    gpu_headroom = _share("gpu_headroom")
+    @property
+    def cpu_headroom(self) -> Any:
+        return self._number("cpu_headroom", 0.0, 1.0)
+
+    @property
+    def gpu_headroom(self) -> Any:
+        return self._number("gpu_headroom", 0.0, 1.0)
 
     @property
     def peer_goodput_mbps(self) -> tuple[Any, ...]:
-        system, me = self._origin.system, self._origin.drone
-        others = (i for i in range(system.drones) if i != me)
-        return tuple(self._number_to(other) for other in others)
+        return tuple(self.goodput_to(other) for other in range(self._system.drones) if other != self.agent_id)
 
-    def _number_to(self, other: int) -> Any:
-        return self._origin.system.path.number(goodput_axis(self._origin.drone, other), 0.0, _SEARCHED_UP_TO["goodput"])
+    def goodput_to(self, peer: int) -> Any:
+        if type(peer) is not int or not 0 <= peer < self._system.drones:
+            self._refuse("goodput to a drone outside the fleet")
+        axis = goodput_axis(self.agent_id, peer)
+        return 0.0 if peer == self.agent_id else self._system.path.number(axis, 0.0, _SEARCHED_UP_TO["goodput"])
 
     def link_state(self, peer: int) -> LinkState:
         return state_of(self.goodput_to(peer))
 
-    def goodput_to(self, peer: int) -> Any:
-        # a drone off a roster reads 0, which is in the range too
-        if type(peer) is not int or not 0 <= peer < self._origin.system.drones:
-            self._origin._reached()
-        return 0.0 if peer == self._origin.drone else self._number_to(peer)
-
-    def counts(self, drone: int) -> bool:
-        return _refusing(self, "roster")
-
     @property
     def task_phase(self) -> TaskPhase:
-        path: Path = self._origin.system.path
-        return path.pick(f"task_phase of drone {self._origin.drone}", tuple(TaskPhase))
+        return self._system.path.pick(f"task_phase of drone {self.agent_id}", tuple(TaskPhase))
 
     @property
     def feature_space(self) -> Any:
-        return Space(self._origin.system, self._origin.drone)
+        return Space(self._system, self.agent_id)
 
     @property
     def codebook(self) -> Any:
-        return Space(self._origin.system, self._origin.drone, "codebook")
+        return Space(self._system, self.agent_id, "codebook")
 
     @property
     def novelty_flags(self) -> Any:
-        return Flags(self._origin.system.path, self._origin.drone)
+        return Flags(self._system.path, self.agent_id)
 
     @property
     def region(self) -> Disc | None:
-        if not self._origin.system.path.pick(f"region of drone {self._origin.drone}", (False, True)):
+        if not self._system.path.pick(f"region of drone {self.agent_id}", (False, True)):
             return None
         return Disc(
             self._number("region x_m", -1e5, 1e5),
@@ -266,101 +239,56 @@ class DescriptorOfRanges(Descriptor):
 
     @property
     def priority_target_ids(self) -> Any:
-        return TargetIds(self._number("targets", 0, 16), self._origin.system.path)
+        return TargetIds(self._number("targets", 0, 16), self._system.path)
 
-    @property
-    def position_m(self) -> tuple[float, float, float]:
-        receiver = self._only_for_order("position_m")
-        system = self._origin.system
-        peers = tuple(i for i in system.heard if i != receiver)
-        order = system.path.pick(_order_of(receiver), orders(peers))
-        return _places(receiver, order)[self._origin.drone]
-
-    @property
-    def footprint_radius_m(self) -> float:
-        self._only_for_order("footprint_radius_m")
-        return _FOOTPRINT_M
-
-    def _only_for_order(self, field: str) -> int:
-        """The drone whose peers are ranked. Geometry may only be read through `peers_by_overlap`, for the order alone.
-
-        The orders of two receivers are searched as if they were independent. Some pairs of orders have no geometry.
-        """
-        frame = sys._getframe(2)
-        while frame is not None:
-            if frame.f_code is peers_by_overlap.__code__:
-                return int(frame.f_locals["of"])
-            frame = frame.f_back  # type: ignore[assignment]
-        self._origin.system.path.refuse(f"reads {field} without peers_by_overlap")
-
-    def __getitem__(self, at: Any) -> Any:
-        return getattr(self, Descriptor._fields[at]) if type(at) is int else self._whole()
-
-    def __iter__(self) -> Any:
-        return (getattr(self, name) for name in Descriptor._fields)
+    def __getitem__(self, at: int) -> Any:
+        return getattr(self, Descriptor._fields[at])
 
     def __eq__(self, other: object) -> bool:
-        return self is other or self._whole()
+        return self is other or self._refuse("a whole descriptor")
 
-    def __ne__(self, other: object) -> bool:
-        return not self.__eq__(other)
+    def __getattr__(self, name: str) -> NoReturn:
+        by_rank = name in ("position_m", "footprint_radius_m")
+        self._system.path.refuse(
+            f"reads {name}{' without peers_by_overlap' if by_rank else ', which cannot be searched'}"
+        )
 
-    def _whole(self, *_: object, **__: object) -> NoReturn:
-        path: Path = self._origin.system.path
-        path.refuse("uses a whole descriptor, which cannot be searched")
-
-    __lt__ = __le__ = __gt__ = __ge__ = __add__ = __radd__ = __mul__ = __rmul__ = __contains__ = __hash__ = __repr__ = (
-        _whole
-    )
-    __reduce__ = __reduce_ex__ = __getnewargs__ = __copy__ = __deepcopy__ = count = index = _whole
-    _replace = _asdict = _make = with_roster = goodput_by_id = _whole
-
-    coverage_corner = _refused("coverage_corner")
-    stamp_ns = _refused("stamp_ns")
-    orientation_xyzw = _refused("orientation_xyzw")
-    velocity_mps = _refused("velocity_mps")
-    coverage_grid = _refused("coverage_grid")
-    roster = _refused("roster")
-
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:
-        return Descriptor
+    _refuse = __getattr__
 
 
-def _refusing(descriptor: DescriptorOfRanges, name: str) -> NoReturn:
-    path: Path = descriptor._origin.system.path
-    path.refuse(f"reads {name}, which cannot be searched")
+def _without_order(name: str) -> Any:
+    """A property of `FleetView` that does not depend on the order of drones, so that it does not fork the run."""
+
+    def read(view: Any) -> Any:
+        system = view.descriptors[view.ego]._system
+        shown, system.shows_order = system.shows_order, False
+        try:
+            return getattr(FleetView, name).fget(view)
+        finally:
+            system.shows_order = shown
+
+    return property(read)
 
 
 class ViewOfRanges(FleetView):
-    """A view over ranges. As in flight its mappings can be read only, those of `attached` peers cannot. They have any order."""
+    """A view over ranges. Its mappings can be read only, and have any order."""
 
     __slots__ = ()
 
-    def _replace(self, **fields: Any) -> Any:
-        if not is_blind(sys._getframe(1)):
-            self.descriptors[self.ego]._origin.system.path.refuse("makes a view of its own")  # type: ignore[attr-defined]
-        return FleetView._replace(self, **fields)
+    peers = _without_order("peers")
+    human_in_region = _without_order("human_in_region")
+    _near = _without_order("attached")
 
     @property
-    def attached(self) -> FleetView:
-        near: FleetView = FleetView.attached.fget(_without_order(self))  # type: ignore[attr-defined]
+    def attached(self) -> ViewOfRanges:
+        near = self._near
         if len(near.age_s) == len(self.age_s):
             return self
-        system = self.descriptors[self.ego]._origin.system  # type: ignore[attr-defined]
-        descriptors, age_s = (InAnyOrder(system.path, m, system.heard) for m in (near.descriptors, near.age_s))
-        return FleetView._replace(self, descriptors=descriptors, age_s=age_s)  # which can be changed, as in flight
-
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:
-        return FleetView
-
-
-def _without_order(view: FleetView) -> FleetView:
-    """The view by ascending id, which no policy may see."""
-    descriptors = {i: view.descriptors[i] for i in sorted(view.descriptors)}
-    age_s = {i: view.age_s[i] for i in sorted(view.age_s)}
-    return FleetView(view.ego, view.period_s, descriptors, age_s, view.detached_after_periods)
+        system: Any = near.descriptors[self.ego]._system
+        found: ViewOfRanges = self._replace(
+            descriptors=system.in_any_order(near.descriptors), age_s=system.in_any_order(near.age_s)
+        )
+        return found
 
 
 _ORDER = "peers by overlap with drone "
@@ -378,10 +306,6 @@ def goodput_axis(source: int, destination: int) -> str:
 def region_axes(drone: int) -> list[str]:
     """The names of the axes of a drone's region."""
     return [f"region {part} of drone {drone}" for part in Disc._fields]
-
-
-def _in_any_order(system: FleetOfRanges, content: Mapping[int, Any]) -> Mapping[int, Any]:
-    return MappingProxyType(InAnyOrder(system.path, content, system.heard))
 
 
 @lru_cache(maxsize=4096)

@@ -15,9 +15,13 @@ from typing import Any, NamedTuple
 from sortie.policies.contract import Directive, Disc, FleetView, Policy
 from sortie.policies.verification.budget import Budget
 from sortie.policies.verification.proof.ranges import FleetOfRanges
-from sortie.policies.verification.proof.symbols import Path, Ranged, Refused, explore
+from sortie.policies.verification.proof.symbols import Combined, Path, Ranged, Refused, explore
+from sortie.policies.verification.subject import function_of
+from sortie.scenarios.plugins.user_calls import Guarded
 
 MakePath = Callable[[Sequence[int]], Path]
+QUESTION = 5
+"""A question to the solver counts as so many cells."""
 
 
 class Found(NamedTuple):
@@ -39,7 +43,7 @@ class Searched:
 
 
 class Stopped(Exception):
-    """The time budget ended the search."""
+    """The budget ended the search."""
 
 
 Complaint = Callable[[Policy, Any], str | None]
@@ -53,7 +57,7 @@ def search_size(
     drones: int,
     period_s: float,
     budget: Budget,
-    make: MakePath | None = None,
+    make: MakePath = Path,
 ) -> bool:
     """Search all views of fleets of one size.
 
@@ -63,7 +67,7 @@ def search_size(
         confirm: whether a cell's plain view shows the fault as well.
         drones: the size.
         period_s: the plane's period.
-        budget: the time.
+        budget: in cells; a run of the policy counts as one, too.
         make: makes the paths; left out, ranges of single inputs.
 
     Returns:
@@ -71,7 +75,7 @@ def search_size(
 
     Raises:
         Refused: the policy cannot be followed.
-        Stopped: the time is over.
+        Stopped: the budget is spent.
     """
     exact = True
     for ego, heard in rosters(drones):
@@ -81,6 +85,7 @@ def search_size(
 
         for path, found in explore(run, make):
             found.compare()
+            budget.spend(1 + QUESTION * path.questions)
             for searched, complaint in properties:
                 if searched.fault is None and not searched.unclear:
                     _search_cell(path, found, searched, complaint, confirm, budget)
@@ -109,23 +114,25 @@ def _search_cell(
         except Exception as error:
             return f"raises {type(error).__name__}"
 
-    for wrong in path.within(act):
-        searched.cells += 1
-        if path.refusal is not None:
-            why, path.refusal = path.refusal, None
-            if path.combines is not None:
-                raise Refused(why)
-            searched.unclear = why
-            return
-        if wrong is not None:
-            fault = Found(found.system.example(), found.system.raised_example())
-            if confirm(searched, fault):
-                searched.fault = fault
-            else:
-                searched.unclear = f"the search finds a fault that no plain view shows ({wrong})"
-            return
-        if budget.is_spent:
-            raise Stopped
+    asked = path.questions
+    try:
+        for wrong in path.within(act):
+            searched.cells += 1
+            budget.spend(1 + QUESTION * (path.questions - asked))
+            asked = path.questions
+            if wrong is not None:
+                fault = Found(found.system.example(), found.system.raised_example())
+                if confirm(searched, fault):
+                    searched.fault = fault
+                else:
+                    searched.unclear = f"the search finds a fault that no plain view shows ({wrong})"
+                return
+            if budget.is_spent:
+                raise Stopped
+    except Combined:
+        raise
+    except Refused as refused:
+        searched.unclear = str(refused)
 
 
 class Run:
@@ -133,14 +140,23 @@ class Run:
 
     def __init__(self, policy: Policy, system: FleetOfRanges) -> None:
         self._policy, self.system = policy, system
+        self._is_users = isinstance(function_of(policy), Guarded)
         self._view = system.view()
-        self._fresh: Any = None
         self.answer: Any = None
         self.error: Exception | None = None
         try:
-            self.answer = policy(self._view)
+            self.answer = self._ask(self._view)
         except Exception as error:  # the policy's fault or the stand-ins': the plain view decides
             self.error = error
+
+    def _ask(self, view: FleetView) -> Any:
+        """What the policy decides. Only a user's may depend on the order of drones; the kit tests it of Sortie's own."""
+        self.system.shows_order = self._is_users
+        try:
+            with self.system.ranked():
+                return self._policy(view)
+        finally:
+            self.system.shows_order = False
 
     def now(self) -> FleetView:
         """The view itself."""
@@ -157,7 +173,7 @@ class Run:
     def decide(self, view: FleetView, /) -> Any:
         """What the policy decided on the view itself, or decides on another one."""
         if view is not self._view:
-            return self._policy(view)
+            return self._ask(view)
         if self.error is not None:
             raise self.error
         return self.answer
@@ -180,8 +196,7 @@ class Run:
         if view is None:
             self.system.path.refuse("compares sums or products so closely that floats show no example")
         try:
-            with self.system.ranked():
-                real = self._policy(view)
+            real = self._ask(view)
         except Exception as error:
             if self.error is None or type(error) is not type(self.error):
                 self.system.path.refuse(f"raises {type(error).__name__} on real objects alone")

@@ -14,16 +14,17 @@ import operator
 import random
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
 from typing import Any
 
-from sortie.policies.verification.proof.symbols import LONGEST_TEXT, MARK, Path, Ranged, Refused
+from sortie.policies.verification.proof.symbols import LONGEST_TEXT, Path, Ranged, Refused
 
 STEP = 3_000_000
 """The most steps of the solver, as it counts them (`rlimit`), for one question."""
-_EXAMPLES = 60
-"""How many examples of a run are tried before none is found that floats do not round out of it."""
-_LEAST_MARGIN = 1e-13
-"""Numbers that are closer in all examples cannot be kept apart."""
+_ROUNDED = 16
+"""At so many other places of a run it is tried whether floats decide there as the reals do."""
+_MARGINS = (1e-3, 1e-6, 1e-9, 1e-12, 0.0)
+"""By so much an example keeps numbers apart, if floats round a closer one out of its run."""
 
 
 _Compared = tuple[Callable[[Any, Any], Any], Any, Any, bool]
@@ -60,8 +61,6 @@ class SolvedPath(Path):
         self._terms: dict[str, Any] = {}
         self._model: Any = None
         """Values that satisfy all facts so far, which answer one side of most questions."""
-        self._computed: list[tuple[Callable[..., Any], Sequence[Any]]] = []
-        """Of each number that is no plain input: how the policy computes it, and from what."""
         self._compared: list[_Compared] = []
         """The comparisons of the run."""
 
@@ -92,6 +91,7 @@ class SolvedPath(Path):
     def _possible(self, fact: Any) -> bool:
         if self._model is not None and self.z3.is_true(self._model.eval(fact, model_completion=True)):
             return True
+        self.questions += 1
         self._solver.push()
         self._solver.add(fact)
         answer = self._solver.check()
@@ -103,18 +103,13 @@ class SolvedPath(Path):
             self._model = model
         return model is not None
 
-    def compares(self, make: Callable[[Any, Any], Any], one: Solved, other: Any, term: Any) -> bool:
+    def compares(self, act: Callable[[Any, Any], Any], one: Solved, other: Any, term: Any) -> bool:
         """The result of a comparison with another number, of which `term` is the term."""
-        found = self._holds(make(one._term, term))
-        self._compared.append((make, one, other, found))
+        found = self.holds(act(one._term, term))
+        self._compared.append((act, one, other, found))
         return found
 
-    def computes(self, act: Callable[..., Any], given: Sequence[Any]) -> int:
-        """Keep how a number is computed, and return its place among such numbers."""
-        self._computed.append((act, given))
-        return len(self._computed) - 1
-
-    def _holds(self, fact: Any) -> bool:
+    def holds(self, fact: Any) -> bool:
         """Whether a fact holds. If both are possible, the run takes a side."""
         not_so = self.z3.Not(fact)
         if not self._possible(fact):
@@ -165,68 +160,57 @@ class SolvedPath(Path):
     def corner(self, system: Any, choose: Callable[[str, float, float], float]) -> Any:
         """A plain view on which floats give the policy's comparisons the same results; None if no such view was found."""
         draw = random.Random(str(self.taken))  # noqa: S311
-        close: list[_Compared] = []
-        margin = 1e-3
-        for _ in range(_EXAMPLES):
-            found = {axis: self.bounds(axis, 0.0)[0] for axis in self.ranges}
-            if margin < _LEAST_MARGIN:
-                found = {axis: self._moved(axis, x, draw) for axis, x in found.items()}
-            values = {axis: choose(axis, x, x) for axis, x in found.items()}
-            others = self._others_in_floats(values)
-            if not others:
-                return system.example(lambda axis, low, _, values=values: values.get(axis, low))
-            close += others
-            while margin >= _LEAST_MARGIN and not self._keeps_apart(close, margin):
-                margin /= 1e3
-        return None
+        values = self._present()
+        for _ in range(0 if self.exact else _ROUNDED):
+            free = [axis for axis, (low, _) in self.ranges.items() if isinstance(low, float) and draw.random() < 0.8]
+            other = values | {axis: draw.uniform(*self.ranges[axis]) for axis in free}
+            if self._decides_alike({axis: Fraction(x) for axis, x in other.items()}) and not self._decides_alike(other):
+                values = other  # only rounding makes the difference
+                break
+        else:
+            for margin in _MARGINS:
+                if self._decides_alike(values):
+                    break
+                values = self._present(margin)
+            else:
+                return None
+        shown = {axis: choose(axis, x, x) for axis, x in values.items()}
+        return system.example(lambda axis, low, _: shown.get(axis, low))
 
-    def _keeps_apart(self, close: Sequence[_Compared], margin: float) -> bool:
-        """Whether the run has an example in which these comparisons have a margin. It becomes the present one."""
-        least = self.constant(margin)
-        self._solver.push()
-        for act, a, b, result in close:
-            one, other = self._term_of(a), self._term_of(b)
-            sides = ((one, other, act(0, 1)), (other, one, act(1, 0)))
-            self._solver.add(self.z3.Or(*[low + least <= high for low, high, holds in sides if holds == result]))
-        is_possible: bool = self._solver.check() == self.z3.sat
-        if is_possible:
-            self._model = self._solver.model()
-        self._solver.pop()
-        return is_possible
+    def _present(self, margin: float = 0.0) -> dict[str, float]:
+        """The present example, or one in which no two numbers that the run compares are closer than this, if there is one."""
+        if margin:
+            least = self.constant(margin)
+            self._solver.push()
+            for act, a, b, result in self._compared:
+                one, other = self._term_of(a), self._term_of(b)
+                sides = ((one, other, act(0, 1)), (other, one, act(1, 0)))
+                self._solver.add(self.z3.Or(*[low + least <= high for low, high, holds in sides if holds == result]))
+            if self._solver.check() == self.z3.sat:
+                self._model = self._solver.model()
+            self._solver.pop()
+        return {axis: self.bounds(axis, 0.0)[0] for axis in self.ranges}
 
     def _term_of(self, number: Any) -> Any:
         return number._term if isinstance(number, Solved) else self.constant(number)
 
-    def _moved(self, axis: str, value: float, draw: random.Random) -> float:
-        """A number of an axis near another one, be it by a few floats; every second time the same."""
-        low, high = self.ranges[axis]
-        if isinstance(low, int) or draw.random() < 0.5:
-            return value
-        moved = value + max(abs(value), 1e-3) * draw.choice((-1, 1)) * 10 ** draw.uniform(-17.0, 0.0)
-        return min(max(draw.choice((moved, round(moved * 1024) / 1024)), low), high)
+    def _decides_alike(self, values: Mapping[str, Any]) -> bool:
+        """Whether the run's comparisons have the same results where its inputs have these values, computed as the policy does."""
+        try:
+            return all(act(value_of(a, values), value_of(b, values)) == result for act, a, b, result in self._compared)
+        except (ArithmeticError, ValueError):  # a divisor that is zero
+            return False
 
-    def _others_in_floats(self, values: Mapping[str, float]) -> list[_Compared]:
-        """The comparisons that have another result in floats.
 
-        All numbers of the run are computed from its inputs, rounded as the policy rounds.
-        """
-        self._floats = []
-        for act, given in self._computed:
-            try:
-                self._floats.append(act(*[self.value_of(x, values) for x in given]))
-            except (ArithmeticError, ValueError):  # a divisor that is zero, which another comparison excludes
-                self._floats.append(math.nan)
-        return [
-            (act, a, b, result)
-            for act, a, b, result in self._compared
-            if act(self.value_of(a, values), self.value_of(b, values)) != result
-        ]
-
-    def value_of(self, number: Any, values: Mapping[str, float]) -> float:
-        """A number where the inputs have the values of the last example."""
-        if not isinstance(number, Solved):
-            return number  # type: ignore[no-any-return]
-        return values[number._axis] if number._place is None else self._floats[number._place]
+def value_of(number: Any, values: Mapping[str, Any]) -> Any:
+    """A number where the inputs have these values; fractions give exact results, floats rounded ones."""
+    if not isinstance(number, Solved):
+        exact = any(isinstance(x, Fraction) for x in values.values())
+        return Fraction(number) if exact else number
+    if number._made is None:
+        return values[number._axis]
+    act, given = number._made
+    return act(*[value_of(x, values) for x in given])
 
 
 _LARGEST = sys.float_info.max / 2
@@ -236,11 +220,12 @@ _LARGEST = sys.float_info.max / 2
 class Solved(Ranged):
     """A number with a term over the inputs of its path."""
 
-    __slots__ = ("_most", "_place", "_term")
+    __slots__ = ("_made", "_most", "_term")
 
-    def __init__(self, path: SolvedPath, axis: str, term: Any, most: float, place: int | None = None) -> None:
+    def __init__(self, path: SolvedPath, axis: str, term: Any, most: float, made: Any = None) -> None:
         super().__init__(path, axis)
-        self._term, self._place = term, place
+        self._term, self._made = term, made
+        """How the policy computes it, and from what; None for an input."""
         self._most = most
         """It is no farther from 0 than this."""
 
@@ -256,40 +241,32 @@ class Solved(Ranged):
             path.refuse(f"computes with {c} and {self._axis}")
         return c, path.constant(c)
 
-    def _compare(self, other: object, make: Callable[[Any, Any], Any], infinite: Callable[[float, float], bool]) -> Any:
+    def _ask(self, other: object, act: Callable[[Any, Any], Any]) -> Any:
         if type(other) is float and not math.isfinite(other):
-            return infinite(0.0, other)
+            return act(0.0, other)
         number, term = self._other(other)
         path: Any = self._path
-        return NotImplemented if term is None else path.compares(make, self, number, term)
+        return NotImplemented if term is None else path.compares(act, self, number, term)
 
     def __lt__(self, other: object) -> Any:
-        return self._compare(other, lambda a, b: a < b, lambda a, b: a < b)
+        return self._ask(other, operator.lt)
 
     def __le__(self, other: object) -> Any:
-        return self._compare(other, lambda a, b: a <= b, lambda a, b: a <= b)
+        return self._ask(other, operator.le)
 
     def __gt__(self, other: object) -> Any:
-        return self._compare(other, lambda a, b: a > b, lambda a, b: a > b)
+        return self._ask(other, operator.gt)
 
     def __ge__(self, other: object) -> Any:
-        return self._compare(other, lambda a, b: a >= b, lambda a, b: a >= b)
+        return self._ask(other, operator.ge)
 
     def __eq__(self, other: object) -> Any:
-        return self._compare(other, lambda a, b: a == b, lambda a, b: a == b)
-
-    def __ne__(self, other: object) -> Any:
-        equal = self.__eq__(other)
-        return equal if equal is NotImplemented else not equal
+        return self._ask(other, operator.eq)
 
     __hash__ = Ranged.__hash__  # type: ignore[assignment]
 
     def _combined(
-        self,
-        other: object,
-        make: Callable[[Any, Any], Any],
-        act: Callable[[Any, Any], Any],
-        most: Callable[[float, float], float] | None = None,
+        self, other: object, act: Callable[[Any, Any], Any], most: Callable[[float, float], float] | None = None
     ) -> Any:
         """A number of two. `most` bounds how far it is from 0, by how far they are; None asks the solver."""
         number, term = self._other(other)
@@ -297,78 +274,60 @@ class Solved(Ranged):
             return NotImplemented
         self._path.exact = False
         others = number._most if isinstance(number, Solved) else abs(number)
-        return self._made(
-            make(self._term, term), act, (self, number), math.inf if most is None else most(self._most, others)
-        )
+        bound = math.inf if most is None else most(self._most, others)
+        return self._new(act(self._term, term), act, (self, number), bound)
 
-    def _made(self, term: Any, act: Callable[..., Any], given: Sequence[Any], most: float) -> Solved:
+    def _new(self, term: Any, act: Callable[..., Any], given: Sequence[Any], most: float) -> Solved:
         """A number that the policy computes by `act`."""
         path: Any = self._path
         if most > _LARGEST:
             largest = path.constant(_LARGEST)
-            if not path._holds(path.z3.And(term <= largest, term >= -largest)):
+            if not path.holds(path.z3.And(term <= largest, term >= -largest)):
                 path.refuse(f"may compute numbers beyond the largest float from {self._axis}")
             most = _LARGEST
-        return Solved(path, self._axis, term, most, path.computes(act, given))
+        return Solved(path, self._axis, term, most, (act, given))
 
     def __add__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: a + b, operator.add, operator.add)
+        return self._combined(other, operator.add, operator.add)
 
     __radd__ = __add__
 
     def __sub__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: a - b, operator.sub, operator.add)
+        return self._combined(other, operator.sub, operator.add)
 
     def __rsub__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: b - a, lambda a, b: b - a, operator.add)
+        return self._combined(other, lambda a, b: b - a, operator.add)
 
     def __mul__(self, other: object) -> Any:
-        return self._combined(other, lambda a, b: a * b, operator.mul, operator.mul)
+        return self._combined(other, operator.mul, operator.mul)
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: object) -> Any:
         if other == 0:
             return 1.0 / 0  # the error of a plain number
-        return self._combined(other, self._quotient, operator.truediv)
+        return self._combined(other, operator.truediv)
 
     def __rtruediv__(self, other: object) -> Any:  # type: ignore[override]
         if self == 0:
             return 1.0 / 0
-        return self._combined(other, lambda a, b: self._quotient(b, a), lambda a, b: b / a)
-
-    def _quotient(self, a: Any, b: Any) -> Any:
-        path: Any = self._path
-        return path.z3.ToReal(a) / b if path.z3.is_int(a) else a / b
+        return self._combined(other, lambda a, b: b / a)
 
     def __pow__(self, other: object) -> Any:  # type: ignore[override]
-        if other != 2 or type(other) is not int:
-            self._cannot()
-        return self._combined(self, lambda a, b: a * b, lambda a, _: a**2, operator.mul)
+        return self * self if other == 2 and isinstance(other, int) else self._cannot()
 
     def __neg__(self) -> Any:
-        return self._made(-self._term, operator.neg, (self,), self._most)  # exact for floats too
+        return self._new(-self._term, operator.neg, (self,), self._most)  # exact for floats too
 
     def __floordiv__(self, other: object) -> Any:
         return self._cannot()
 
-    def _whole(self, *_: object) -> Any:
+    def _then(self, step: str, c: float = 0.0) -> Any:
         return self._cannot()
 
-    __int__ = __floor__ = __ceil__ = __trunc__ = __round__ = _whole  # type: ignore[assignment]
-
-    def __abs__(self) -> Any:
-        return self if self >= 0 else -self
-
     def __format__(self, spec: str) -> str:
-        return format(0.0 if isinstance(self, float) else 0, spec).rjust(LONGEST_TEXT, MARK)
+        return format(0.0, spec).rjust(LONGEST_TEXT)
 
     def _value_in(self, values: Mapping[str, float]) -> float:
-        path: Any = self._path
-        value: float = path.value_of(self, values)
+        value: float = value_of(self, values)
         return value
-
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:
-        path: Any = self._path
-        return int if path.z3.is_int(self._term) else float

@@ -5,33 +5,29 @@ Otherwise the run takes one side and narrows the range to it, and the search vis
 own comparisons thus give its decision boundaries. Every run represents a cell of views on which the policy decides the
 same. The search is complete when no side is left.
 
-A range cannot answer everything exactly: a comparison of two axes, a square root, a conversion to int, a use of its text
-raise `Refused`. Arithmetic with constants is stored as steps. Every step is monotone, rounding included, and stays
-finite. So a bisection over the floats finds the last float below a boundary.
+A range cannot answer everything exactly: a comparison of two axes or a square root raises `Refused`. Arithmetic with
+constants is stored as steps. Every step is monotone, rounding included, and stays finite. So a bisection over the floats
+finds the last float below a boundary.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
+from numbers import Real
 from typing import Any, NoReturn, TypeVar
 
 T = TypeVar("T")
 
 
 class Refused(BaseException):
-    """The search cannot follow the policy; the message says why. An ordinary `except` in the policy does not catch it."""
+    """The search cannot follow the policy; the message says why. No check with `except Exception` catches it."""
 
 
 class Combined(Refused):
     """Two inputs are compared or combined, which an interval of one input cannot follow; the solver may (`solver`)."""
-
-    def __init__(self, path: Path, one: str, other: str) -> None:
-        path.refusal, path.combines = f"combines {one} and {other}", (one, other)
-        super().__init__(path.refusal)
 
 
 class Path:
@@ -40,11 +36,10 @@ class Path:
     def __init__(self, script: Sequence[int]) -> None:
         self.ranges: dict[str, tuple[float, float]] = {}
         self.picks: dict[str, Any] = {}
-        self.refusal: str | None = None
         self.exact = True
         """Whether every number was followed as the floats that it can be, not over the reals."""
-        self.combines: tuple[str, str] | None = None
-        """The two inputs that the run combines, if that is why it ended."""
+        self.questions = 0
+        """How often the solver was asked."""
         self.taken: list[tuple[int, int]] = []
         self._script = script
 
@@ -94,8 +89,6 @@ class Path:
                 self._restore(before)
                 self.taken, self._script = [], script
                 yield act()
-                if self.refusal is not None:
-                    return
                 script = _next_script(self.taken)
                 if not script:
                     return
@@ -110,26 +103,24 @@ class Path:
         self.ranges, self.picks = dict(ranges), dict(picks)
 
     def refuse(self, why: str) -> NoReturn:
-        """End the run, because the policy cannot be searched."""
-        self.refusal = why
+        """End the search, because the policy cannot be followed."""
         raise Refused(why)
 
 
-def explore(run: Callable[[Path], T], make: Callable[[Sequence[int]], Path] | None = None) -> Iterator[tuple[Path, T]]:
+def explore(run: Callable[[Path], T], make: Callable[[Sequence[int]], Path] = Path) -> Iterator[tuple[Path, T]]:
     """Every run of a deterministic function of one path, depth first, each with its result.
 
     Args:
         run: the function.
-        make: makes a path from the sides that it is to take; left out, a `Path`.
+        make: makes a path from the sides that it is to take.
+
+    Raises:
+        Refused: the function cannot be followed.
     """
     script: list[int] = []
     while True:
-        path = (make or Path)(script)
+        path = make(script)
         result = run(path)
-        if path.refusal is not None:  # a bare `except` may have caught it
-            if path.combines is not None:
-                raise Combined(path, *path.combines)
-            raise Refused(path.refusal)
         if len(path.taken) < len(script):
             raise Refused("decides differently on the same view")
         yield path, result
@@ -195,56 +186,37 @@ class Ranged:
 
     def _constant(self, other: object) -> float | None:
         """The other operand as a plain number; None if it is not a number."""
-        kind = type(other)
-        if kind is float or kind is int or kind is bool:
-            return other  # type: ignore[return-value]
+        if type(other) is float or type(other) is int:  # mostly
+            return other
         if isinstance(other, Ranged):
             low, high = other._path.ranges[other._axis]
             if low == high:
                 return other._at(low)
-            raise Combined(self._path, self._axis, other._axis)
+            raise Combined(f"combines {self._axis} and {other._axis}")
         if isinstance(other, IntEnum):
             return int(other)
-        return None
+        return other if isinstance(other, (float, int)) else None
 
-    def _same(self, other: object) -> bool:
-        if not isinstance(other, Ranged) or other._axis != self._axis or len(other._steps) != len(self._steps):
-            return False
-        return self._steps is other._steps or all(map(_is_same_step, self._steps, other._steps))
+    def _compare(self, other: object, if_same: bool, answer: Callable[[float], bool]) -> bool:
+        if isinstance(other, Ranged) and other._axis == self._axis and repr(other._steps) == repr(self._steps):
+            return if_same  # equal steps may round otherwise, such as those with 10**16 and 1e16
+        c = self._constant(other)
+        return NotImplemented if c is None else c == c and answer(c)
 
     def __lt__(self, other: object) -> bool:
-        if self._same(other):
-            return False
-        c = self._constant(other)
-        return NotImplemented if c is None else c == c and self._below(c, False)
+        return self._compare(other, False, lambda c: self._below(c, False))
 
     def __le__(self, other: object) -> bool:
-        if self._same(other):
-            return True
-        c = self._constant(other)
-        return NotImplemented if c is None else c == c and self._below(c, True)
+        return self._compare(other, True, lambda c: self._below(c, True))
 
     def __gt__(self, other: object) -> bool:
-        if self._same(other):
-            return False
-        c = self._constant(other)
-        return NotImplemented if c is None else c == c and not self._below(c, True)
+        return self._compare(other, False, lambda c: not self._below(c, True))
 
     def __ge__(self, other: object) -> bool:
-        if self._same(other):
-            return True
-        c = self._constant(other)
-        return NotImplemented if c is None else c == c and not self._below(c, False)
+        return self._compare(other, True, lambda c: not self._below(c, False))
 
     def __eq__(self, other: object) -> bool:
-        if self._same(other):
-            return True
-        c = self._constant(other)
-        return NotImplemented if c is None else not self._below(c, False) and self._below(c, True)
-
-    def __ne__(self, other: object) -> bool:
-        equal = self.__eq__(other)
-        return equal if equal is NotImplemented else not equal
+        return self._compare(other, True, lambda c: not self._below(c, False) and self._below(c, True))
 
     def __bool__(self) -> bool:
         return self != 0
@@ -253,9 +225,7 @@ class Ranged:
 
     def _step(self, step: str, other: object) -> Any:
         c = self._constant(other)
-        if c is None:
-            return NotImplemented
-        return self._then(step, c)
+        return NotImplemented if c is None else self._then(step, c)
 
     def _then(self, step: str, c: float = 0.0) -> Ranged:
         """The number after one more step, which must be monotone and stay finite."""
@@ -304,38 +274,6 @@ class Ranged:
     def __abs__(self) -> Any:
         return self if self >= 0 else -self
 
-    # --- what it cannot do -------------------------------------------------------------------
-
-    def _cannot(self, *_: object) -> NoReturn:
-        self._path.refuse(f"uses {self._axis} for more than arithmetic with constants and comparisons")
-
-    __float__ = __index__ = __complex__ = _cannot
-    __pow__ = __rpow__ = __mod__ = __rmod__ = __rfloordiv__ = __rtruediv__ = __divmod__ = __rdivmod__ = _cannot
-    __and__ = __rand__ = __or__ = __ror__ = __xor__ = __rxor__ = __lshift__ = __rlshift__ = __rshift__ = _cannot
-    __rrshift__ = __invert__ = __reduce__ = __reduce_ex__ = __copy__ = __deepcopy__ = __sizeof__ = __dir__ = _cannot
-    __array_ufunc__ = __array_function__ = _cannot  # numpy would raise TypeError, which the policy may catch
-    __hash__ = _cannot
-
-    def _value_in(self, values: Mapping[str, float]) -> float:
-        """The number's value where `values` gives the value of its axis."""
-        return self._at(values[self._axis])
-
-    def __getattr__(self, name: str) -> NoReturn:
-        self._cannot()
-
-    def __format__(self, spec: str) -> str:
-        """A text as long as the number's can be; `allowed` sees to it that it is used for nothing but a reason."""
-        low, high = self._path.ranges[self._axis]
-        return max(format(self._at(low), spec), format(self._at(high), spec), key=len).rjust(LONGEST_TEXT, MARK)
-
-    def __str__(self) -> str:
-        """For Sortie's errors alone: a policy could read the number in it."""
-        if not str(sys._getframe(1).f_globals.get("__name__")).startswith("sortie."):
-            self._cannot()
-        return format(self, "")
-
-    __repr__ = __str__
-
     def __int__(self) -> int:
         """The whole part. The run forks for each, if they are few."""
         whole = self._then("int")
@@ -356,14 +294,28 @@ class Ranged:
     def __round__(self, digits: int | None = None) -> Any:
         return self._then("round") if digits is None else self._cannot()
 
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:
-        """The plain number's class, so that `isinstance` and `match` give the same result as in flight. `type` does not."""
-        return type(self._at(self._path.ranges[self._axis][0]))
+    # --- what it cannot do -------------------------------------------------------------------
+
+    def _cannot(self, *_: object) -> NoReturn:
+        self._path.refuse(f"uses {self._axis} for more than arithmetic with constants and comparisons")
+
+    __float__ = __index__ = __hash__ = __pow__ = __rpow__ = __mod__ = __rmod__ = __divmod__ = _cannot
+    __rfloordiv__ = __rtruediv__ = _cannot
+
+    def _value_in(self, values: Mapping[str, float]) -> float:
+        """The number's value where `values` gives the value of its axis."""
+        return self._at(values[self._axis])
+
+    def __format__(self, spec: str) -> str:
+        """A text at least as long as the number's; `allowed` sees to it that it is used for nothing but a reason."""
+        return format(self._at(self._path.ranges[self._axis][0]), spec).rjust(LONGEST_TEXT)
+
+    def __repr__(self) -> str:
+        return format(self, "")
 
 
-MARK = "\ue000"
-"""Fills texts of numbers with a range."""
+Real.register(Ranged)  # the checks of directives take it for the number that it stands for
+
 LONGEST_TEXT = 24
 _MOST_WHOLE = 200
 """Into so many whole parts a run forks."""
@@ -384,14 +336,6 @@ _STEPS: dict[str, Callable[[float, float], float]] = {
     "ceil": lambda x, _: math.ceil(x),
     "round": lambda x, _: round(x),
 }
-
-
-def _is_same_step(one: tuple[str, float], other: tuple[str, float]) -> bool:
-    """Whether two steps round alike: equal constants may not, such as 10**16 and 1e16, or 0.0 and -0.0."""
-    (step, c), (other_step, d) = one, other
-    if step != other_step or type(c) is not type(d):
-        return False
-    return c.hex() == d.hex() if isinstance(c, float) and isinstance(d, float) else c == d
 
 
 def _ordinal(x: float) -> int:

@@ -9,7 +9,7 @@ import pytest
 from sortie.policies.registry import POLICIES, resolve
 from sortie.policies.verification.proof.allowed import why_not_provable
 
-HEAD = "import math, random, helper\nfrom helper import LEAST, rate\nfrom sortie import Directive, LinkState\nRATES = {0: 2.0}\nSEEN = []\n"
+HEAD = "import math, random, time, helper\nfrom helper import LEAST, rate\nfrom sortie import Directive, LinkState\nRATES = {0: 2.0}; BEGIN = time.time()\nSEEN = []\n"
 HELPER = "LEAST = 0.3\nNOW = [0]\ndef rate(soc, least=LEAST):\n    return 2.0 if soc < least else 8.0\ndef counts():\n    NOW[0] += 1\n"
 ALLOWED = (
     "x = rate(me.battery_soc)\ndef unused(): pass",
@@ -29,6 +29,10 @@ REFUSED = {
     "x = Directive(0, 1, reason='a').reason == 'a'": "uses .reason in line 8",
     "x = {1, 2}": "has a set in line 8",
     "try:\n    x = 1\nexcept ValueError:\n    pass": "has a try statement in line 8",
+    "x = BEGIN": "uses BEGIN in line 8",
+    "def f(kept=SEEN):\n    return kept\nx = f()": "hands on SEEN in line 8",
+    "rate = 1.0": "gives rate another meaning in line 6",
+    "x = view._replace(age_s={})": "hands age_s to a function in line 8",
     "x = random.random()": "uses random in line 8",
     "x = type(me)": "uses type in line 8",
     "x = me.battery_soc is 0.5": "compares by `is` with more than None, a truth value or an enum in line 8",
