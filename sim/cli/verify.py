@@ -43,7 +43,8 @@ Kept = tuple[str, FleetView | None, Scenario]
 WRITTEN = "# A counterexample, written by sortie verify.\n"
 FOR_POLICIES = ("invariants", "drones", "budget", "views", "scenario", "courses", "flights", "out_dir")
 COLOURS = {
-    "holds": "green", "fails": "red", "unfinished": "yellow", "proved": "green", "refuted": "red", "tried": "yellow",
+    "holds": "green", "fails": "red", "unusual": "yellow", "not tried enough": "yellow",
+    "proved": "green", "refuted": "red", "tried": "yellow",
 }  # fmt: skip
 
 
@@ -145,7 +146,7 @@ def _verify_model(kind: str, reference: str) -> None:
     with watched(DECISION_S):
         checks = verify_model(kind, name, params)
     for check in checks:
-        table.add_row(check.name, _verdict(_word(check)), check.what)
+        table.add_row(check.name, _verdict(check.verdict), check.what)
     out.print(table)
     broken = len(failing(checks))
     if broken:
@@ -167,7 +168,7 @@ def _try(
     table = Table("rule", "verdict", "what", title=f"{policy}: the conformance kit, {views} drawn views")
     checks = conform(decide, count=views)
     for check in checks:
-        table.add_row(check.name, _verdict(_word(check)), check.what)
+        table.add_row(check.name, _verdict(check.verdict), check.what)
     out.print(table)
     verdicts = prove(decide, rules, max_drones=drones, cells=budget)
     out.print(_verdicts(f"{policy}: proofs", verdicts))
@@ -188,10 +189,6 @@ def _verdicts(title: str, verdicts: Sequence[ProofVerdict | TimeVerdict]) -> Tab
     for verdict in verdicts:
         table.add_row(verdict.name, _verdict(verdict.outcome), verdict.what)
     return table
-
-
-def _word(check: Check) -> str:
-    return "holds" if check.holds else "unfinished" if check.unfinished else "fails"
 
 
 def _verdict(word: str) -> Text:

@@ -6,6 +6,7 @@ line is known from how it is made. A correct one keeps the line on every view.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from random import Random
 
 from policies_corpus import source
@@ -172,6 +173,49 @@ def unreached(draw: Random) -> str:
     if draw.random() < 0.3 and "age" not in x:
         return source(filled(draw.choice(POINTS), x, k=str(top + draw.randrange(1, 50))))
     return source(filled(draw.choice(BETWEEN), x, str(a), str(b)))
+
+
+COUNTS = (
+    "len(view.peers)", "len(view.descriptors) - 1", "len(view.age_s) - 1", "sum(1 for p in view.peers)",
+    "len(sorted(view.descriptors)) - 1", "len([p for p in view.peers if me.goodput_to(p) >= 0])",
+    "len({p for p in view.peers})", "len(tuple(view.peers))", "max(view.descriptors)", "len(set(view.descriptors) - {view.ego})",
+    "sum(map(bool, [1 for p in view.peers]))", "functools.reduce(lambda n, _: n + 1, view.peers, 0)",
+    "len(list(view.descriptors.values())) - 1", "len(me.peer_goodput_mbps)", "view.full_sharing_maps",
+    "len(dict(view.age_s)) - 1", "len([*view.peers])", "len(list(itertools.pairwise(view.peers))) + 1",
+)  # fmt: skip
+SIZES = (
+    "bad = X >= N", "bad = X > N", "bad = not X < N", "bad = X // N >= 1", "bad = X * 2 >= 2 * N",
+    "bad = any(k >= N - 1 for k in range(X))", "bad = list(range(X))[N - 1:] != []", "bad = bool(list(range(X))[N:])",
+    "n = X\nwhile n >= N:\n    bad, n = True, 0", "bad = (X - N) >= 0", "bad = (X).bit_length() >= (N).bit_length() + 1",
+    "bad = [2, 20][X >= N] == 20", "bad = min(X, N) == N", "bad = max(X, N - 1) >= N", "bad = math.log2(X) >= math.log2(N)",
+    "try:\n    list(range(X))[N - 1]\n    bad = True\nexcept IndexError:\n    pass",
+    "match list(range(X)):\n    case [*most] if len(most) >= N:\n        bad = True",
+    "def depth(k):\n    return 0 if k <= 0 else 1 + depth(k - 1)\nbad = depth(X) >= N",
+    "bad = 'a' * X >= 'a' * N", "bad = str(X).zfill(4) >= str(N).zfill(4)", "bad = bool(1 << X >> N)",
+    "bad = len(f'{0:0{X}d}') >= N", "bad = sum(range(X)) >= sum(range(N))", "bad = X in range(N, 10 * N)",
+)  # fmt: skip
+SIZE_LINES = (
+    ("count_links(representation > none) <= N", "bad = False"),
+    ("sum_links(rate_hz) <= 2 * N", "bad = False"),
+    ("count_links(rate_hz >= 2) <= N", "bad = False"),
+    ("when peers >= N: every_link(representation >= features)", "bad = False"),
+    ("when peers > N: any_link(rate_hz > 5)", "bad = False"),
+)
+
+
+FEW = (4, 5, 6, 7, 8, 10, 11, 13, 15, 17, 19, 25, 40, 60, 90)
+MANY = (210, 333, 777, 1500, 2400, 3000, 4100, 4900)
+
+
+def size(draw: Random, sizes: Sequence[int] = FEW) -> tuple[str, str]:
+    """A fault that needs more drones than are searched by default; the policy and its line."""
+    n = draw.choice(sizes)
+    if draw.random() < 0.2:
+        line, body = draw.choice(SIZE_LINES)
+        return source(body), line.replace("N", str(n))
+    if draw.random() < 0.1:
+        return source(f"bad = view.ego == {n}"), "rate_hz <= 10"
+    return source(filled(draw.choice(SIZES), draw.choice(COUNTS)).replace("N", str(n))), "rate_hz <= 10"
 
 
 def filled(text: str, x: str, a: str = "", b: str = "", k: str = "") -> str:

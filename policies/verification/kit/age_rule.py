@@ -8,19 +8,18 @@ from sortie.policies.contract import Directive, FleetView, Representation
 from sortie.policies.verification.invariants.language import by_peer
 
 
-def older_views(view: FleetView, *, one_by_one: bool = True) -> Iterator[tuple[tuple[int, ...], float, FleetView]]:
-    """Views in which one descriptor, or all, are older: whose age is raised, by how many seconds, and the view.
+def older_views(view: FleetView, *, one_by_one: bool = True) -> Iterator[FleetView]:
+    """Views in which one descriptor, or all, are older.
 
     Args:
         view: with the ages that are raised.
         one_by_one: also each by itself, besides all together.
     """
-    everyone = tuple(view.age_s)
     for periods in (1.0, 3.5, 10.5, 1000.0):
         add_s = periods * view.period_s
-        for i in everyone if one_by_one else ():
-            yield (i,), add_s, view._replace(age_s={**view.age_s, i: view.age_s[i] + add_s})
-        yield everyone, add_s, view._replace(age_s={i: a + add_s for i, a in view.age_s.items()})
+        for i in view.age_s if one_by_one else ():
+            yield view._replace(age_s={**view.age_s, i: view.age_s[i] + add_s})
+        yield view._replace(age_s={i: a + add_s for i, a in view.age_s.items()})
 
 
 def without_detached(view: FleetView, older: FleetView) -> FleetView:

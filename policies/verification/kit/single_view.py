@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sortie.policies.checks import check_directives, find_inexact, find_wrong_type
-from sortie.policies.contract import FleetView, Policy, PolicyError
+from sortie.policies.checks import check_directives, find_wrong_type
+from sortie.policies.contract import Directive, FleetView, Policy, PolicyError
 from sortie.policies.verification.invariants.language import (
     Invariant,
     describe_directives,
@@ -16,11 +16,10 @@ from sortie.policies.verification.invariants.language import (
     violations,
 )
 from sortie.policies.verification.kit.age_rule import older_views, raised_part, without_detached
-from sortie.policies.verification.kit.conformance import missing_links
 from sortie.scenarios.plugins.user_calls import text_of
 
 ONE_BY_ONE = 8
-"""Ages are raised drone by drone in views of up to so many; the kit does it in all of its own."""
+"""Ages are raised drone by drone in views of up to so many; in larger ones of all drones at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +48,14 @@ class RepeatableView:
         """The view with some raises of its ages: of each drone by itself and of all at once; above `ONE_BY_ONE`, of all at once alone."""
         if self._raised is not None:
             yield self._plain._replace(age_s=dict(self._raised)).frozen
-        for _, _, older in older_views(self._plain, one_by_one=len(self._plain.age_s) <= ONE_BY_ONE):
+        for older in older_views(self._plain, one_by_one=len(self._plain.age_s) <= ONE_BY_ONE):
             yield older.frozen
+
+
+def missing_links(directives: Iterable[Directive], view: FleetView) -> str | None:
+    """A complaint if the directives are not exactly one for each peer."""
+    decided, peers = sorted(d.destination for d in directives), list(view.peers)
+    return None if decided == peers else f"directives for [{listed(decided)}], must be for each of [{listed(peers)}]"
 
 
 def keeps_contract(policy: Policy, view: Any) -> str | None:
@@ -64,11 +69,15 @@ def keeps_contract(policy: Policy, view: Any) -> str | None:
 
 
 def only_falls_with_age(policy: Policy, view: Any) -> str | None:
-    """Raising any ages raises no directive's representation, budget or rate (the kit's rule `age-monotone`)."""
+    """Raising any ages raises no directive's representation, budget or rate.
+
+    A peer that is detached has left the fleet, and its place may go to others: no directive may be higher than it was with
+    that peer and than it is without.
+    """
     before = policy(view.now())
     for older in view.older():
         after = policy(older)
-        if raised_part(before, after) is None:
+        if raised_part(before, after) is None:  # mostly, and then a third decision changes nothing
             continue
         raised = raised_part(before, after, policy(without_detached(view.now(), older)))
         if raised is not None:
@@ -101,23 +110,19 @@ def check_property(
     prop: Property, policy: Policy, view: FleetView, raised: Mapping[int, float] | None = None
 ) -> str | None:
     """The complaint of a property about a policy on one plain view. An exception is a complaint."""
-    return complaint_of(prop, policy, RepeatableView(view, raised))
-
-
-def complaint_of(prop: Property, policy: Policy, view: RepeatableView) -> str | None:
-    """The complaint of a property about a policy on a view. An exception is a complaint too."""
+    repeatable = RepeatableView(view, raised)
     try:
-        return prop.complaint(policy, view)
+        return prop.complaint(policy, repeatable)
     except Exception as error:
-        return _invalid_directive(policy, view.now()) or f"raises {type(error).__name__}: {text_of(error, str)}"
+        return _invalid_directive(policy, repeatable.now()) or f"raises {type(error).__name__}: {text_of(error, str)}"
 
 
 def _invalid_directive(policy: Policy, view: FleetView) -> str | None:
     """The first invalid directive in the policy's output, as text; None if that is not the cause of an exception."""
     try:
         answer = policy(view)
-        if type(answer) not in (list, tuple):  # others may never end
-            return find_inexact(answer)
+        if type(answer) not in (list, tuple):
+            return f"a policy returns a list or a tuple of directives, got {type(answer).__name__}"
         return next((wrong for d in answer if (wrong := find_wrong_type(d)) is not None), None)
     except Exception:
         return None

@@ -1,13 +1,12 @@
-"""Fleet views for testing a policy: drawn from a seed, shrunk if the policy fails on one, written as JSON."""
+"""Fleet views for testing a policy: drawn from a seed, some at the constants of a policy; written as JSON."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
-
-import numpy as np
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from random import Random
+from typing import Any
 
 from sortie.policies.contract import (
     AGENT_IDS,
@@ -26,9 +25,10 @@ from sortie.scenarios.errors import SortieError
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS
 from sortie.scenarios.schema import Scenario, Section
 from sortie.scenarios.schema.base import MOST_DRONES
-from sortie.scenarios.streams import stream
 
 MAX_DRONES = 20
+AT_CONSTANTS = 3
+"""Every third drawn view lies at the constants of the policy that it is for."""
 
 
 def _most(section: type[Section], field: str) -> Any:
@@ -44,11 +44,10 @@ GONE = "detached_after_periods"
 OTHER_CODEBOOK = "0" * 14
 """A digest that is not the fleet's common one: 7 bytes, as a descriptor has them."""
 
-Drawn = TypeVar("Drawn")
 _SPECIAL_SOC = (0.0, 0.05, 0.2999, 0.3, 0.5, 0.5999, 0.6, 1.0)
 _SPECIAL_GOODPUT_MBPS = (0.0, SILENT_MBPS, PROBED_MBPS, 0.01, 4.99, 5.0, 50.0, 600.0, 1e5)
 _SPECIAL_AGE_PERIODS = (0.0, 1.0, 3.0, 3.1, 10.0, 10.1, 600.0)
-_PERIODS_S = (0.1, 0.2, 1.0)
+_SHARES = ("battery_soc", "cpu_headroom", "gpu_headroom")
 
 
 class ViewError(SortieError):
@@ -69,154 +68,121 @@ def draw_view(seed: int, number: int, drones: int | None = None, reach: float | 
         drones: the size of the fleet; left out, it is drawn. In one of more than `LISTED_IDS` every drone has a roster.
         reach: the chance that the ego has heard each other drone, 0 … 1; left out, it is drawn.
     """
-    rng = stream(seed, number, (), "verify.view")
-    n = int(rng.integers(1, MAX_DRONES + 1)) if rng.random() < 0.5 else int(rng.integers(1, 6))
-    n = n if drones is None else drones
-    ego = int(rng.integers(n))
-    drawn_reach = _one_of(rng, (1.0, 0.7))
+    rng = Random(f"view {seed} {number}")  # noqa: S311
+    drawn = rng.randint(1, MAX_DRONES if rng.random() < 0.5 else 5)
+    n = drawn if drones is None else drones
+    ego = rng.randrange(n)
+    drawn_reach = rng.choice((1.0, 0.7))
     reach = drawn_reach if reach is None else reach
     heard = [i for i in range(n) if i == ego or rng.random() < reach]
     rng.shuffle(heard)
-    period_s = _one_of(rng, _PERIODS_S)
-    spread_m = _one_of(rng, (0.0, 30.0, 100.0, 2000.0))
+    period_s = rng.choice((0.1, 0.2, 1.0))
+    spread_m = rng.choice((0.0, 30.0, 100.0, 2000.0))
     listed = n if n <= LISTED_IDS else 1
     descriptors = {i: _draw_descriptor(rng, i, listed, spread_m) for i in heard}
     age_s = {i: period_s * _mixed(rng, 0.0, 15.0, _SPECIAL_AGE_PERIODS) for i in heard}
     if rng.random() < 0.25:  # two makes of drone in one fleet
-        descriptors = {i: d._replace(feature_space=_one_of(rng, ("", "other"))) for i, d in descriptors.items()}
+        descriptors = {i: d._replace(feature_space=rng.choice(("", "other"))) for i, d in descriptors.items()}
     if n > LISTED_IDS:
         descriptors = {i: _with_members(rng, d, heard, n) for i, d in descriptors.items()}
     elif rng.random() < 0.25:  # all agree who is a member, heard by the ego or not
         members = tuple(i for i in range(n) if i in descriptors or rng.random() < 0.5)
-        descriptors = {i: d.with_roster(Roster(int(rng.integers(9)), members)) for i, d in descriptors.items()}
+        descriptors = {i: d.with_roster(Roster(rng.randrange(9), members)) for i, d in descriptors.items()}
     if rng.random() < 0.25:  # and some codes are of another codebook
-        descriptors = {i: d._replace(codebook=_one_of(rng, ("", OTHER_CODEBOOK))) for i, d in descriptors.items()}
-    gone_after = _one_of(rng, (4.0, 20.0, 1000.0)) if rng.random() < 0.25 else DETACHED_AFTER_PERIODS
+        descriptors = {i: d._replace(codebook=rng.choice(("", OTHER_CODEBOOK))) for i, d in descriptors.items()}
+    gone_after = rng.choice((4.0, 20.0, 1000.0)) if rng.random() < 0.25 else DETACHED_AFTER_PERIODS
     return FleetView(ego, period_s, descriptors, age_s, gone_after)
 
 
-def draw_views(seed: int, count: int) -> Iterator[FleetView]:
-    """The first `count` views of a seed."""
-    return (draw_view(seed, number) for number in range(count))
+def draw_views(seed: int, count: int, constants: Iterable[float] = ()) -> Iterator[FleetView]:
+    """The first `count` views of a seed; every `AT_CONSTANTS`th has numbers at these constants, if there are any."""
+    known = sorted(set(constants))
+    for number in range(count):
+        view = draw_view(seed, number)
+        yield move_to_constants(view, known, f"{seed} {number}") if known and number % AT_CONSTANTS == 0 else view
 
 
-def _draw_descriptor(rng: np.random.Generator, agent_id: int, drones: int, spread_m: float) -> Descriptor:
-    x_m, y_m, vx_mps, vy_mps, yaw = rng.uniform(-1, 1, 5).tolist()
+def move_to_constants(view: FleetView, constants: Sequence[float], key: str) -> FleetView:
+    """The view with some of its numbers at constants, or one float beside them.
+
+    Args:
+        view: the view.
+        constants: a policy's own, ascending.
+        key: draws which numbers move.
+    """
+    rng = Random(f"constants {key}")  # noqa: S311
+
+    def near(low: float, high: float) -> float | None:
+        known = [c for c in constants if low <= c <= high]
+        if not known or rng.random() < 0.3:
+            return None
+        c = rng.choice(known)
+        return min(max(rng.choice((c, c, math.nextafter(c, -math.inf), math.nextafter(c, math.inf))), low), high)
+
+    descriptors, ages_s = dict(view.descriptors), dict(view.age_s)
+    egos = [int(c) for c in constants if c in descriptors]
+    ego = rng.choice(egos) if egos and rng.random() < 0.3 else view.ego
+    if egos and egos[-1] >= MAX_DRONES:  # no other view has such an ego
+        ego = egos[-1]
+    together = rng.random() < 0.5  # of all drones, or of the ego alone
+    for i, d in descriptors.items():
+        if i != ego and not together:
+            continue
+        changed: dict[str, Any] = {field: x for field in _SHARES if (x := near(0, 1)) is not None}
+        goodput, age_s, flags, stamp_s = near(0, 1e5), near(0, LONGEST_S), near(0, 255), near(0, LONGEST_S)
+        if goodput is not None:
+            changed["peer_goodput_mbps"] = (goodput,) * len(d.peer_goodput_mbps)
+        if flags is not None and rng.random() < 0.3:
+            changed["novelty_flags"] = int(flags)
+        if age_s is not None and rng.random() < 0.5:
+            ages_s[i] = age_s
+        if stamp_s is not None and rng.random() < 0.3:
+            changed["stamp_ns"] = round(stamp_s * rng.choice((1, 1e9)))
+        descriptors[i] = d._replace(**changed)
+    return view._replace(ego=ego, descriptors=descriptors, age_s=ages_s)
+
+
+def _draw_descriptor(rng: Random, agent_id: int, drones: int, spread_m: float) -> Descriptor:
+    x_m, y_m, vx_mps, vy_mps, yaw = (rng.uniform(-1, 1) for _ in range(5))
     region = None
     if rng.random() < 0.5:
-        away_m = 0.0 if rng.random() < 0.5 else 3000.0  # the region is here, or far from everyone
-        region = Disc(spread_m * x_m + away_m, spread_m * y_m, _one_of(rng, (1.0, 32.0, 500.0)))
+        away_m = rng.choice((0.0, 3000.0))  # the region is here, or far from everyone
+        region = Disc(spread_m * x_m + away_m, spread_m * y_m, rng.choice((1.0, 32.0, 500.0)))
     return Descriptor(
-        stamp_ns=int(rng.integers(0, 10**12)),
+        stamp_ns=rng.randrange(10**12),
         agent_id=agent_id,
-        position_m=(spread_m * x_m, spread_m * y_m, float(rng.uniform(0, 120))),
+        position_m=(spread_m * x_m, spread_m * y_m, rng.uniform(0, 120)),
         orientation_xyzw=(0.0, 0.0, math.sin(yaw), math.cos(yaw)),
         velocity_mps=(20 * vx_mps, 20 * vy_mps, 0.0),
-        footprint_radius_m=_one_of(rng, (0.0, 20.0, 42.0, 100.0)),
+        footprint_radius_m=rng.choice((0.0, 20.0, 42.0, 100.0)),
         battery_soc=_mixed(rng, 0.0, 1.0, _SPECIAL_SOC),
         cpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
         gpu_headroom=_mixed(rng, 0.0, 1.0, (0.0, 1.0)),
-        peer_goodput_mbps=tuple(_mixed(rng, 0.0, 600.0, _SPECIAL_GOODPUT_MBPS) for _ in range(drones - 1)),
-        coverage_grid=rng.bytes(COVERAGE_BYTES) if rng.random() < 0.7 else bytes(COVERAGE_BYTES),
-        novelty_flags=int(rng.integers(8)),
-        task_phase=TaskPhase(int(rng.integers(len(TaskPhase)))),
+        peer_goodput_mbps=_draw_goodput_mbps(rng, drones - 1),
+        coverage_grid=rng.randbytes(COVERAGE_BYTES) if rng.random() < 0.7 else bytes(COVERAGE_BYTES),
+        novelty_flags=rng.randrange(8),
+        task_phase=rng.choice(tuple(TaskPhase)),
         region=region,
-        priority_target_ids=tuple(rng.integers(0, 1000, _one_of(rng, (0, 0, 1, 5))).tolist()),
+        priority_target_ids=tuple(rng.randrange(1000) for _ in range(rng.choice((0, 0, 1, 5)))),
     )
 
 
-def _with_members(rng: np.random.Generator, d: Descriptor, heard: Sequence[int], drones: int) -> Descriptor:
+def _with_members(rng: Random, d: Descriptor, heard: Sequence[int], drones: int) -> Descriptor:
     """As in a large fleet: with a roster of those in its own earshot, which the ego may not have heard, and their goodputs."""
     most = LISTED_MEMBERS - 1
-    others = {heard[k] for k in rng.integers(0, len(heard), _one_of(rng, (0, 8, most))).tolist()}
-    others |= set(rng.integers(0, drones, min(most - len(others), 4)).tolist())
+    others = set(rng.choices(heard, k=rng.choice((0, 8, most))))
+    others |= set(rng.choices(range(drones), k=min(most - len(others), 4)))
     members = tuple(sorted({d.agent_id, *others}))
-    count = len(members) - 1
-    special = np.array(_SPECIAL_GOODPUT_MBPS)[rng.integers(0, len(_SPECIAL_GOODPUT_MBPS), count)]
-    goodput_mbps = np.where(rng.random(count) < 0.5, rng.uniform(0.0, 600.0, count), special)
-    return d._replace(peer_goodput_mbps=tuple(goodput_mbps.tolist()), roster=Roster(int(rng.integers(9)), members))
+    goodput_mbps = _draw_goodput_mbps(rng, len(members) - 1)
+    return d._replace(peer_goodput_mbps=goodput_mbps, roster=Roster(rng.randrange(9), members))
 
 
-def _one_of(rng: np.random.Generator, values: Sequence[Drawn]) -> Drawn:
-    """What `rng.choice` draws, without its array."""
-    return values[int(rng.integers(len(values)))]
+def _draw_goodput_mbps(rng: Random, count: int) -> tuple[float, ...]:
+    return tuple([_mixed(rng, 0.0, 600.0, _SPECIAL_GOODPUT_MBPS) for _ in range(count)])
 
 
-def _mixed(rng: np.random.Generator, low: float, high: float, special: tuple[float, ...]) -> float:
-    return float(rng.uniform(low, high)) if rng.random() < 0.5 else _one_of(rng, special)
-
-
-# --- shrinking -----------------------------------------------------------------------------------
-
-_PLAIN: dict[str, Any] = {
-    "stamp_ns": 0,
-    "orientation_xyzw": (0.0, 0.0, 0.0, 1.0),
-    "velocity_mps": (0.0, 0.0, 0.0),
-    "cpu_headroom": 1.0,
-    "gpu_headroom": 1.0,
-    "coverage_grid": bytes(COVERAGE_BYTES),
-    "novelty_flags": 0,
-    "region": None,
-    "priority_target_ids": (),
-    "feature_space": "",
-    "roster": None,
-    "codebook": "",
-    "task_phase": TaskPhase.SEARCH,
-    "battery_soc": 1.0,
-    "footprint_radius_m": 42.0,
-    "position_m": (0.0, 0.0, 60.0),
-}
-
-
-def shrink(view: FleetView, fails: Callable[[FleetView], bool]) -> FleetView:
-    """A view that still fails, with fewer drones and plainer fields; not always the smallest.
-
-    Args:
-        view: a view that fails.
-        fails: whether a view fails; called about twenty times for each drone that is left, some hundreds of times if more
-            than 200 are left.
-    """
-
-    def kept(candidate: FleetView) -> bool:
-        nonlocal view
-        if candidate != view and fails(candidate):
-            view = candidate
-            return True
-        return False
-
-    kept(view._replace(detached_after_periods=DETACHED_AFTER_PERIODS))
-    for _ in range(1 if len(view.peers) <= LISTED_IDS else 2):  # of many peers, parts are left out before single ones
-        for few in _parts(view.peers):
-            kept(view._replace(descriptors=_without(view.descriptors, few), age_s=_without(view.age_s, few)))
-    drones = tuple(view.descriptors)
-    each = [(i,) for i in drones] if len(drones) <= LISTED_IDS else []
-    for few in (drones, *each):  # all at once, which is often enough, then each
-        kept(view._replace(age_s={**view.age_s, **dict.fromkeys(few, 0.0)}))
-        for field, plain in _PLAIN.items():
-            if field != "roster" or max(drones, default=0) < LISTED_IDS:
-                kept(_with(view, {i: view.descriptors[i]._replace(**{field: plain}) for i in few}))
-        flat = {i: (100.0,) * len(view.descriptors[i].peer_goodput_mbps) for i in few}
-        kept(_with(view, {i: view.descriptors[i]._replace(peer_goodput_mbps=flat[i]) for i in few}))
-    return view
-
-
-def _parts(peers: Sequence[int]) -> Iterator[Sequence[int]]:
-    """All peers, then halves of them, quarters and so on, down to each by itself; of very many, down to some 64 parts."""
-    size, most = len(peers), LISTED_IDS if len(peers) <= LISTED_IDS else 64
-    while size * most >= len(peers) > 0:
-        yield from (peers[k : k + size] for k in range(0, len(peers), size))
-        if size == 1:
-            return
-        size = (size + 1) // 2
-
-
-def _with(view: FleetView, changed: Mapping[int, Descriptor]) -> FleetView:
-    return view._replace(descriptors={**view.descriptors, **changed})
-
-
-def _without(mapping: Mapping[int, Any], keys: Sequence[int]) -> dict[int, Any]:
-    gone = set(keys)
-    return {k: v for k, v in mapping.items() if k not in gone}
+def _mixed(rng: Random, low: float, high: float, special: Sequence[float]) -> float:
+    return rng.uniform(low, high) if rng.random() < 0.5 else rng.choice(special)
 
 
 # --- JSON ----------------------------------------------------------------------------------------

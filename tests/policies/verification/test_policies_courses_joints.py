@@ -22,7 +22,8 @@ from sortie.policies.verification.kit.courses import (
     shrink_course,
     values_at,
 )
-from sortie.policies.verification.kit.drawn import views_at
+from sortie.policies.verification.kit.drawn import views_at_sizes
+from sortie.policies.verification.kit.views import AT_CONSTANTS, draw_views
 from sortie.policies.verification.shield import shield
 from sortie.policies.verification.subject import constants_of
 
@@ -156,7 +157,7 @@ def _shares(views: Sequence[FleetView]) -> set[float]:
 
 def test_views_at_constants_have_them_and_the_floats_beside_them() -> None:
     c, rate_mbps, age_s = 0.4321, 77.25, 1234.5
-    views = list(views_at({c, rate_mbps, age_s, 2.0}, 5, 80))
+    views = list(draw_views(5, 80 * AT_CONSTANTS, {c, rate_mbps, age_s, 2.0}))[::AT_CONSTANTS]
     assert {c, math.nextafter(c, 0), math.nextafter(c, 1)} <= _shares(views)
     assert all(0 <= x <= 1 for x in _shares(views))
     goodputs = {x for v in views for d in v.descriptors.values() for x in d.peer_goodput_mbps}
@@ -165,20 +166,20 @@ def test_views_at_constants_have_them_and_the_floats_beside_them() -> None:
     assert any(v.ego == 2 for v in views)
     assert all(v.ego in v.descriptors and v.age_s.keys() == v.descriptors.keys() for v in views)
     assert all(a.descriptors != b.descriptors for k, a in enumerate(views) for b in views[:k] if len(a.descriptors) > 2)
-    assert [v.descriptors for v in views_at({c}, 5, 5)] == [v.descriptors for v in views_at({c}, 5, 5)]
+    assert list(draw_views(5, 5, {c})) == list(draw_views(5, 5, {c})) != list(draw_views(5, 5))
 
 
 def test_where_only_the_ego_is_at_constants_it_is_the_ego_of_the_view() -> None:
     """The others then have the numbers that they were drawn with, which are no constants."""
     apart, chosen = 0, {float(i) for i in range(3, 20)}
-    for view in views_at({0.4321, *chosen}, 5, 80):
+    for view in draw_views(5, 80 * AT_CONSTANTS, {0.4321, *chosen}):
         at = {i for i, d in view.descriptors.items() if 0.4321 in (d.battery_soc, d.cpu_headroom, d.gpu_headroom)}
         apart += at == {view.ego} and len(view.descriptors) > 2
     assert apart >= 10
 
 
 def test_fleets_are_as_large_as_the_constants_of_a_policy() -> None:
-    large = [view for seed in range(4) for view in list(views_at({0.5, 30.0}, seed, 4))[4:]]
+    large = [view for seed in range(4) for view in views_at_sizes({0.5, 30.0}, seed)]
     assert {v.ego for v in large} >= {30}
     listed = {len(d.peer_goodput_mbps) + 1 for v in large for d in v.descriptors.values() if d.roster is None}
     assert listed == {30, 31, 32}

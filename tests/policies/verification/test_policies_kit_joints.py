@@ -14,7 +14,8 @@ from policies_examples import fleet_of
 
 from sortie.policies.contract import Directive, FleetView, Reposition, Representation, looks_from
 from sortie.policies.verification.kit.conformance import RULES, conform
-from sortie.policies.verification.kit.views import draw_view, draw_views, shrink
+from sortie.policies.verification.kit.tried import shrink
+from sortie.policies.verification.kit.views import draw_view, draw_views
 
 VIEW = fleet_of(5)
 
@@ -116,7 +117,7 @@ TWO_CODEBOOKS = VIEW._replace(
 )
 def test_a_rule_finds_what_breaks_it_and_nothing_else_does(policy: Any, rule: str, view: FleetView) -> None:
     copied = view._replace(descriptors=dict(view.descriptors), age_s=dict(view.age_s))
-    broken = [name for name, check in RULES.items() if check(policy, _anew(copied)) is not None]
+    broken = [name for name, rule in RULES.items() if rule.complaint(policy, _anew(copied)) is not None]
     assert broken == [rule]
     assert [c.name for c in conform(policy, [_anew(view)]) if not c.holds and c.name in RULES] == [rule]
 
@@ -127,7 +128,7 @@ def _anew(view: FleetView) -> FleetView:
 
 @pytest.mark.parametrize("policy", [_boxes, lambda view: _sends_codes(view)])
 def test_a_policy_that_breaks_nothing_keeps_every_rule(policy: Callable[[FleetView], list[Directive]]) -> None:
-    assert [name for name, check in RULES.items() if check(policy, _anew(VIEW)) is not None] == []
+    assert [name for name, rule in RULES.items() if rule.complaint(policy, _anew(VIEW)) is not None] == []
 
 
 def test_a_rule_that_no_view_could_check_does_not_hold() -> None:

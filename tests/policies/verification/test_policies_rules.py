@@ -347,7 +347,7 @@ def remembers(view: FleetView) -> list[Directive]:
 
 
 def test_memory_between_calls_is_caught() -> None:
-    assert RULES["deterministic"](remembers, FLEET) is not None
+    assert RULES["deterministic"].complaint(remembers, FLEET) is not None
 
 
 # --- 5: damping and idempotence ------------------------------------------------------------------

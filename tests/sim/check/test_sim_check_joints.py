@@ -274,6 +274,5 @@ def test_a_model_that_draws_when_it_is_loaded_gives_another_answer_when_it_is_lo
         drawn = next(numbers)
         return RuleSubject(lambda case: drawn, {"a": 0, "b": 1})
 
-    assert {check.name: check.holds for check in conform(load)} == {
-        "answers": True, "same answer again": False, "no memory": True, "arguments unchanged": True,
-    }  # fmt: skip
+    verdicts = {check.name: check.verdict for check in conform(load)}
+    assert verdicts == {"answers": "holds", "same answer again": "fails", "no memory": "holds"}

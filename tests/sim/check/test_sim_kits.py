@@ -18,11 +18,8 @@ BROKEN = """
 import numpy as np
 
 def loss(d):
+    d += 0.0  # it may change what it is given, which is a copy
     return 80 + 20 * np.log10(np.maximum(d, 1.0))
-
-def changes(d, a, b, ghz):
-    d += 1.0
-    return loss(d)
 
 def random(d, a, b, ghz):
     return loss(d) + np.random.random(np.shape(d))
@@ -58,10 +55,6 @@ def free_fall(air, acceleration, climb, mass):
 
 def two_frames(times_s, positions_m, rng):
     return np.zeros((len(times_s), 4)) + times_s[1]
-
-def rises(times_s, starts_m, rng):
-    starts_m += 1.0
-    return np.repeat(starts_m[None], len(times_s), axis=0)
 
 class Wanders:
     def __init__(self, drone, start_m, rng):
@@ -141,7 +134,7 @@ SOUND = [
 @pytest.mark.parametrize(("kind", "reference", "params"), SOUND, ids=[f"{k}-{r}" for k, r, _ in SOUND])
 def test_the_guides_models_keep_every_rule(kind: str, reference: str, params: dict[str, float]) -> None:
     checks = verify(kind, reference, params)
-    assert len(checks) >= 4
+    assert len(checks) >= 3
     assert not [(c.name, c.what) for c in checks if not c.holds]
 
 
@@ -152,7 +145,6 @@ def test_every_kind_is_tried() -> None:
 @pytest.mark.parametrize(
     ("kind", "name", "fails"),
     [
-        ("path_loss", "changes", {"arguments unchanged": "changes its argument 1"}),
         ("path_loss", "random", {"same answer again": "one link: another answer than the first time; take random numbers from what is given"}),
         ("path_loss", "counts", {"no memory": "frames by links: another answer"}),
         ("path_loss", "tallest", {"links apart": "the loss of a link depends on the other links of the same call"}),
@@ -165,7 +157,6 @@ def test_every_kind_is_tried() -> None:
         ("fusion", "mean_of_all", {"absent peers": "a peer that takes part in no cell", "ego alone": "another map than the ego's"}),
         ("fusion", "last_peer", {"order of peers": "the map depends on the order of the peers"}),
         ("fusion", "all_egos", {"egos apart": "an ego's map depends on the other egos of the same call"}),
-        ("mobility", "rises", {"arguments unchanged": "changes its argument 2"}),
         ("mobility", "Wanders", {"same answer again": "no region: another answer"}),
         ("mobility", "squad", {"answers": "one drone: mobility squad: TypeError"}),
         ("event", "Late", {"same answer again": "from 0.5 s to the end: another answer"}),

@@ -134,7 +134,7 @@ def test_the_best_of_a_condition_is_bold_in_whichever_table_it_stands(
 def verified(monkeypatch: pytest.MonkeyPatch, proved: str = "proved", judged: str = "holds") -> dict[str, Seen]:
     """What `sortie verify` calls, each with one verdict."""
     seen = {
-        "conform": Seen([SimpleNamespace(name="rule", holds=True, what="", counterexample=None)]),
+        "conform": Seen([SimpleNamespace(name="rule", verdict="holds", holds=True, what="", counterexample=None)]),
         "prove": Seen([SimpleNamespace(name="line", outcome=proved, what="", counterexample=None)]),
         "judge_over_time": Seen([SimpleNamespace(name="timed", outcome=judged, what="", view=None, scenario=None)]),
     }
@@ -155,7 +155,7 @@ def test_verify(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert resolved.args == ("best-2", {"received_budget": 0.25})
     assert seen["conform"].kwargs == {"count": 50}
     decide, rules = seen["prove"].args
-    assert seen["prove"].kwargs == {"max_drones": 3, "budget_s": 4.0}
+    assert seen["prove"].kwargs == {"max_drones": 3, "cells": 4}
     subject, timed = seen["judge_over_time"].args
     assert [rule.over_time for rule in (*rules, *timed)] == [False, True]
     assert all(isinstance(rule, Invariant) for rule in (*rules, *timed))
@@ -187,8 +187,8 @@ def test_a_model_of_another_kind_is_verified_with_its_parameters(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checks = [
-        SimpleNamespace(name=name, holds=holds, unfinished=False, what="")
-        for name, holds in (("a", True), ("b", False), ("c", False))
+        SimpleNamespace(name=name, verdict=verdict, holds=verdict == "holds", what="")
+        for name, verdict in (("a", "holds"), ("b", "fails"), ("c", "not tried enough"))
     ]
     seen = Seen(checks)
     monkeypatch.setattr(verify_command, "verify_model", seen)

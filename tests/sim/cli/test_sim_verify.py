@@ -150,7 +150,7 @@ def test_what_breaks_the_plane_shows_in_flight(name: str, faulty: Path) -> None:
     reference = f"{faulty}:{name}"
     policy = resolve(reference)
     rule = {"too_fast": "bounds kept", "eager": "age-monotone", "forgetful": "one directive per link"}[name]
-    view = next(v for v in draw_views(2, 200) if len(v.peers) == 3 and RULES[rule](policy, v) is not None)
+    view = next(v for v in draw_views(2, 200) if len(v.peers) == 3 and RULES[rule].complaint(policy, v) is not None)
     raised = raised_ages(policy, view) if name == "eager" else None
     assert shows_in_flight(replay_scenario(rule, "", reference, {}, view, raised_age_s=raised))
     assert not shows_in_flight(replay_scenario(rule, "", "worked", {}, view, raised_age_s=raised))
