@@ -6,7 +6,6 @@ import functools
 import math
 import numbers
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -41,7 +40,7 @@ POLICIES: Mapping[str, Callable[..., Sequence[Directive]]] = MappingProxyType({
     "vantage": vantage,
     **{name: method.policy for name, method in METHODS.items()},
 })  # fmt: skip
-"""One line for each policy. Its keyword-only arguments are its parameters. A user's file cannot change it."""
+"""One line for each policy. Its keyword-only arguments are its parameters."""
 
 
 class Bound(NamedTuple):
@@ -88,15 +87,6 @@ def resolve(name: str, params: Mapping[str, object] | None = None) -> Policy:
         if limit is not None and not limit.holds(value):
             raise PolicyError(f"{name}: {key} is {value!r}, must be {limit.text}")
     return found
-
-
-def modules_of(name: str) -> tuple[Path, ...]:
-    """The files that a policy's code is in: its own and those that it imports (`imported_files`); none if registered.
-
-    Raises:
-        PolicyError: the file is missing.
-    """
-    return reference.modules_of("policy", name, PolicyError)
 
 
 def handshake_bytes(name: str, params: Mapping[str, object] | None = None) -> int:

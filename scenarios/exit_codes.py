@@ -14,5 +14,3 @@ INTERRUPTED = 128 + signal.SIGINT
 """Ctrl-C."""
 ENDED = 128 + signal.SIGTERM
 """SIGTERM."""
-STUCK = 128 + signal.SIGVTALRM
-"""Compiled code of the user does not return, so that the process was killed (SIGVTALRM)."""

@@ -16,7 +16,6 @@ again before its next one, and goes on from there.
 
 from __future__ import annotations
 
-import math
 import threading
 import weakref
 from collections.abc import Mapping
@@ -35,7 +34,7 @@ from sortie.policies.observation import CHOICES, LIMIT, ROW, Obs, directives, ob
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import DroneJoins, Scenario
 from sortie.scenarios.whole import whole
-from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.engine.sortie import fly_here
 from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version
 from sortie.sim.results.accuracy import matched
@@ -79,7 +78,7 @@ class SortieEnv(ParallelEnv):  # type: ignore[misc]
     metadata = {"name": "sortie_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012 - the library's own way
 
     def __init__(self, scenario: Scenario) -> None:
-        """Args: `scenario` with at least two drones; its policy and its `limits.run_s` are not used.
+        """Args: `scenario` with at least two drones; its policy and its `limits` are not used.
 
         Raises:
             RunError: a lone drone, which has nothing to decide.
@@ -267,9 +266,9 @@ class _Flight:
 
     def _fly(self, seed: int | None, replication: int) -> None:
         try:
-            unlimited = self._scenario.limits.model_copy(update={"run_s": math.inf})  # it waits for the learner
-            scenario = self._scenario.model_copy(update={"limits": unlimited})
-            run_sortie(scenario, self.decide, seed, replication=replication, observer=self)
+            fly_here(
+                self._scenario, self.decide, seed, replication=replication, observer=self
+            )  # it waits for the learner
         except _Closed:
             pass
         except BaseException as error:  # whatever ends the thread, or the caller would wait for ever

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sortie.scenarios.code_digest import contents, digest_of, installed
-from sortie.scenarios.plugins.reference import file_of, is_file, package_of
+from sortie.scenarios.plugins.reference import code_files, file_of, is_file, package_of
 from sortie.scenarios.plugins.user_code import imported_files, imported_packages
 from sortie.scenarios.reading.files import ensure_files, named_files, named_models
 from sortie.scenarios.regular import regular
@@ -123,7 +123,7 @@ def own_files(
     """The files beside the package that a sortie reads.
 
     Those are the files that the scenario names (models of one's own, weights, recordings, traces), the files of objects
-    that were passed in, and the modules that Python files among them import. The standard library and installed
+    that were passed in, and the modules that Python files among them have imported. The standard library and installed
     packages do not count, but for packages that offer a model which flies.
 
     Args:
@@ -136,7 +136,7 @@ def own_files(
         source, or of nothing where Python has none.
 
     Raises:
-        PluginError: a file of a model is not there.
+        PluginError: a file of a model is not there, or does not load.
         ScenarioError: another file that the scenario names is not there.
         OSError: a file cannot be read.
     """
@@ -149,7 +149,7 @@ def own_files(
     ensure_files(sections)
     named = {name: located(Path(name)) for name in named_files(sections)}
     found = {name: _digest(path) for name, path in named.items() if path.suffix != ".py"}
-    code = [path for path in named.values() if path.suffix == ".py"]
+    modules = {file for path in named.values() if path.suffix == ".py" for file in code_files(path)}
     for thing in (None if isinstance(policy, str) else policy, detector):
         function: Any = inspect.unwrap(thing.func if isinstance(thing, functools.partial) else thing)  # type: ignore[arg-type]
         function = function if inspect.isroutine(function) else type(function)
@@ -161,11 +161,10 @@ def own_files(
         except (OSError, TypeError):  # typed in, or written in C
             file, source = Path(), ""
         if file.is_file():
-            code.append(file)
+            modules.update(imported_files(file))
         else:
             found[name_of(thing)] = hashlib.sha256(source.encode()).hexdigest()[:16]
     found |= packages(named_models(sections))
-    modules = {file for path in code for file in imported_files(path)}
     return found | {_shown(path): _digest(path) for path in sorted(modules)}
 
 

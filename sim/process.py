@@ -2,16 +2,10 @@
 
 import gc
 
-from sortie.scenarios.plugins.user_calls import limit_calls
-
 ALLOCATIONS = 200_000
 """Net allocations between two looks for reference cycles; Python's own 700 cost a flight of twenty drones a tenth."""
 
 
 def own_process() -> None:
-    """Have the garbage collector run rarely, and let calls of a user's code have their limits.
-
-    Libraries must not call this: it changes the whole process.
-    """
+    """Have the garbage collector run rarely. Libraries must not call this: it changes the whole process."""
     gc.set_threshold(ALLOCATIONS)
-    limit_calls()

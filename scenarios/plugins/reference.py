@@ -17,14 +17,15 @@ from collections.abc import Callable, Mapping
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from numbers import Real
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sortie.scenarios.errors import SortieError
-from sortie.scenarios.plugins.user_calls import LOAD_S, Guarded, Source, guarded, watched
-from sortie.scenarios.plugins.user_code import imported_files, is_users, load
+from sortie.scenarios.plugins.user_calls import Guarded, Source, guarded
+from sortie.scenarios.plugins.user_code import imported_files, is_loaded, is_users, load
 
 FILE = re.compile(r".+\.py:[^\W\d]\w*")
 """`path/to/file.py:Name`."""
@@ -128,17 +129,10 @@ def file_of(kind: str, reference: str, error: type[SortieError] = PluginError) -
 
 
 def from_file(kind: str, reference: str, error: type[SortieError] = PluginError) -> Callable[..., Any]:
-    """The function or class that `path/to/file.py:Name` means. It is the user's own code and runs as such.
-
-    Calls of it are guarded (`sortie.scenarios.plugins.user_calls`): none ends the program.
-    """
+    """The function or class that `path/to/file.py:Name` means. It is the user's own code and runs as such."""
     path, attribute = file_of(kind, reference, error)
     file = str(path)
-    try:
-        with watched(LOAD_S):
-            module = Guarded(load)(path)
-    except Exception as failure:
-        raise error(f"{kind} file {file!r} does not load: {describe_error(failure)}") from failure
+    module = _loaded(path, f"{kind} file {file!r}", error)
     function = getattr(module, attribute, None)
     if not callable(function):
         raise error(f"{kind} file {file!r} has no {_thing(kind).replace('Name', 'function or class')} {attribute!r}")
@@ -148,6 +142,24 @@ def from_file(kind: str, reference: str, error: type[SortieError] = PluginError)
         raise error(f"{kind} file {file!r}: {attribute!r} names no parameters, must be a Python function") from failure
     plain = function.__wrapped__ if isinstance(function, Guarded) else function  # whose own file may be another one
     return Guarded(plain, Source(path, attribute, vars(module)))
+
+
+def code_files(path: Path) -> tuple[Path, ...]:
+    """The files that a user's code is in: a file of models and all that it imports. It is loaded where it is not yet.
+
+    Raises:
+        PluginError: it does not load.
+    """
+    if not is_loaded(path):
+        _loaded(path, f"file {str(path)!r}", PluginError)
+    return imported_files(path)
+
+
+def _loaded(path: Path, what: str, error: type[SortieError]) -> ModuleType:
+    try:
+        return load(path)
+    except (Exception, SystemExit) as failure:
+        raise error(f"{what} does not load: {describe_error(failure)}") from failure
 
 
 def _from_package(kind: str, entry: EntryPoint, error: type[SortieError]) -> Callable[..., Any]:
@@ -169,8 +181,7 @@ def describe_error(error: BaseException, called: Any = None) -> str:
     lines = _lines_outside(error) or _defined(called)
     own = next((top for top, _, _ in lines if is_users(top)), lines[0][0] if lines else "")
     place = next((f" ({Path(file).name}, line {n})" for top, file, n in reversed(lines) if top == own), "")
-    text = f"{error if isinstance(error, SortieError) else f'{type(error).__name__}: {error}'}{place}"
-    return text.encode(errors="backslashreplace").decode()  # a table and a terminal take no half of a surrogate pair
+    return f"{error if isinstance(error, SortieError) else f'{type(error).__name__}: {error}'}{place}"
 
 
 def passes_through_users(error: BaseException) -> bool:
@@ -257,15 +268,13 @@ def real_array(values: object) -> NDArray[np.float64] | None:
 
 def _shown(answer: object) -> str:
     """What a model returned, short enough for a line."""
-    text = repr(answer).encode(errors="backslashreplace").decode().replace("\n", " ")
+    text = repr(answer).replace("\n", " ")
     return text if len(text) <= 60 else f"{type(answer).__name__} {text[:60]}…"
 
 
 class Guard:
-    """A user's object as everything else calls it: errors of its methods are of one line, and none ends the program.
-
-    It has the public methods and attributes of the object, as they were when it was made.
-    """
+    """A user's object as everything else calls it: errors of its methods are of one line. It has the object's public
+    methods and attributes."""
 
     def __init__(
         self, kind: str, model: object, needed: tuple[str, ...] = (), name: str | None = None, *, timed: bool = True
@@ -275,7 +284,7 @@ class Guard:
             model: the user's object.
             needed: methods that it must have.
             name: the name in the record; None keeps the object's own.
-            timed: whether a call has the limit of a decision (`watched`).
+            timed: whether `limits.decision_s` is for calls of it.
 
         Raises:
             PluginError: a method is missing.
@@ -292,11 +301,6 @@ class Guard:
                 setattr(self, attribute, value)
         if name is not None:
             self.name = name
-
-
-def modules_of(kind: str, reference: str, error: type[SortieError] = PluginError) -> tuple[Path, ...]:
-    """The files that a model's code is in: its own and those that it imports; none unless it is `file.py:Name`."""
-    return imported_files(file_of(kind, reference, error)[0]) if is_file(reference) else ()
 
 
 def package_of(kind: str, reference: str) -> tuple[str, str] | None:

@@ -1,42 +1,36 @@
-"""A user's Python file as a module that can import the modules beside it, and the files that such a module imports.
+"""A user's Python file as a module that imports what lies beside it, and the files that it has imported.
 
-`load` runs a file. Its imports look in the file's own folder first, as they do for a script: `import helper` finds
-helper.py beside it, `from . import helper` does too, and so do imports inside functions. Python's standard library and
-Sortie itself always come first. Nothing is added to `sys.path`, and the modules are registered under names that the
-modules of no other file can have. Two files in two folders, each with a helper.py of its own, therefore get their own.
-`importlib.import_module` does not look in the folder.
-
-`imported_files` reads the same imports from the sources, without running them.
+`load` runs a file as a module of a package. The package has a name that is made of the file's path, and the file's own
+folder as its place, so two files in two folders, each with a helper.py, get their own. `from . import helper` is plain
+Python there. `import helper` means the same, also inside functions: when a source is compiled, the package's name is
+put before the names of modules that lie beside the file. The standard library and Sortie come before the folder,
+installed packages after it, as for a script.
 """
 
 from __future__ import annotations
 
 import ast
-import builtins
 import functools
 import hashlib
-import importlib
 import importlib.util
 import sys
-import sysconfig
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.abc import MetaPathFinder
-from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec, SourceFileLoader
+from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader, FileFinder, ModuleSpec, SourceFileLoader
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import NamedTuple
+from typing import Any
 
 PREFIX = "sortie_user_"
 """The first part of the name of every module that `load` registers."""
-_STDLIB = Path(sysconfig.get_path("stdlib"))
 _INSTALLED = {"site-packages", "dist-packages"}
 _LOADING = threading.RLock()
 
 
 def load(path: Path) -> ModuleType:
-    """Run a file as a new module, with new modules for all that it imports from its folder.
+    """Run a file as it is now, as a new module, with new modules for all that it imports from its folder.
 
     Args:
         path: the file.
@@ -44,7 +38,23 @@ def load(path: Path) -> ModuleType:
     Raises:
         Exception: what the file, or a module that it imports, raises.
     """
-    return _Folder(path.resolve()).load()
+    path = path.resolve()
+    package = ModuleType(_package(path))
+    package.__path__ = [str(path.parent)]
+    name = f"{package.__name__}.{path.stem.replace('.', '_')}"
+    spec = importlib.util.spec_from_file_location(name, path, loader=_Loader(name, str(path)))
+    assert spec is not None and spec.loader is not None  # noqa: S101, PT018 - a loader was given
+    module = importlib.util.module_from_spec(spec)
+    with _LOADING:
+        for old in [name for name in sys.modules if _top(name) == package.__name__]:
+            del sys.modules[old]
+        sys.modules.update({package.__name__: package, name: module})
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[package.__name__], sys.modules[name]
+            raise
+    return module
 
 
 def is_users(name: object) -> bool:
@@ -52,119 +62,92 @@ def is_users(name: object) -> bool:
     return str(name).startswith(PREFIX)
 
 
-def imported_files(path: Path) -> tuple[Path, ...]:
-    """A file and every module that it imports, directly or through others, sorted.
+def is_loaded(path: Path) -> bool:
+    """Whether `load` has run a file."""
+    return _package(path.resolve()) in sys.modules
 
-    Modules of the standard library, of installed packages (site-packages) and of Sortie are left out. Imports inside
-    functions count, and so do `importlib.import_module` and `__import__` with a constant name. Three things are not
-    seen: an import that is not found, a name that is worked out while the program runs, and a file read as data.
+
+def imported_files(path: Path) -> tuple[Path, ...]:
+    """A file and every module that it has imported, directly or through others, sorted.
+
+    Modules that are loaded now count, and those beside the file that its functions will import by their plain names.
+    Modules of the standard library, of installed packages (site-packages) and of Sortie are left out.
     """
-    return tuple(sorted({source.path for source in _sources(path)}))
+    return tuple(sorted(_imports(path.resolve())))
 
 
 def imported_packages(path: Path) -> set[str]:
-    """The installed packages of which a file and the modules beside it import something, by their names on the index."""
-    imports = {(s.folder, name.partition(".")[0]) for s in _sources(path) for name, _, level in _named(s) if not level}
-    names = {top for folder, top in imports if not (_is_pythons(top) or (folder and _is_beside(folder, top)))}
-    return {package for name in names for package in _offered_by().get(name, ())}
+    """The installed packages that `imported_files` of a file import, by their names on the index."""
+    return {
+        package
+        for names in _imports(path.resolve()).values()
+        for name in names
+        for package in _offered_by().get(name, ())
+    }
 
 
 # --- running ---------------------------------------------------------------------------------------
 
 
-class _Folder(MetaPathFinder):
-    """The modules of one run of a file, found in the file's folder."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._package = PREFIX + hashlib.sha256(str(path).encode()).hexdigest()[:16]
-        self._main = f"{self._package}.{path.stem.replace('.', '_')}"
-        package = ModuleType(self._package)
-        package.__path__ = [str(path.parent)]
-        self._modules = {self._package: package}
-        self._beside: dict[str, bool] = {}
-        self.builtins = vars(builtins) | {"__import__": self._import}
-
-    def load(self) -> ModuleType:
-        self._registered(self._main)
-        return self._modules[self._main]
-
-    def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Where a module of this run is. Python calls this while `_registered` imports."""
-        if not name.startswith(f"{self._package}."):
-            return None
-        where = self._path if name == self._main else _find(path or (), name.rpartition(".")[2])
-        if where is None:
-            return None
-        if where.is_dir():
-            spec = ModuleSpec(name, None, is_package=True)
-            spec.submodule_search_locations = [str(where)]
-            return spec
-        loader = _Loader(name, where, self) if where.suffix == ".py" else None
-        return importlib.util.spec_from_file_location(name, where, loader=loader)
-
-    def _import(
-        self,
-        name: str,
-        globals: Mapping[str, object] | None = None,
-        locals: Mapping[str, object] | None = None,
-        fromlist: Sequence[str] | None = (),
-        level: int = 0,
-    ) -> ModuleType:
-        """`__import__` as the modules of this run see it."""
-        package, top = str((globals or {}).get("__package__")), name.partition(".")[0]
-        if level and is_users(package):
-            return self._registered(importlib.util.resolve_name("." * level + name, package), fromlist)
-        if level or not self._is_beside(top):
-            return __import__(name, globals, locals, fromlist or (), level)
-        module = self._registered(f"{self._package}.{name}", fromlist)
-        return module if fromlist else self._modules[f"{self._package}.{top}"]
-
-    def _is_beside(self, top: str) -> bool:
-        if top not in self._beside:
-            self._beside[top] = _is_beside(self._path.parent, top)
-        return self._beside[top]
-
-    def _registered(self, name: str, fromlist: Sequence[str] | None = ()) -> ModuleType:
-        """Import a module of this run by the name that it is registered under."""
-        known = self._modules.get(name)
-        if known is not None and all(hasattr(known, item) for item in fromlist or ()):
-            return known
-        with _LOADING:
-            outermost = self not in sys.meta_path  # otherwise a module that is being imported imports another
-            if outermost:
-                for other in self._in_sys():  # another run of the same file
-                    del sys.modules[other]
-                sys.modules.update(self._modules)
-                sys.meta_path.insert(0, self)
-            try:
-                return __import__(name, fromlist=fromlist) if fromlist else importlib.import_module(name)
-            finally:
-                self._modules.update({n: sys.modules[n] for n in self._in_sys()})
-                if outermost:
-                    sys.meta_path.remove(self)
-
-    def _in_sys(self) -> list[str]:
-        return [name for name in sys.modules if name.partition(".")[0] == self._package]
-
-
 class _Loader(SourceFileLoader):
     """Runs a source as it is now: it neither reads nor writes compiled files."""
 
-    def __init__(self, name: str, path: Path, folder: _Folder) -> None:
-        super().__init__(name, str(path))
-        self.folder = folder
-
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
-        return self.source_to_code(self.get_data(path), path)
+        tree = ast.parse(self.get_data(path), path)
+        package = _top(fullname)
+        (folder,) = sys.modules[package].__path__
+        code: CodeType = self.source_to_code(_Beside(package, folder).visit(tree), path)
+        return code
 
-    def exec_module(self, module: ModuleType) -> None:
-        vars(module)["__builtins__"] = self.folder.builtins
-        super().exec_module(module)
+
+class _Beside(ast.NodeTransformer):
+    """Puts the package's name before the modules beside a file in plain imports."""
+
+    def __init__(self, package: str, folder: str) -> None:
+        self._package, self._folder = package, folder
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.ImportFrom:
+        if not node.level and node.module is not None and _is_beside(self._folder, _top(node.module)):
+            node.module = f"{self._package}.{node.module}"
+        return node
+
+    def visit_Import(self, node: ast.Import) -> list[ast.stmt]:
+        found: list[ast.stmt] = []
+        for alias in node.names:
+            top = _top(alias.name)
+            if not _is_beside(self._folder, top):
+                found.append(ast.Import([alias]))
+                continue
+            found.append(ast.Import([ast.alias(f"{self._package}.{alias.name}", alias.asname)]))
+            if alias.asname is None:
+                found.append(ast.ImportFrom(self._package, [ast.alias(top)], 0))
+        return [ast.fix_missing_locations(ast.copy_location(statement, node)) for statement in found]
 
 
-# --- finding ---------------------------------------------------------------------------------------
+class _Finder(MetaPathFinder):
+    """Finds the modules of users' packages; Python's own finder would have them by other loaders."""
+
+    def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if not is_users(name):
+            return None
+        return next((spec for folder in path or () if (spec := _found(folder, name)) is not None), None)
+
+
+sys.meta_path.insert(0, _Finder())
+
+
+def _package(path: Path) -> str:
+    return PREFIX + hashlib.sha256(str(path).encode()).hexdigest()[:16]
+
+
+def _top(name: str) -> str:
+    return name.partition(".")[0]
+
+
+def _found(folder: str, name: str) -> ModuleSpec | None:
+    """Where a module is in a folder; a folder without __init__.py counts as in Python."""
+    return FileFinder(folder, (ExtensionFileLoader, EXTENSION_SUFFIXES), (_Loader, [".py"])).find_spec(name)
 
 
 def _is_pythons(top: str) -> bool:
@@ -172,103 +155,56 @@ def _is_pythons(top: str) -> bool:
     return top == "sortie" or top in sys.stdlib_module_names
 
 
-def _is_beside(folder: Path, top: str) -> bool:
+def _is_beside(folder: str, top: str) -> bool:
     """Whether a name means a module in a user's folder.
 
     A folder without __init__.py counts only where no installed package has its name, as everywhere in Python.
     """
-    found = None if _is_pythons(top) else _find([folder], top)
-    return found is not None and (found.is_file() or _on_path(top) is None)
+    found = None if _is_pythons(top) else _found(folder, top)
+    return found is not None and (found.loader is not None or importlib.util.find_spec(top) is None)
 
 
-def _find(folders: Iterable[str | Path], name: str) -> Path | None:
-    """A package's __init__.py, a module's file, or else a folder without __init__.py."""
-    names = [f"{name}/__init__.py", *(name + suffix for suffix in (*EXTENSION_SUFFIXES, ".py"))]
-    paths = [[Path(folder, file) for file in names] for folder in folders]
-    files = (path for inside in paths for path in inside if path.is_file())
-    return next(files, None) or next((path[0].parent for path in paths if path[0].parent.is_dir()), None)
+# --- what was loaded -------------------------------------------------------------------------------
 
 
-def _on_path(top: str) -> ModuleSpec | None:
-    """Where Python finds a module outside the user's folder."""
+def _imports(path: Path) -> Mapping[Path, set[str]]:
+    """A file and the modules that it has imported: by their files, the first names of what they import from outside."""
+    loaded = [(_top(name), file) for name, module in tuple(sys.modules.items()) if (file := _file(name, module))]
+    beside = {file for top, file in loaded if top == _package(path)}
+    found: dict[Path, set[str]] = {}
+    waiting = {path}
+    while waiting:
+        here = waiting.pop()
+        named = {top for top in _named(here) if not _is_pythons(top)}
+        if here in beside:
+            near = {top for top in named if _is_beside(str(path.parent), top)}
+            origins = {spec.origin for top in near if (spec := _found(str(path.parent), top)) is not None}
+            beside |= {Path(origin) for origin in origins if origin is not None}
+            waiting |= beside - found.keys()
+            named -= near
+        found[here] = named
+        tops = named | {top for top, file in loaded if file == here}  # the modules of its own package
+        waiting |= {file for top, file in loaded if top in tops} - found.keys()
+    return found
+
+
+def _file(name: str, module: Any) -> Path | None:
+    """The file of a loaded module, unless it is of the standard library, of an installed package or of Sortie."""
+    file = None if _is_pythons(_top(name)) else getattr(module, "__file__", None)
+    return Path(file) if isinstance(file, str) and not _INSTALLED & set(Path(file).parts) else None
+
+
+def _named(path: Path) -> set[str]:
+    """The first names of what a source imports, also inside functions."""
     try:
-        return importlib.util.find_spec(top)
-    except (ImportError, ValueError):
-        return None
+        nodes = [*ast.walk(ast.parse(path.read_bytes()))]
+    except (SyntaxError, ValueError):  # a compiled module
+        return set()
+    plain = {_top(alias.name) for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    return plain | {_top(n.module) for n in nodes if isinstance(n, ast.ImportFrom) and n.module and not n.level}
 
 
 @functools.cache
 def _offered_by() -> Mapping[str, list[str]]:
     """The installed packages by the modules that they offer."""
     return packages_distributions()
-
-
-# --- reading ---------------------------------------------------------------------------------------
-
-
-class _Source(NamedTuple):
-    """A source file."""
-
-    path: Path
-    folder: Path | None
-    """The user's folder, in which its imports look first; None for a module that Python found on `sys.path`."""
-
-
-def _sources(path: Path) -> set[_Source]:
-    """A file and every module that it imports, directly or through others."""
-    waiting, found = [_Source(path.resolve(), path.resolve().parent)], set[_Source]()
-    while waiting:
-        source = waiting.pop()
-        if source not in found:
-            found.add(source)
-            for name, item, level in _named(source):
-                waiting += _chain(source, name, item, level)
-    return found
-
-
-def _named(source: _Source) -> Iterator[tuple[str, str, int]]:
-    """What a source imports: the module, the name within it, and the number of dots before it."""
-    try:
-        tree = ast.parse(source.path.read_bytes())
-    except (SyntaxError, ValueError):  # a compiled module, or a source that fails with this error when it is run
-        return
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, "", 0
-        elif isinstance(node, ast.ImportFrom):
-            for alias in node.names:
-                yield node.module or "", alias.name, node.level
-        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
-            called, name = getattr(node.func, "attr", getattr(node.func, "id", "")), node.args[0].value
-            if called in ("import_module", "__import__") and isinstance(name, str) and name.strip("."):
-                yield name.lstrip("."), "", len(name) - len(name.lstrip("."))
-
-
-def _chain(source: _Source, name: str, item: str, level: int) -> Iterator[_Source]:
-    """The packages on the way to a module, the module, and its submodule `item` (all of them for `*`)."""
-    folder = source.folder
-    folders: Sequence[str | Path]
-    if level:
-        folders = source.path.parents[level - 1 : level]
-    else:
-        top = name.partition(".")[0]
-        if _is_pythons(top):
-            return
-        if folder is not None and _is_beside(folder, top):
-            folders = [folder]
-        else:
-            folder, spec = None, _on_path(top)
-            places = [] if spec is None else spec.submodule_search_locations or [spec.origin or ""]
-            folders = [Path(place).parent for place in places]
-    for part in [*name.split("."), item]:
-        if part in ("", "*"):
-            continue
-        found = _find(folders, part)
-        if found is None or (folder is None and (_INSTALLED & set(found.parts) or found.is_relative_to(_STDLIB))):
-            return
-        if found.is_file():
-            yield _Source(found, folder)
-        folders = [found.parent] if found.stem == "__init__" else [found] if found.is_dir() else []
-    if item == "*":
-        yield from (_Source(path, folder) for place in folders for path in Path(place).glob("*.py"))

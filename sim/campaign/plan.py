@@ -19,7 +19,7 @@ import numpy as np
 
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import resolve
-from sortie.scenarios.plugins.user_code import imported_files
+from sortie.scenarios.plugins.reference import code_files
 from sortie.scenarios.reading.campaign import Study, extremes
 from sortie.scenarios.reading.files import (
     found_beside,
@@ -287,7 +287,7 @@ def file_digests(names: Sequence[str]) -> dict[str, str]:
     for path in map(Path, names):
         inside = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
         if path.suffix == ".py" and path.is_file():
-            inside = list(imported_files(path))
+            inside = list(code_files(path))
         for file in inside:
             try:
                 digests[str(file)] = file_digest(file)

@@ -1,32 +1,35 @@
 """Processes in which runs fly, beside the driver's, or beside a cluster's worker where policies of a user's own fly.
 
-What ends such a process, or cannot be interrupted, is one failed run, and the next one flies in a new process.
+What ends such a process, or takes longer than a limit, is one failed run, and the next one flies in a new process.
 """
 
 from __future__ import annotations
 
 import itertools
-import multiprocessing
-import os
 import queue
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection
+from functools import partial
 
-from sortie.scenarios.exit_codes import FAILED
+from sortie.sim.apart import Apart, DiedError, LimitError
 from sortie.sim.campaign.signals import undisturbed
-from sortie.sim.campaign.work import RunResult, Task, flies_user_code, fly_in_worker, killed, stuck
+from sortie.sim.campaign.work import (
+    RunResult,
+    Task,
+    flies_user_code,
+    fly_in_worker,
+    fly_one,
+    killed,
+    late,
+    limits_of,
+)
 
 AHEAD = 2
 """Tasks given out per worker: one flies, one waits."""
 ATTEMPTS = 4
 """As often as dask's scheduler tries a run whose worker dies: a process may be killed for no fault of the run."""
-_BEGIN = "from sortie.sim.campaign.processes import serve; serve({})"
 
 
 class Turns:
@@ -54,16 +57,12 @@ class Turns:
 
 
 class OneProcess:
-    """Flies one run after the other in a process of its own.
-
-    It is started by `-P`, so that no module of the working folder takes the place of an installed one.
-    """
+    """Flies one run after the other in a process of its own, which ends where a run takes longer than its limits."""
 
     def __init__(self, memory_b: int | None = None, turns: Turns | None = None) -> None:
         """Args: `memory_b` is what it may take; `turns` are those of all processes on this machine."""
         self.memory_b, self._turns = memory_b, turns or Turns()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._pipe: Connection | None = None
+        self._process: Apart | None = None
         self._ended = False
         self._starting = threading.Lock()
 
@@ -72,52 +71,43 @@ class OneProcess:
         with self._starting:
             self._ended = True
             if self._process is not None:
-                self._process.kill()
+                self._process.end()
 
     def close(self) -> None:
         """End the process; nobody flies with it any more."""
         self.end()
         if self._process is not None:
-            self._process.wait()
-        if self._pipe is not None:
-            self._pipe.close()
+            self._process.close()
 
     def fly(self, code: str, task: Task) -> RunResult:
         """One run's row. Raises what the worker raises: RunError for other code or files; EOFError after `end`."""
+        work, limits = partial(fly_one, code, task, self.memory_b), limits_of(task)
         for attempt in range(1, ATTEMPTS + 1):
             with self._turns.turn(alone=attempt == ATTEMPTS):  # others may have filled the memory
-                answer = self._answer(code, task)
-            if isinstance(answer, Exception):
-                raise answer
-            if isinstance(answer, RunResult):
-                return answer
-            if answer == -signal.SIGVTALRM:
-                return stuck(task, code)
+                process = self._started()
+                try:
+                    row: RunResult = process.call(work, limits)
+                    return row
+                except LimitError as error:
+                    self._replace(process)
+                    return late(task, code, error)
+                except DiedError:
+                    self._replace(process)
         return killed(task, code)
 
-    def _answer(self, code: str, task: Task) -> RunResult | Exception | int:
-        """The run's row, what the worker raised, or the exit code of a process that has ended."""
-        process, pipe = self._started()
-        try:
-            pipe.send((code, task, self.memory_b))
-            answer: RunResult | Exception = pipe.recv()
-            return answer
-        except (EOFError, OSError):
-            pipe.close()
-            self._pipe = None
-            return process.wait()
-
-    def _started(self) -> tuple[subprocess.Popen[bytes], Connection]:
+    def _started(self) -> Apart:
         with self._starting:
             if self._ended:
                 raise EOFError
-            if self._process is None or self._pipe is None:
-                self._pipe, theirs = multiprocessing.Pipe()
-                self._process = subprocess.Popen(  # noqa: S603 - our own code
-                    [sys.executable, "-P", "-c", _BEGIN.format(theirs.fileno())], pass_fds=[theirs.fileno()]
-                )
-                theirs.close()
-            return self._process, self._pipe
+            if self._process is None:
+                self._process = Apart()
+            return self._process
+
+    def _replace(self, process: Apart) -> None:
+        """The next run flies in a new process."""
+        with self._starting:
+            process.close()
+            self._process = None
 
 
 class Processes:
@@ -187,27 +177,3 @@ def fly_apart(code: str, tasks: Sequence[Task], memory_b: int | None = None) -> 
 
 
 _OF_THREAD = threading.local()
-
-
-def serve(file: int) -> None:
-    """Fly what comes in until the driver is gone."""
-    pipe, driver = Connection(file), os.getppid()
-    threading.Thread(target=_end_with, args=(driver,), daemon=True).start()
-    while True:
-        try:
-            code, task, memory_b = pipe.recv()
-        except (EOFError, OSError):  # the driver was killed
-            return
-        try:
-            answer: RunResult | Exception = fly_in_worker(code, [task], memory_b)[0][0]
-        except Exception as error:
-            answer = error
-        with suppress(OSError):
-            pipe.send(answer)
-
-
-def _end_with(driver: int) -> None:
-    """End this process when the driver is gone, also in the middle of a run."""
-    while os.getppid() == driver:
-        time.sleep(0.5)
-    os._exit(FAILED)

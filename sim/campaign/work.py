@@ -23,10 +23,12 @@ from sortie.policies.contract import Policy
 from sortie.scenarios.code_digest import installed
 from sortie.scenarios.plugins.reference import package
 from sortie.scenarios.reading.nodes import ScenarioError
-from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema import Limits, Scenario
+from sortie.scenarios.schema.limits import IN_CAMPAIGNS
+from sortie.sim.apart import LimitError
 from sortie.sim.campaign.memory import limited
 from sortie.sim.check.expectations import metric
-from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.engine.sortie import fly_here, run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.identity import codes_here, file_digest
 from sortie.sim.process import own_process
@@ -88,6 +90,11 @@ def fly_in_worker(code: str, tasks: Sequence[Task], memory_b: int | None = None)
     return fly_batch(code, tasks, memory_b)
 
 
+def fly_one(code: str, task: Task, memory_b: int | None) -> RunResult:
+    """`fly_in_worker` for one run."""
+    return fly_in_worker(code, [task], memory_b)[0][0]
+
+
 def fly_task(task: str) -> SortieRecord:
     """One run's record.
 
@@ -95,7 +102,7 @@ def fly_task(task: str) -> SortieRecord:
         ScenarioError, PolicyError, ...: whatever a sortie raises.
     """
     scenario, seed, replication = unpack(task)
-    return run_sortie(scenario, None, seed, replication=replication)
+    return fly_here(scenario, None, seed, replication=replication)
 
 
 def unpack(task: str) -> tuple[Scenario, int, int]:
@@ -152,11 +159,15 @@ def killed(task: Task, code: str) -> RunResult:
     return _without_result(task, code, "WorkerDied: on every attempt")
 
 
-def stuck(task: Task, code: str) -> RunResult:
-    """The row of a run whose policy could not be interrupted."""
-    limit_s = json.loads(task[1])["scenario"]["limits"]["decision_s"]
-    what = f"no answer within {limit_s:g} s (limits.decision_s), and no interruption either"
-    return _without_result(task, code, f"TookTooLongError: {what}")
+def late(task: Task, code: str, error: LimitError) -> RunResult:
+    """The row of a run that took longer than its limits."""
+    return _without_result(task, code, in_line(error, MAX_ERROR))
+
+
+def limits_of(task: Task) -> Limits:
+    """The limits of a task's run."""
+    limits = json.loads(task[1])["scenario"]["limits"]
+    return Limits(**IN_CAMPAIGNS | {name: value for name, value in limits.items() if value is not None})
 
 
 def _without_result(task: Task, code: str, error: str) -> RunResult:

@@ -32,7 +32,6 @@ from sortie.policies.verification.proof.allowed import why_not_provable
 from sortie.policies.verification.proof.ranges import FleetOfRanges, region_axes
 from sortie.policies.verification.proof.search import Run, rosters
 from sortie.policies.verification.proof.symbols import Path, Ranged, Refused, explore
-from sortie.scenarios.plugins.user_calls import text_of
 
 MOST_CELLS, MOST_STATES = 20_000, 200_000
 MOST_TUPLES = 400
@@ -151,7 +150,7 @@ class _Proof:
         except PolicyError as error:
             raise NotFinite(f"it breaks the contract: {error}") from None
         except Exception as error:
-            raise NotFinite(f"it raises {type(error).__name__}: {text_of(error, str)}") from None
+            raise NotFinite(f"it raises {type(error).__name__}: {error}") from None
         asked, links = {d.destination: _plain(d, view.ego) for d in answer}, list[tuple[int, int]]()
         for peer in decided.system.peers:
             capped = cap_by_age(asked.get(peer, _AT_REST), self._plane.health(view.age_s[peer]), None)

@@ -25,7 +25,6 @@ from sortie.policies.verification.shield import check_shieldable
 from sortie.policies.verification.subject import OWN_INVARIANTS, own_invariants
 from sortie.scenarios.exit_codes import FAILED
 from sortie.scenarios.plugins.reference import Params
-from sortie.scenarios.plugins.user_calls import DECISION_S, LOAD_S, watched
 from sortie.scenarios.reading.load import build, dump, loads
 from sortie.scenarios.regular import regular
 from sortie.scenarios.schema import PolicySection, Scenario
@@ -110,30 +109,28 @@ def verify(
     policy, section = reference, _section(reference)
     flown = None if scenario is None else sortie.load(scenario)
     decide = resolve(section.name, section.params)
-    with watched(LOAD_S):
-        rules = _invariants(section.name, decide, invariants)
+    rules = _invariants(section.name, decide, invariants)
     _ensure_own(out_dir / slug(policy))
     over_time = [rule for rule in rules if rule.over_time]
     if flown is not None and flown.policy.shield:
         _ensure_shieldable(flown, over_time)
-    with watched(DECISION_S):
-        broken, kept = _try(
-            policy, section, decide, [r for r in rules if not r.over_time], drones, budget, views, bool(over_time)
+    broken, kept = _try(
+        policy, section, decide, [r for r in rules if not r.over_time], drones, budget, views, bool(over_time)
+    )
+    if over_time:
+        subject = Subject(decide, section.name, section.params)
+        verdicts = judge_over_time(
+            subject,
+            over_time,
+            drones=drones,
+            scenario=flown,
+            courses=courses,
+            flights=flights,
         )
-        if over_time:
-            subject = Subject(decide, section.name, section.params)
-            verdicts = judge_over_time(
-                subject,
-                over_time,
-                drones=drones,
-                scenario=flown,
-                courses=courses,
-                flights=flights,
-            )
-            out.print(_verdicts(f"{policy}: over time, as the gates enforce it", verdicts))
-            broken += sum(v.outcome == "refuted" for v in verdicts)
-            kept += [(v.name, v.view, v.scenario) for v in verdicts if v.scenario is not None]
-        _keep(out_dir / slug(policy), kept)
+        out.print(_verdicts(f"{policy}: over time, as the gates enforce it", verdicts))
+        broken += sum(v.outcome == "refuted" for v in verdicts)
+        kept += [(v.name, v.view, v.scenario) for v in verdicts if v.scenario is not None]
+    _keep(out_dir / slug(policy), kept)
     if broken:
         print_failure(f"{broken} {'do' if broken > 1 else 'does'} not hold")
         raise typer.Exit(FAILED)
@@ -143,8 +140,7 @@ def _verify_model(kind: str, reference: str) -> None:
     """Print what a kind's kit says of a model. Exit code 1 if a rule fails."""
     name, params = _called(reference, kind)
     table = Table("rule", "verdict", "what", title=f"{reference}: the conformance kit of kind {kind}")
-    with watched(DECISION_S):
-        checks = verify_model(kind, name, params)
+    checks = verify_model(kind, name, params)
     for check in checks:
         table.add_row(check.name, _verdict(check.verdict), check.what)
     out.print(table)

@@ -119,9 +119,8 @@ class FleetHandle:
             raise PluginError(f"event {self._event.model}: drone {drone!r:.60}, {must}")
 
     def _check_text(self, text: object) -> None:
-        """The record holds text that UTF-8 can write."""
-        if not isinstance(text, str) or any("\ud800" <= letter <= "\udfff" for letter in text):
-            raise PluginError(f"event {self._event.model}: text {text!r:.60}, must be a str that UTF-8 can write")
+        if not isinstance(text, str):
+            raise PluginError(f"event {self._event.model}: text {text!r:.60}, must be a str")
 
 
 def _read_only(values: NDArray[Any]) -> NDArray[Any]:

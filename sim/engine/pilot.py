@@ -89,11 +89,6 @@ class PolicyPlan(NamedTuple):
         }
 
     @property
-    def of_users(self) -> bool:
-        """Whether any of its policies is a user's own code."""
-        return any(is_guarded(policy.decide) for policy in self.policies.values())
-
-    @property
     def chooses_viewpoints(self) -> bool:
         """Whether any of its policies chooses viewpoints."""
         return any(viewpoint_of(policy.decide) is not None for policy in self.policies.values())

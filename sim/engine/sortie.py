@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from time import perf_counter  # before a user's file may replace it in its module
-from typing import Protocol
+from time import perf_counter
+from types import SimpleNamespace
+from typing import Any, Protocol, cast
 
 import pyarrow as pa
 import simpy
@@ -31,10 +31,10 @@ from sortie.policies.contract import Policy
 from sortie.radio import Air
 from sortie.radio.event_loop import EventLoop
 from sortie.radio.rates import STANDARDS
-from sortie.scenarios.errors import SortieError
-from sortie.scenarios.plugins.user_calls import guarded, watched
+from sortie.scenarios.plugins.user_calls import guarded
 from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.streams import stream
+from sortie.sim.apart import Said, call_within
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
@@ -55,7 +55,7 @@ from sortie.sim.engine.steering import Steering, area_m
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, air_settings, cars_in_reach
-from sortie.sim.identity import code_version, name_of, own_files, runs_user_code
+from sortie.sim.identity import code_version, name_of, own_files
 from sortie.sim.results import beliefs, disagreement, rosters
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 from sortie.sim.results.views import TABLES as VIEW_TABLES
@@ -81,10 +81,6 @@ class Observer(Protocol):
 
     def begin(self, scenario: Scenario, scene: SceneModel) -> None: ...
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None: ...
-
-
-class LimitError(SortieError):
-    """A flight that takes longer than it may."""
 
 
 DetectorMaker = Callable[[SceneModel, Perception, int, int], Detector | None]
@@ -115,42 +111,67 @@ def run_sortie(
     Returns:
         The record; equal (scenario, policy, seed, replication, version) give equal records and fingerprints.
 
+    A scenario with `limits` flies in a process of its own, which ends there. With a `detector_of` of its caller it flies
+    here, without limits.
+
     Raises:
-        PolicyError: an unknown policy, or one that breaks its contract, fails, or takes longer than `limits.decision_s`.
-        LimitError: the flight takes longer than `limits.run_s`.
+        PolicyError: an unknown policy, or one that breaks its contract or fails.
+        LimitError: the flight, or a call of the user's code in it, takes longer than `limits`.
+        DiedError: the process of a flight with limits ended.
+        RunError: the flight has limits, and the policy is a function that no other process can get.
     """
+    if not scenario.limits.are_set or detector_of is not make_detector:
+        return fly_here(
+            scenario,
+            policy,
+            seed,
+            replication=replication,
+            progress=progress,
+            observer=observer,
+            detector_of=detector_of,
+        )
+    hear: dict[str, Callable[..., object]] = {}
+    if progress is not None:
+        hear["progress"] = progress
+    if observer is not None:
+        hear |= {"begin": observer.begin, "second": observer.second}
+    work = partial(
+        fly_here,
+        scenario,
+        policy,
+        seed,
+        replication=replication,
+        progress=None if progress is None else Said("progress"),
+        observer=None if observer is None else SimpleNamespace(begin=Said("begin"), second=Said("second")),
+    )
+    what = f"{scenario.name}, seed {scenario.seed if seed is None else seed}"
+    return cast("SortieRecord", call_within(scenario.limits, what, work, hear))
+
+
+def fly_here(
+    scenario: Scenario,
+    policy: str | Policy | None = None,
+    seed: int | None = None,
+    *,
+    replication: int = 0,
+    progress: Callable[[float], None] | None = None,
+    observer: Any = None,
+    detector_of: DetectorMaker = make_detector,
+) -> SortieRecord:
+    """Fly in this process, without the scenario's limits; else as `run_sortie`."""
     begin_s = perf_counter()
     LEFTOVERS.free()
     seed = scenario.seed if seed is None else seed
     name, policies = _policy(scenario, policy)
-    limits, end_s = scenario.limits, begin_s + scenario.limits.run_s
-
-    def each_second(t_s: float) -> None:
-        if perf_counter() > end_s:
-            what = f"{scenario.name}, seed {seed}: the flight"
-            raise LimitError(f"{what} takes longer than {limits.run_s:g} s (limits.run_s), and is at {t_s:g} s")
-        if progress is not None:
-            progress(t_s)
-
-    with decisions_limited(scenario, policies):
-        own = loaded(scenario)
-        parts = build(scenario, policies, seed, replication, detector_of)
-        files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited during the flight
-        with cycles_searched_rarely():
-            fly(parts, each_second, observer)
-        record = _collect(parts, policies, name, seed, replication)
-        metrics = own_metrics(own, record)
+    own = loaded(scenario)
+    parts = build(scenario, policies, seed, replication, detector_of)
+    files = own_files(scenario, policy, parts.detector)  # as they are now: a file may be edited during the flight
+    with cycles_searched_rarely():
+        fly(parts, progress, observer)
+    record = _collect(parts, policies, name, seed, replication)
+    metrics = own_metrics(own, record)
     wall = {"wall_s": perf_counter() - begin_s, **record.wall}
     return dataclasses.replace(record, own_files=files, metrics=metrics, wall=wall)
-
-
-def decisions_limited(scenario: Scenario, policies: PolicyPlan) -> AbstractContextManager[None]:
-    """Within it, no call of a user's own code takes longer than `limits.decision_s`."""
-    if not (policies.of_users or runs_user_code(scenario)):
-        return nullcontext()
-    limit_s = scenario.limits.decision_s
-    asked = "decision_s" in scenario.limits.model_fields_set
-    return watched(limit_s, f"{limit_s:g} s (limits.decision_s)", always=asked)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
+from typing import cast
 
 import numpy as np
 import pyarrow as pa
@@ -26,10 +28,11 @@ from sortie.perception.scene.height_field import HeightField
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import PERSON_FLAG, PHASE_NAMES, Disc, TaskPhase, goodput_in
-from sortie.scenarios.schema import Lie, Scenario
+from sortie.scenarios.schema import Lie, Limits, Scenario
+from sortie.sim.apart import Said, call_within
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.pilot import plan_for
-from sortie.sim.engine.sortie import build, decisions_limited, fly
+from sortie.sim.engine.sortie import build, fly
 from sortie.sim.engine.steering import area_m
 from sortie.sim.engine.tracking import FleetTracking, TargetSeen
 from sortie.sim.engine.world import INSTANT_S, cars_in_reach
@@ -84,19 +87,28 @@ def traces(scenario: Scenario, progress: Callable[[float], None] | None = None) 
     """Fly the scenario without a detector, boxes with maps and lies, and keep each drone's trace.
 
     Raises:
-        PolicyError: its policy is unknown, breaks its contract, or takes longer than `limits.decision_s`.
+        PolicyError: its policy is unknown, fails or breaks its contract.
+        LimitError: its policy takes longer than `limits.decision_s`.
     """
+    limits = Limits(decision_s=scenario.limits.decision_s)
+    if progress is None or not limits.are_set:
+        work, hear = partial(_flown, scenario, progress), {}
+    else:
+        work, hear = partial(_flown, scenario, Said("progress")), {"progress": progress}
+    return cast("list[Trace]", call_within(limits, scenario.name, work, hear) if limits.are_set else work())
+
+
+def _flown(scenario: Scenario, progress: Callable[[float], None] | None) -> list[Trace]:
+    """`traces`, in this process."""
     alone = {"detector": "none", "maps_bring_boxes": False, "match_poses": False}
     perception = scenario.perception.model_copy(update=alone)
     honest = tuple(event for event in scenario.events if not isinstance(event, Lie))
     # a roster would shorten the goodputs to those of its members; the live drone makes its own
     context = scenario.context.model_copy(update={"roster": False})
     flown = scenario.model_copy(update={"perception": perception, "context": context, "events": honest})
-    policies = plan_for(flown)
-    with decisions_limited(flown, policies):
-        parts = build(flown, policies, flown.seed)
-        bounds = area_m(flown.fleet, parts.world.motion.bounds_m())
-        fly(parts, progress)
+    parts = build(flown, plan_for(flown), flown.seed)
+    bounds = area_m(flown.fleet, parts.world.motion.bounds_m())
+    fly(parts, progress)
     tables = parts.recorder.finish()
     return [
         _trace(scenario, drone, _only(parts.world.motion, drone), bounds, tables)

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, PolicyError, Reposition, nothing
 from sortie.policies.registry import viewpoint_of
-from sortie.scenarios.plugins.user_calls import watched
 from sortie.scenarios.representation import NAME_OF
 from sortie.sim.engine.pilot import NamedPolicy, PolicyPlan, ask, ask_viewpoint
 from sortie.sim.folders import RunError
@@ -45,16 +44,15 @@ def replay(record: SortieRecord, plan: PolicyPlan, *, as_flown: bool, disagreeme
     differences: list[Difference] = []
     decided, directives = Counter[int](), 0
     kept = list(kept_decisions(record))
-    measured, limit_s = None, record.scenario.limits.decision_s
-    with watched(limit_s, f"{limit_s:g} s (limits.decision_s)"):
-        for decision in kept:
-            policy = chosen(decision)
-            flown[decision.policy] = again[policy.name] = None
-            directives += len(decision.view.peers)
-            differences += compare(decision, decided[decision.drone], *decide_again(policy, decision))
-            decided[decision.drone] += 1
-        if disagreement:
-            measured = figures(measure(kept, lambda decision: chosen(decision).decide, record.scenario.frame_s))
+    measured = None
+    for decision in kept:
+        policy = chosen(decision)
+        flown[decision.policy] = again[policy.name] = None
+        directives += len(decision.view.peers)
+        differences += compare(decision, decided[decision.drone], *decide_again(policy, decision))
+        decided[decision.drone] += 1
+    if disagreement:
+        measured = figures(measure(kept, lambda decision: chosen(decision).decide, record.scenario.frame_s))
     return Replay(", ".join(flown), ", ".join(again), len(kept), directives, tuple(differences), measured)
 
 

@@ -19,10 +19,6 @@ BEFORE = {p: Directive(VIEW.ego, p, Representation.FEATURES, 0.5, rate_hz=10.0, 
 FIRST, SECOND, *REST = ANSWER = tuple(BEFORE.values())
 
 
-class Own(Directive):
-    """A type of a policy's own, which may read differently the next time."""
-
-
 PEERS = st.sets(st.sampled_from(list(BEFORE)))
 
 
@@ -46,7 +42,6 @@ def test_what_is_new_is_found_in_any_order(order: list[int], new: set[int], met:
         [FIRST, SECOND._replace(source=99), *REST],
         [FIRST, SECOND._replace(rho=1.5), *REST],
         [FIRST, SECOND._replace(rate_hz=float("nan")), *REST],
-        [FIRST, Own(*SECOND), *REST],
         [FIRST, tuple(SECOND), *REST],
         [FIRST, None, *REST],
         iter(BEFORE.values()),

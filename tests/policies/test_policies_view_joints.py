@@ -3,9 +3,8 @@
 1. A view that can be read only stays so in both mappings, and a copy of it has every field of its own.
 2. A directive is the same whatever its reason says, also as a key.
 3. Of a request both axes count, together and each from the drone's own place.
-4. A region of interest of the policy's own kind of number is as little accepted as a rate of that kind.
-5. Peers of another receiver are ranked from that receiver on.
-6. Each policy's parameters and what it takes from another policy.
+4. Peers of another receiver are ranked from that receiver on.
+5. Each policy's parameters and what it takes from another policy.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from sortie.policies.catalogue.other_representations import codes, uncertain_box
 from sortie.policies.catalogue.prior.where2comm import where2comm
 from sortie.policies.catalogue.vantage import NEAR_M, over_region, vantage
 from sortie.policies.catalogue.worked import worked
-from sortie.policies.checks import check_reposition, find_inexact
+from sortie.policies.checks import check_reposition
 from sortie.policies.contract import (
     PERSON_FLAG,
     Directive,
@@ -39,8 +38,9 @@ from sortie.policies.contract import (
 )
 from sortie.policies.damping import SAME_DISC_M, is_switch
 from sortie.policies.geometry import peers_by_overlap
-from sortie.policies.registry import modules_of, resolve, viewpoint_of, within_budget
+from sortie.policies.registry import resolve, viewpoint_of, within_budget
 from sortie.scenarios.plugins.user_calls import Guarded
+from sortie.scenarios.plugins.user_code import imported_files
 
 VIEW = fleet_of(4)
 
@@ -91,19 +91,6 @@ def test_a_request_is_as_far_as_both_axes_together_from_the_drone_itself() -> No
     for x_m, y_m in ((150.0, 150.0), (0.0, 201.0), (-201.0, 0.0), (0.0, 800.0)):
         with pytest.raises(PolicyError, match="must be at most 200 m"):
             check_reposition(Reposition(300.0 + x_m, -500.0 + y_m), view)
-
-
-class _Own(float):
-    """A number of the policy's own, which may compare as it likes."""
-
-
-@pytest.mark.parametrize("at", [0, 1, 2])
-def test_a_region_of_numbers_of_the_policys_own_is_inexact(at: int) -> None:
-    parts = [1.0, 2.0, 3.0]
-    plain = Directive(0, 1, Representation.FEATURES, roi=Disc(*parts))
-    assert find_inexact([plain]) is None
-    parts[at] = _Own(parts[at])
-    assert find_inexact([plain._replace(roi=Disc(*parts))]) == "directive 0→1: roi is of the policy's own type _Own"
 
 
 def test_peers_that_cover_as_much_are_ranked_from_the_receiver_on() -> None:
@@ -221,8 +208,7 @@ def test_a_users_file_bounds_its_parameters_itself_and_is_found_with_what_it_imp
     assert isinstance(found, partial)
     assert found.keywords == {"k": -5}
     assert isinstance(found.func, Guarded)
-    assert {path.name for path in modules_of(f"{file}:decide")} == {"mine.py", "limits_of_mine.py"}
-    assert modules_of("worked") == ()
+    assert {path.name for path in imported_files(file)} == {"mine.py", "limits_of_mine.py"}
     with pytest.raises(PolicyError, match="rho is 7"):
         resolve("worked", {"rho": 7.0})
 

@@ -25,9 +25,9 @@ from sortie.scenarios import scratch
 from sortie.scenarios.control_variates import Controlled, controlled_mean, plan_units, widened
 from sortie.scenarios.intervals import AMOUNT, SHARE, Estimate, Range, mean_interval, paired
 from sortie.scenarios.plugins import reference
-from sortie.scenarios.plugins.reference import Guard, PluginError, checked_array, resolve
+from sortie.scenarios.plugins.reference import Guard, PluginError, checked_array, code_files, resolve
 from sortie.scenarios.plugins.user_calls import Guarded
-from sortie.scenarios.plugins.user_code import imported_files, imported_packages
+from sortie.scenarios.plugins.user_code import imported_packages, load
 from sortie.scenarios.reading.load import ScenarioError, loads
 from sortie.scenarios.schema import Expectation, Mission, Perception, PolicySection, Scenario, Steering, Viewpoints
 from sortie.scenarios.schema.base import models_of_the_past
@@ -506,21 +506,24 @@ def test_a_guard_counts_no_time_where_it_is_told_not_to() -> None:
 
 
 def test_a_module_beside_a_file_hides_the_installed_package_of_its_name(tmp_path: Path) -> None:
-    (tmp_path / "p.py").write_text("import numpy\nimport yaml\n")
-    assert imported_packages(tmp_path / "p.py") == {"numpy", "PyYAML"}
+    path = tmp_path / "p.py"
+    path.write_text("import numpy\nimport yaml\n")
+    load(path)
+    assert imported_packages(path) == {"numpy", "PyYAML"}
     (tmp_path / "yaml.py").write_text("")
-    assert imported_packages(tmp_path / "p.py") == {"numpy"}
+    load(path)
+    assert imported_packages(path) == {"numpy"}
 
 
 def test_imported_files_are_those_beside_the_file_and_in_its_packages(tmp_path: Path) -> None:
     for name, text in {
-        "own.py": "from pack import *\nfrom pack.inner import deep\nimport sortie\nimport numpy\nimport json\n",
+        "own.py": "from pack import one\nfrom pack.inner import deep\nimport sortie\nimport numpy\nimport json\n",
         "pack/__init__.py": "", "pack/one.py": "", "pack/inner/__init__.py": "from .. import two\n", "pack/inner/deep.py": "from ..three import x\n",
-        "pack/two.py": "", "pack/three.py": "x = 1\n", "sortie.py": "", "numpy/nothing.txt": "", "json.py": "",
+        "pack/two.py": "", "pack/three.py": "x = 1\n", "pack/four.py": "", "sortie.py": "", "numpy/nothing.txt": "", "json.py": "",
     }.items():  # fmt: skip
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    found = [path.relative_to(tmp_path.resolve()).as_posix() for path in imported_files(tmp_path / "own.py")]
+    found = [path.relative_to(tmp_path.resolve()).as_posix() for path in code_files(tmp_path / "own.py")]
     assert found == [
         "own.py", "pack/__init__.py", "pack/inner/__init__.py", "pack/inner/deep.py", "pack/one.py", "pack/three.py", "pack/two.py",
     ]  # fmt: skip

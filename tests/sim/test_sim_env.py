@@ -275,7 +275,7 @@ def test_what_went_wrong_in_the_sortie_is_said_each_time(
     def broken(*_: object, **__: object) -> None:
         raise error("planted")
 
-    monkeypatch.setattr("sortie.sim.env.run_sortie", broken)
+    monkeypatch.setattr("sortie.sim.env.fly_here", broken)
     e = env()
     for fly in (e.reset, lambda: e.step({})):
         with pytest.raises(error, match="planted"):

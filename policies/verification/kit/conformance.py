@@ -24,7 +24,7 @@ from sortie.policies.verification.kit.single_view import RepeatableView, missing
 from sortie.policies.verification.kit.tried import NotJudged, try_views
 from sortie.policies.verification.kit.views import draw_view, draw_views
 from sortie.policies.verification.subject import constants_of, with_function
-from sortie.scenarios.plugins.user_calls import Guarded, text_of
+from sortie.scenarios.plugins.user_calls import Guarded
 from sortie.scenarios.plugins.user_code import load
 
 VIEWS = 300
@@ -127,7 +127,7 @@ def _decides_in_time(policy: Policy) -> Check:
             try:
                 policy(view)
             except Exception as error:
-                return Check(name, "not tried enough", f"raises {type(error).__name__}: {text_of(error, str)}")
+                return Check(name, "not tried enough", f"raises {type(error).__name__}: {error}")
             marks_ns.append(time.thread_time_ns())
         took_s[drones] = min(b - a for a, b in pairwise(marks_ns)) * 1e-9
     what = ", ".join(f"{s * 1e6:.0f} µs at {n} drones" for n, s in took_s.items())
@@ -213,7 +213,7 @@ def _accepts_small_views(policy: Policy, view: FleetView) -> str | None:
         try:
             directives = list(policy(_with_drones(view, ids).frozen))
         except Exception as error:
-            return f"{len(ids)} drones in the view: raises {type(error).__name__}: {text_of(error, str)}"
+            return f"{len(ids)} drones in the view: raises {type(error).__name__}: {error}"
         if directives:
             return f"{len(ids)} drones in the view: {len(directives)} directives, must be none"
     return None
@@ -224,7 +224,7 @@ def _accepts_stale_views(policy: Policy, view: FleetView) -> str | None:
     try:
         check_directives(policy(stale.frozen), stale)
     except Exception as error:
-        return f"every descriptor {_STALE_PERIODS:g} periods old: {type(error).__name__}: {text_of(error, str)}"
+        return f"every descriptor {_STALE_PERIODS:g} periods old: {type(error).__name__}: {error}"
     return None
 
 
@@ -332,7 +332,7 @@ def _raising(rule: OnView, begin: str = "") -> OnView:
         except PolicyError as error:
             return str(error)
         except Exception as error:
-            return f"{begin}raises {type(error).__name__}: {text_of(error, str)}"
+            return f"{begin}raises {type(error).__name__}: {error}"
 
     return complaint
 

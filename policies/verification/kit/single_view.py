@@ -16,7 +16,6 @@ from sortie.policies.verification.invariants.language import (
     violations,
 )
 from sortie.policies.verification.kit.age_rule import older_views, raised_part, without_detached
-from sortie.scenarios.plugins.user_calls import text_of
 
 ONE_BY_ONE = 8
 """Ages are raised drone by drone in views of up to so many; in larger ones of all drones at once."""
@@ -114,7 +113,7 @@ def check_property(
     try:
         return prop.complaint(policy, repeatable)
     except Exception as error:
-        return _invalid_directive(policy, repeatable.now()) or f"raises {type(error).__name__}: {text_of(error, str)}"
+        return _invalid_directive(policy, repeatable.now()) or f"raises {type(error).__name__}: {error}"
 
 
 def _invalid_directive(policy: Policy, view: FleetView) -> str | None:

@@ -18,7 +18,7 @@ from sortie.fleet.gate import Gate
 from sortie.fleet.messages.auth import Dropped, Sealer, open_datagram
 from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES
 from sortie.fleet.messages.wire import decode_directive, encode_descriptor, encode_directive
-from sortie.policies.checks import check_directives, find_inexact
+from sortie.policies.checks import check_directives
 from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, PolicyError, Representation
 from sortie.policies.damping import DampedLink, damp
 from sortie.policies.registry import POLICIES
@@ -106,7 +106,6 @@ def test_no_directive_passes_its_bounds(field: str, value: float) -> None:
         ("reason", 5, "reason is 5, must be text"),
         ("reason", b"why", "reason is b'why', must be text"),
         ("reason", "x" * 1001, "reason has 1001 characters, must have at most 1000"),
-        ("reason", "\ud800", r"reason is '\ud800', must be text that UTF-8 can write"),
     ],
 )
 def test_a_directive_of_other_types_is_named(field: str, value: object, message: str) -> None:
@@ -123,77 +122,11 @@ def test_what_is_no_directive_is_named(answer: Sequence[Directive]) -> None:
         check_directives(answer, FLEET)
 
 
-class Lazy(list[Directive]):
-    """Reads differently the second time."""
-
-
-@pytest.mark.parametrize("answer", ["hello", iter(share(FLEET)), Lazy(share(FLEET)), {1: share(FLEET)[0]}])
+@pytest.mark.parametrize("answer", ["hello", iter(share(FLEET)), share(FLEET)[0], {1: share(FLEET)[0]}])
 def test_what_is_no_list_or_tuple_is_named(answer: Sequence[Directive]) -> None:
     said = f"^a policy returns a list or a tuple of directives, got {type(answer).__name__}$"
     with pytest.raises(PolicyError, match=said):
         check_directives(answer, FLEET)
-
-
-class Quick(float):
-    """A rate that is never too high."""
-
-    def __le__(self, other: object) -> bool:
-        return True
-
-
-class Lying(Directive):
-    """A directive that hides its rate."""
-
-    @property
-    def rate_hz(self) -> float:  # type: ignore[override]
-        return 2.0
-
-
-def test_what_may_read_differently_is_refused() -> None:
-    first, *rest = share(FLEET)
-    with pytest.raises(PolicyError, match=r"^a policy returns Directive, got Lying$"):
-        check_directives([Lying(*first), *rest], FLEET)
-    with pytest.raises(
-        PolicyError, match=r"rate_hz is 99\.0 of the policy's own type Quick, must be in \[0, 30\], a number$"
-    ):
-        check_directives([first._replace(rate_hz=Quick(99)), *rest], FLEET)
-
-
-class Own(int):
-    """A whole number that decides by itself what it is equal to."""
-
-
-class Failing:
-    """No number, with methods that fail."""
-
-    def __index__(self) -> int:
-        raise ZeroDivisionError
-
-    __str__ = __repr__ = __format__ = __index__  # type: ignore[assignment]
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        (
-            {"destination": Own(1)},
-            "directive 0→1: destination is 1 of the policy's own type Own, must be a drone's id, a whole number",
-        ),
-        (
-            {"source": Own(0)},
-            "directive 0→1: source is 0 of the policy's own type Own, must be a drone's id, a whole number",
-        ),
-        (
-            {"destination": Failing()},
-            "directive 0→a Failing: destination is a Failing of the policy's own type Failing, must be a drone's id, a whole number",
-        ),
-    ],
-)
-def test_an_id_of_the_policy_s_own_type_is_refused_before_its_methods_run(fields: dict[str, int], message: str) -> None:
-    first, *rest = share(FLEET)
-    with pytest.raises(PolicyError, match=f"^{re.escape(message)}$"):
-        check_directives([first._replace(**fields), *rest], FLEET)
-    assert find_inexact([first._replace(**fields)]) is not None
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_a_name_that_means_nothing(reference: str, params: dict[str, object], me
     ("source", "message"),
     [
         ("1 / 0", r"mine.py' does not load: ZeroDivisionError: division by zero \(mine.py, line 1\)$"),
-        ("import sys; sys.exit(0)", r"mine.py' does not load: ProgramExitError: exit code 0, must return"),
+        ("import sys; sys.exit(0)", r"mine.py' does not load: SystemExit: 0 \(mine.py, line 1\)$"),
         ("loss = 3", r"^path_loss file '.*mine.py' has no function or class 'loss'$"),
     ],
 )

@@ -10,7 +10,8 @@ import pytest
 from policies_examples import fleet_of
 
 from sortie.policies.contract import PolicyError
-from sortie.policies.registry import describe_error, modules_of, resolve
+from sortie.policies.registry import describe_error, resolve
+from sortie.scenarios.plugins.user_code import imported_files
 
 START = "from sortie.policies.contract import Directive, nothing\n"
 DECIDE = "\ndef decide(view):\n    return [nothing(view.ego, p, {}) for p in view.peers]\n"
@@ -29,7 +30,7 @@ def reason(folder: Path, file: str = "mine.py") -> str:
 
 
 def names(folder: Path, file: str = "mine.py") -> list[str]:
-    return [path.relative_to(folder.resolve()).as_posix() for path in modules_of(f"{folder / file}:decide")]
+    return [path.relative_to(folder.resolve()).as_posix() for path in imported_files(folder / file)]
 
 
 FORMS = {
@@ -87,15 +88,15 @@ def test_a_policy_imports_what_is_beside_it(form: str, tmp_path: Path) -> None:
     policy = resolve(f"{tmp_path}/mine.py:decide")
     assert policy(fleet_of(2))[0].reason == "beside"
     assert sys.path == path
-    assert not [finder for finder in sys.meta_path if "sortie" in type(finder).__module__]
     left = {name for name in set(sys.modules) - before if not name.startswith(("sortie.", "sortie_user_"))}
     assert not left & {"mine", "helper", "second", "kit", "sim", "policies"}
     assert names(tmp_path) == sorted(["mine.py", *files])
     assert not list(tmp_path.rglob("__pycache__"))
 
 
-def test_two_policies_keep_their_own_helpers(tmp_path: Path) -> None:
-    late = INSIDE.format("from helper import why")
+@pytest.mark.parametrize("form", ["import helper", "from . import helper", "import helper as other; helper = other"])
+def test_two_policies_keep_their_own_helpers(form: str, tmp_path: Path) -> None:
+    late = INSIDE.format(f"{form}; why = helper.why")
     for name in ("one", "two"):
         write(tmp_path / name, {"mine.py": START + late, "helper.py": f"def why(): return '{name}'"})
     one, two = (resolve(f"{tmp_path}/{name}/mine.py:decide") for name in ("one", "two"))
@@ -103,17 +104,15 @@ def test_two_policies_keep_their_own_helpers(tmp_path: Path) -> None:
         assert (one(fleet_of(2))[0].reason, two(fleet_of(2))[0].reason) == ("one", "two")
 
 
-def test_each_resolving_reads_the_files_anew_and_leaves_older_ones_as_they_were(tmp_path: Path) -> None:
+def test_each_resolving_reads_the_files_anew(tmp_path: Path) -> None:
     """Same size, same second: a compiled file beside it would not have noticed."""
     late = (
         "\ndef decide(view):\n    import helper, second\n    return [nothing(view.ego, 1, helper.WHY + second.WHY)]\n"
     )
     write(tmp_path, {"mine.py": START + "import helper" + late, "helper.py": "WHY = 'a'", "second.py": "WHY = 'x'"})
-    old = resolve(f"{tmp_path}/mine.py:decide")
-    assert old(fleet_of(2))[0].reason == "ax"
+    assert reason(tmp_path) == "ax"
     write(tmp_path, {"helper.py": "WHY = 'b'", "second.py": "WHY = 'y'"})
     assert reason(tmp_path) == "by"
-    assert old(fleet_of(2))[0].reason == "ax"
 
 
 def test_python_and_sortie_come_first(tmp_path: Path) -> None:
@@ -125,31 +124,37 @@ def test_python_and_sortie_come_first(tmp_path: Path) -> None:
     assert names(tmp_path) == ["mine.py"]
 
 
-def test_modules_on_the_path_count_and_installed_ones_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_loaded_counts_but_for_installed_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A library of the user's own on the path does, and what only a function will import beside the file."""
     write(
         tmp_path / "lib",
-        {"shop/__init__.py": "from .tools import a\n", "shop/tools/__init__.py": "", "shop/tools/a.py": ""},
+        {
+            "shop/__init__.py": "from .tools import a\n",
+            "shop/tools/__init__.py": "",
+            "shop/tools/a.py": "import cart",
+            "cart.py": "",
+            "unused.py": "",
+        },
     )
     write(tmp_path / "venv/site-packages", {"bought.py": ""})
-    write(tmp_path / "own", {"mine.py": "import shop, bought, numpy, json, absent\nimport importlib\n"
-                                        "importlib.import_module('late')", "late.py": ""})  # fmt: skip
+    source = START + "import shop, bought, numpy, json" + INSIDE.format("from late import why")
+    write(
+        tmp_path / "own",
+        {
+            "mine.py": source,
+            "late.py": "import later\ndef why(): return ''",
+            "later.py": "",
+            "cart.py": "",
+            "spare.py": "",
+        },
+    )
     for folder in ("lib", "venv/site-packages"):
         monkeypatch.syspath_prepend(tmp_path / folder)
     importlib.invalidate_caches()
-    found = [path.relative_to(tmp_path.resolve()).as_posix() for path in modules_of(f"{tmp_path}/own/mine.py:decide")]
-    assert found == [
-        "lib/shop/__init__.py",
-        "lib/shop/tools/__init__.py",
-        "lib/shop/tools/a.py",
-        "own/late.py",
-        "own/mine.py",
-    ]
-
-
-def test_a_registered_policy_has_no_files_and_a_missing_file_is_an_error(tmp_path: Path) -> None:
-    assert modules_of("worked") == ()
-    with pytest.raises(PolicyError, match=r"none\.py' not found"):
-        modules_of(f"{tmp_path}/none.py:decide")
+    resolve(f"{tmp_path}/own/mine.py:decide")
+    loaded = ["cart.py", "shop/__init__.py", "shop/tools/__init__.py", "shop/tools/a.py"]
+    found = [path.relative_to(tmp_path.resolve()).as_posix() for path in imported_files(tmp_path / "own/mine.py")]
+    assert found == [*(f"lib/{name}" for name in loaded), "own/late.py", "own/later.py", "own/mine.py"]
 
 
 @pytest.mark.parametrize(

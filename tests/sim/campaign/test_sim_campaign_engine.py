@@ -15,7 +15,8 @@ import pytest
 from campaign_examples import BASE, CAMPAIGN, CLUSTER, InProcess, Pretended, plan, table_bytes, write
 from typer.testing import CliRunner
 
-from sortie.sim.campaign import cluster
+from sortie.sim.apart import DiedError
+from sortie.sim.campaign import cluster, processes
 from sortie.sim.campaign.cluster import Dask
 from sortie.sim.campaign.drive import Progress, run_campaign
 from sortie.sim.campaign.engine import open_engine
@@ -92,8 +93,9 @@ def test_processes_that_are_killed_cost_nothing(tmp_path: Path) -> None:
     def progress(done: Progress) -> None:
         if done.flown > 6 * (len(killed) + 1) and len(killed) < 5:
             process = engine._processes[len(killed) % 3]._process
-            killed.append(process.pid)
-            process.kill()
+            if process is not None:
+                killed.append(process._process.pid)
+                process.end()
 
     with open_engine(3) as engine:
         assert isinstance(engine, Processes)
@@ -142,9 +144,16 @@ def test_the_last_attempt_of_a_run_that_kills_its_process_is_alone(monkeypatch: 
             return super().turn(alone=alone)
 
     asked = list[bool]()
+
+    class Dies:
+        def call(self, *_: Any) -> None:
+            raise DiedError
+
+        def close(self) -> None: ...
+
+    monkeypatch.setattr(processes, "Apart", Dies)
     one = OneProcess(turns=Noting())
-    monkeypatch.setattr(one, "_answer", lambda code, task: -signal.SIGKILL)
-    assert one.fly("", (0, '{"metrics": []}')).error == "WorkerDied: on every attempt"
+    assert one.fly("", (0, '{"metrics": [], "scenario": {"limits": {}}}')).error == "WorkerDied: on every attempt"
     assert asked == [False, False, False, True]
 
 

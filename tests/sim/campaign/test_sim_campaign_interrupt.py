@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import psutil
@@ -19,6 +20,7 @@ from campaign_examples import CAMPAIGN, CLUSTER, plan, rows_on_disk, write
 
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.signals import EndedError, ended_by_sigterm, undisturbed
+from sortie.sim.campaign.work import fly_one
 from sortie.sim.folders import RunError
 
 pytest.importorskip("distributed")
@@ -102,7 +104,7 @@ def _children(pid: int) -> list[int]:
     found = []
     for task in Path(f"/proc/{pid}/task").iterdir():
         found += [int(child) for child in (task / "children").read_text().split()]
-    return [child for child in found if b"processes import serve" in Path(f"/proc/{child}/cmdline").read_bytes()]
+    return [child for child in found if b"apart import serve" in Path(f"/proc/{child}/cmdline").read_bytes()]
 
 
 def _blocks_ctrl_c(pid: int) -> bool:
@@ -175,15 +177,18 @@ def test_a_process_whose_driver_was_killed_says_nothing(tmp_path: Path) -> None:
     p = plan(tmp_path)
     for sent in (False, True):
         ours, theirs = multiprocessing.Pipe()
-        with subprocess.Popen(
-            [sys.executable, "-c", f"from sortie.sim.campaign.processes import serve; serve({theirs.fileno()})"],
-            pass_fds=[theirs.fileno()], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        ) as process:  # fmt: skip
-            theirs.close()
-            if sent:
-                ours.send((p.code, (0, p.task(0)), None))
-            ours.close()
-            assert process.communicate(timeout=600)[0] == b""
+        with (tmp_path / "place").open("wb") as place:
+            files = [theirs.fileno(), place.fileno()]
+            with subprocess.Popen(
+                [sys.executable, "-c", f"from sortie.sim.apart import serve; serve(*{files})"],
+                pass_fds=files, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            ) as process:  # fmt: skip
+                theirs.close()
+                if sent:
+                    ours.send((sys.path, 0.0))
+                    ours.send(partial(fly_one, p.code, (0, p.task(0)), None))
+                ours.close()
+                assert process.communicate(timeout=600)[0] == b""
         assert process.returncode == 0
 
 

@@ -25,15 +25,15 @@ def decide(view):
         {what}
     return silent(view)
 """
-LATE = "TookTooLongError: no answer within 2 s (limits.decision_s)"
+LATE = "LimitError: no answer within 2 s (limits.decision_s) (mine.py, line 10)"
 
 
 @pytest.mark.parametrize(
     ("what", "error"),
     [
         ("sys.exit(0)", "raises ProgramExitError: exit code 0, must return (mine.py, line 10)"),
-        ("while True: pass", f"raises {LATE} (mine.py, line 10)"),
-        ("hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)", f"{LATE}, and no interruption either"),
+        ("while True: pass", LATE),
+        ("hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)", LATE),
         ("os.kill(os.getpid(), 9)", "WorkerDied: on every attempt"),
     ],
 )

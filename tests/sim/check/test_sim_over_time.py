@@ -13,7 +13,6 @@ from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants.language import parse
 from sortie.policies.verification.kit.courses import Course, draw_course, values_at
 from sortie.policies.verification.subject import constants_of
-from sortie.scenarios.plugins.user_calls import watched
 from sortie.scenarios.reading.load import loads
 from sortie.sim.check import over_time
 from sortie.sim.check.few_states import NotFinite, prove_over_time
@@ -239,8 +238,7 @@ def test_a_policy_that_fails_in_a_course_is_refuted_by_a_flight_of_it(error: str
     path = tmp_path / "mine.py"
     path.write_text(RAISES.format(limit=0.3137, error=error))
     subject = Subject(resolve(f"{path}:decide"), f"{path}:decide", {})
-    with watched(10.0):
-        (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=2)
+    (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=2)
     assert verdict.outcome == "refuted", verdict.what
     assert verdict.what.startswith("the policy fails after ")
     assert said in verdict.what

@@ -19,7 +19,7 @@ import sortie
 from sortie.fleet.logs.flightlog import read_logs
 from sortie.perception.recordings.recording import open_recording
 from sortie.policies.registry import resolve
-from sortie.scenarios.exit_codes import DEFECT, ENDED, FAILED, INTERRUPTED, STUCK, USER
+from sortie.scenarios.exit_codes import DEFECT, ENDED, FAILED, INTERRUPTED, USER
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.traces import read_columns
 from sortie.sim.export.endpoint import read_key
@@ -33,7 +33,7 @@ POLICY = "def mine(view):\n    raise ValueError('shapes (3,) (4,)')\n"
 def test_the_page_has_them_all() -> None:
     table = PAGE.read_text("utf-8").partition("## Exit codes")[2].partition("## ")[0]
     codes = [int(code) for row in re.findall(r"^\| ([\d, ]+) \|", table, re.MULTILINE) for code in row.split(", ")]
-    assert codes == [0, FAILED, USER, DEFECT, INTERRUPTED, ENDED, STUCK]
+    assert codes == [0, FAILED, USER, DEFECT, INTERRUPTED, ENDED]
 
 
 @pytest.mark.parametrize(

@@ -346,12 +346,12 @@ def test_an_event_of_one_s_own_sees_the_drones_of_the_frame_and_weakens_a_link_o
     assert world._loss_db().tolist() == [[0.0, 4.0, 4.0], [4.0, 0.0, 4.0], [4.0, 4.0, 0.0]]
 
 
-@pytest.mark.parametrize("text", [5, None, b"storm", "half of a pair \ud800"])
+@pytest.mark.parametrize("text", [5, None, b"storm"])
 def test_an_event_of_one_s_own_writes_no_note_that_the_record_cannot_hold(text: Any) -> None:
     world = _world()
     its = FleetHandle(world, world._scenario, SimpleNamespace(model="mine"), 3)  # type: ignore[arg-type]
     for act in (lambda: its.note(text), lambda: its.lose(0, text)):
-        with pytest.raises(PluginError, match=r"^event mine: text .+, must be a str that UTF-8 can write$"):
+        with pytest.raises(PluginError, match=r"^event mine: text .+, must be a str$"):
             act()
     assert world.drones[0].airborne
     assert world._recorder.rows["events"] == []

@@ -17,6 +17,7 @@ from sim_examples import example
 from typer.testing import CliRunner
 
 from sortie.policies.contract import PolicyError, Representation
+from sortie.sim.apart import LimitError
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
 from sortie.sim.live import watchdog
@@ -126,7 +127,7 @@ def test_a_policy_that_hangs_in_the_simulated_flight_ends_it_by_the_scenario_s_l
     (tmp_path / "mine.py").write_text(POLICY)
     (tmp_path / "mode").write_text("hang")
     sets = (f"policy={{name: '{tmp_path}/mine.py:decide'}}", "limits.decision_s=0.2", "duration_s=1")
-    with pytest.raises(PolicyError, match=r"no answer within 0\.2 s \(limits\.decision_s\)"):
+    with pytest.raises(LimitError, match=r"no answer within 0\.2 s \(limits\.decision_s\)"):
         traces(example(*sets))
 
 
