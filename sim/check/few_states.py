@@ -33,7 +33,7 @@ from sortie.policies.verification.proof.ranges import FleetOfRanges, region_axes
 from sortie.policies.verification.proof.search import Run, rosters
 from sortie.policies.verification.proof.symbols import Path, Ranged, Refused, explore
 
-MOST_CELLS, MOST_STATES = 20_000, 200_000
+MOST_CELLS, MOST_STATES = 3_000, 100_000
 MOST_TUPLES = 400
 """Combinations of directives of all links on which a line over all links is judged in one cell."""
 MOST_DIRECTIVES = 40
@@ -261,8 +261,7 @@ def _plain(d: Directive, ego: int) -> Directive:
 
 
 _State = tuple[tuple[tuple[int, int], ...], tuple[int, ...], int]
-"""Each peer's link by its number, how many frames ago the only link changed, and for how many frames the line has been
-broken (−1: it holds)."""
+"""Each peer's link, how many frames ago the only link changed, and how long the line is broken, frames (−1: it holds)."""
 
 
 class _Move(NamedTuple):
@@ -283,6 +282,7 @@ class _Links:
         self._frames = math.ceil((plane.dwell_s - EPSILON_S) / plane.period_s)
         self._merges = len({d._replace(deadline_s=0.1) for d in known}) == len(known)
         self._place = {d: k for k, d in enumerate(known)}
+        self._lower = [[self._place[lower_of(a, b)._replace(reason="")] for b in known] for a in known]
         self._links: list[tuple[int, tuple[tuple[int, int], ...]]] = []
         """What a link enforces, and its proposals with their ages in frames; directives by their numbers."""
         self._numbers: dict[Any, int] = {}
@@ -316,7 +316,7 @@ class _Links:
             least: list[tuple[int, int]] = []
             for k, (age, fold) in enumerate(recent):
                 for _, later in recent[k + 1 :]:
-                    fold = self._place[lower_of(self._known[fold], self._known[later])._replace(reason="")]
+                    fold = self._lower[fold][later]
                 if not least or least[-1][1] != fold:
                     least.append((age, fold))
             key = (enforced, tuple(least), recent[-1][1])

@@ -239,3 +239,13 @@ def test_links_that_share_a_correction_keep_their_own_region_and_reason() -> Non
     for d in enforce(parse("rate_hz <= 2"), view, decided):
         assert (d.roi, d.rate_hz) == (discs[d.destination], 2.0)
         assert d.reason.endswith(f"raw at 9 Hz: for {d.destination})")
+
+
+def test_where_no_range_is_left_a_safe_directive_takes_the_place() -> None:
+    sends = Directive(0, 1, Representation.TRACKS, rate_hz=5.0)
+    (silent,) = enforce(parse("rate_hz * (10 - rate_hz) <= 0"), fleet_of(2), [sends])
+    assert (silent.representation, silent.rate_hz) == (Representation.NONE, 0.0)
+    line = "rate_hz * (2 - rate_hz) >= 0 and representation > none"
+    (slow,) = enforce(parse(line), fleet_of(2), [sends])
+    assert (slow.representation, slow.rate_hz) == (Representation.DETECTIONS, 2.0)
+    assert slow.reason.startswith(f"{MARK}{line} (decided tracks at 5 Hz")
