@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import re
 from collections.abc import Mapping, Sequence
 from itertools import compress
 
@@ -215,10 +216,15 @@ def _where(d: Directive) -> str:
     return f"directive {d.source}→{d.destination}"
 
 
+_HALF_PAIR = re.compile("[\ud800-\udfff]")
+
+
 def _reason_fault(reason: object) -> str | None:
     """Why a reason cannot stand in the record; None if it can."""
     if not isinstance(reason, str):
         return f"reason is {reason!r}, must be text"
+    if _HALF_PAIR.search(reason):
+        return f"reason is {reason!r:.200}, must be text that UTF-8 can write"
     if len(reason) > MAX_REASON:
         return f"reason has {len(reason)} characters, must have at most {MAX_REASON}"
     return None

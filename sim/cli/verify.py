@@ -208,7 +208,7 @@ def _invariants(name: str, decide: Policy, file: Path | None) -> tuple[Invariant
     """From the file named, or the policy's own file, or what a registered policy promises."""
     own = own_invariants(decide) if ":" in name else PROMISES.get(name, "")
     source = f"{name}: {OWN_INVARIANTS}" if file is None else str(file)
-    if file is None and type(own) is not str:  # a text of another class may read otherwise
+    if file is None and not isinstance(own, str):
         raise RunError(f"{source} is of type {type(own).__name__}, must be text")
     try:
         return parse(str(own) if file is None else regular(file).read_text("utf-8-sig"))
