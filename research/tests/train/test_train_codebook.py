@@ -25,7 +25,8 @@ from sortie.scenarios.shipped import CODEBOOK, beside
 
 def test_the_fit_finds_clusters_stage_by_stage_and_repeats() -> None:
     rng = np.random.default_rng(6)
-    coarse, fine = rng.normal(size=(12, 80)) * 4.0, rng.normal(size=(9, 80)) * 0.2
+    # a network's features are rectified, so none is below zero
+    coarse, fine = rng.uniform(size=(12, 80)) * 8.0, rng.uniform(size=(9, 80)) * 0.4
     cells = (coarse[rng.integers(12, size=900)] + fine[rng.integers(9, size=900)]).astype(np.float32)
     recipe = CodebookRecipe(stages=2, iterations=10)
     stages = fit(cells, recipe)
