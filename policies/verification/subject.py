@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import inspect
+import linecache
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -62,8 +64,9 @@ def constants_of(policy: Policy, rules: Sequence[Invariant] = ()) -> set[float]:
             path = inspect.getsourcefile(inspect.unwrap(bound))
         except TypeError:  # an object that is called
             path = inspect.getsourcefile(type(bound))
-    if path is not None:
-        with open(path, "rb") as file:
-            found += [node.value for node in ast.walk(ast.parse(file.read())) if isinstance(node, ast.Constant)]
+    linecache.checkcache(str(path))  # it may have changed since
+    with contextlib.suppress(SyntaxError):  # a policy that stands in a page, not in a Python file
+        tree = ast.parse("".join(linecache.getlines(str(path))))  # of a notebook's cell too
+        found += [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)]
     limits = [float(x) for x in found if type(x) in (int, float) and abs(x) < 1e300]  # type: ignore[arg-type]
     return {x for x in limits if math.isfinite(x)}
