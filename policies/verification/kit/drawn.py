@@ -10,6 +10,7 @@ import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache, partial
+from types import FrameType
 from typing import Any, NamedTuple
 
 from sortie.policies.contract import FleetView, Policy
@@ -88,11 +89,11 @@ def views_at_sizes(constants: Iterable[float], seed: int) -> Iterator[FleetView]
 def _affordable(policy: Policy, views: Sequence[FleetView]) -> list[FleetView]:
     """The smallest of large views, as many as a policy decides on in `LARGE_STEPS`: the same ones on every machine."""
     _steps_of(policy, draw_view(seed=0, number=0))  # what a policy does at its first decision alone is not counted
-    small, twice = (_steps_of(policy, _whole_fleet(drones)) for drones in (MAX_DRONES, 2 * MAX_DRONES))
+    small, twice = (_steps_of(policy, _whole_fleet(drones)) for drones in (LISTED_IDS // 2, LISTED_IDS))
     doublings = max(1.0, math.log2(twice / small) if small else 1.0)
     left, affordable = float(LARGE_STEPS), []
     for view in sorted(views, key=lambda view: len(view.descriptors)):
-        left -= twice * (len(view.descriptors) / (2 * MAX_DRONES)) ** doublings
+        left -= twice * (len(view.descriptors) / LISTED_IDS) ** doublings
         if left < 0:
             break
         affordable.append(view)
@@ -105,12 +106,14 @@ def _whole_fleet(drones: int) -> FleetView:
 
 
 def _steps_of(policy: Policy, view: FleetView) -> int:
-    """How many lines of Python a decision runs."""
-    count = 0
+    """How many lines of Python a decision runs; to sort the peers counts as a line for every four of them."""
+    count, sorts = 0, FleetView.peers.fget.__code__  # type: ignore[attr-defined]
 
-    def follow(frame: object, event: str, argument: object) -> Any:
+    def follow(frame: FrameType, event: str, argument: object) -> Any:
         nonlocal count
         count += event == "line"
+        if event == "call" and frame.f_code is sorts:
+            count += len(view.descriptors) // 4
         return follow
 
     before = sys.gettrace()

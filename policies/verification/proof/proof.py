@@ -19,7 +19,7 @@ heard, every order of the drones in the view, and
 | `refuted` | a view of plain numbers on which the policy itself was run and failed |
 | `tried` | drawn views, some of them at the policy's own constants; none fails |
 
-Drawn views are tried after every proof too, up to the largest fleet that a scenario may have. A proof covers neither
+Drawn views are tried before every proof too, up to the largest fleet that a scenario may have. A proof covers neither
 rosters (`context.roster`, and fleets of more than 200 drones), nor another period than the one given, nor another
 `detached_after_periods`, nor NaN. Sums and products of inputs are followed over the reals, without rounding; the verdict says so.
 """
@@ -44,8 +44,8 @@ DRONES = 5
 """The largest fleet that a proof covers if nothing else is asked for."""
 PLANE_CELLS, RULE_CELLS = 25_000, 40_000
 """Cells for the search of the plane's properties, and for each invariant, if nothing else is asked for."""
-WITH_FAULT_CELLS = 20_000
-"""Cells for the whole search once it has found a fault."""
+WITH_FAULT_CELLS = 5_000
+"""Cells for the whole search once a fault is known: a faulty policy will be searched again."""
 
 Outcome = Literal["proved", "refuted", "tried"]
 _NOT_REPEATED = "not the same for the same view: it fails on this view only sometimes"
@@ -82,7 +82,7 @@ def prove(
         period_s: the plane's period.
         cells: how many the search of all properties together may visit; None: `PLANE_CELLS`, and `RULE_CELLS` for each
             invariant.
-        seed: of the drawn views on which every property is tried that no search refuted.
+        seed: of the drawn views on which every property is tried first.
         views: how many of them, besides a few of large fleets; 0 for none at all.
 
     Returns:
@@ -96,21 +96,22 @@ def prove(
             raise InvariantError(f"{rule.text!r} is about time: a single view does not decide it")
     properties = [*PLANE, *(property_of(i) for i in invariants)]
     budget = Budget(PLANE_CELLS + RULE_CELLS * len(invariants) if cells is None else cells)
-    drawn = Drawn(policy, invariants, seed, views)
+    drawn = Drawn(policy, invariants, seed, views).first_faults(properties)
     searched = {prop: Searched(prop.name) for prop in properties}
+    for prop, tried in drawn.items():
+        if tried.view is not None:
+            searched[prop].fault = Found(tried.view, None)
+            budget.units = min(budget.units, WITH_FAULT_CELLS)
     coverage = _search(policy, searched, max_drones, period_s, budget)
-    left = [prop for prop in properties if searched[prop].fault is None]
-    faults = drawn.first_faults(left)
     verdicts = []
     for prop, found in searched.items():
-        shown = None if found.fault is not None else faults[prop].view
-        fault = found.fault if shown is None else Found(shown, None)
+        fault = found.fault
         if fault is not None:
             said = check_property(prop, policy, fault.view, fault.raised_age_s) or _NOT_REPEATED
             verdicts.append(ProofVerdict(prop.name, "refuted", said, fault.view, fault.raised_age_s))
             continue
         why = found.unclear or coverage.why
-        text = f"{faults[prop].text}; not proved: it {why}" if why else f"{coverage.text(found)}; {faults[prop].text}"
+        text = f"{drawn[prop].text}; not proved: it {why}" if why else f"{coverage.text(found)}; {drawn[prop].text}"
         verdicts.append(ProofVerdict(prop.name, "tried" if why else "proved", text))
     return verdicts
 
@@ -146,7 +147,7 @@ def _search(
     def confirm(searched: Searched, fault: Found) -> bool:
         prop = next(p for p, s in properties.items() if s is searched)
         shows = check_property(prop, policy, fault.view, fault.raised_age_s) is not None
-        if shows:  # a faulty policy will be searched again
+        if shows:
             budget.units = min(budget.units, WITH_FAULT_CELLS)
         return shows
 
