@@ -25,7 +25,15 @@ from sortie.policies.contract import (
 _MAX_RUNG, _MAX_RHO, _MAX_RATE_HZ, _MAX_DEADLINE_S, _MAX_WEIGHT, _MAX_DUTY = (b.high for b in DIRECTIVE_BOUNDS.values())
 _PLAIN_NUMBERS = frozenset({float, int})
 _WHOLE = (int, np.integer)
-_NUMBERS = (float, int, np.floating, np.integer, np.bool_)
+
+
+class StandIn:
+    """What stands for a number while a proof runs a policy; the checks take it for one."""
+
+    __slots__ = ()
+
+
+_NUMBERS = (float, int, np.floating, np.integer, np.bool_, StandIn)
 _FAR_M = 3.4028234663852886e38
 """The largest 32-bit float. The wire carries a disc in 32-bit floats."""
 

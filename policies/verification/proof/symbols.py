@@ -16,8 +16,9 @@ import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
-from numbers import Real
 from typing import Any, NoReturn, TypeVar
+
+from sortie.policies.checks import StandIn
 
 T = TypeVar("T")
 
@@ -140,7 +141,7 @@ def _next_script(taken: Sequence[tuple[int, int]]) -> list[int]:
     return script
 
 
-class Ranged:
+class Ranged(StandIn):
     """A number with a known range: an axis, and the arithmetic steps applied to it."""
 
     __slots__ = ("_axis", "_path", "_steps")
@@ -313,8 +314,6 @@ class Ranged:
     def __repr__(self) -> str:
         return format(self, "")
 
-
-Real.register(Ranged)  # the checks of directives take it for the number that it stands for
 
 LONGEST_TEXT = 24
 _MOST_WHOLE = 200
