@@ -72,11 +72,11 @@ def test_workers_share_the_machine_unless_they_are_told_less() -> None:
 
 
 def test_a_run_without_memory_says_which_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def run_sortie(*_: Any, **__: Any) -> None:
+    def fly_here(*_: Any, **__: Any) -> None:
         raise MemoryError
 
     p = plan(tmp_path)
-    monkeypatch.setattr(work, "run_sortie", run_sortie)
+    monkeypatch.setattr(work, "fly_here", fly_here)
     (row,), _ = fly_batch(p.code, [(3, p.task(3))], 64_000_000_000)
     assert (row.run, row.key, row.status) == (3, p.key(3), "failed")
     assert row.error == "MemoryError: more than 64 GB (--worker-memory)"

@@ -56,7 +56,7 @@ def make_tiny(monkeypatch: pytest.MonkeyPatch) -> None:
         (scratch, "IN_MEMORY_BYTES", 0), (scratch, "TAPE_IN_MEMORY_BYTES", 0), (scratch, "BLOCK_BYTES", 1),
         (record, "BATCH_BYTES", 1), (record, "FIRST_ROWS", 1), (spool, "_READ_BYTES", 1), (selection, "IN_MEMORY", 0),
         (box_rows, "BLOCK_FUSIONS", 3), (box_rows, "REST_S", 0.25), (mission_outcome, "BLOCK_FRAMES", 2), (scoring, "WAITING_EGOS", 1),
-        (run_folder, "_ROW_GROUP_BYTES", 1),
+        (spool, "_ROW_GROUP_BYTES", 1),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, value)
 
