@@ -191,7 +191,9 @@ def _imports(path: Path) -> Mapping[Path, set[str]]:
 def _file(name: str, module: Any) -> Path | None:
     """The file of a loaded module, unless it is of the standard library, of an installed package or of Sortie."""
     file = None if _is_pythons(_top(name)) else getattr(module, "__file__", None)
-    if not isinstance(file, str) or not Path(file).is_absolute():  # torch makes modules with names of files that are none
+    if (
+        not isinstance(file, str) or not Path(file).is_absolute()
+    ):  # torch makes modules with names of files that are none
         return None
     return None if _INSTALLED & set(Path(file).parts) else Path(file)
 
