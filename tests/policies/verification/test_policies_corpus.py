@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from policies_corpus import FAULTY, HELPER, LINE, RIGHT, UNPLAIN, source
-from policies_hidden import KEPT, ORDERS, TEXTS, UNSEEN, K
 
 from sortie.policies.registry import resolve
 from sortie.policies.verification.invariants.language import parse
-from sortie.policies.verification.proof.allowed import why_not_provable
 from sortie.policies.verification.proof.proof import ProofVerdict, prove
-from sortie.scenarios.plugins.user_calls import Guarded, Source
 
 pytestmark = pytest.mark.slow
 
@@ -71,27 +67,3 @@ def test_correct_policies_are_proved(name: str, drones: int, verify: Verify) -> 
 @pytest.mark.parametrize("name", UNPLAIN)
 def test_correct_policies_in_other_python_are_tried(name: str, verify: Verify) -> None:
     assert {v.outcome for v in verify(source(UNPLAIN[name]))} == {"tried"}
-
-
-@pytest.mark.filterwarnings("ignore::SyntaxWarning")
-def test_what_reads_texts_orders_or_state_is_no_plain_python(tmp_path: Path) -> None:
-    texts = [source(body.replace("K", K)) for body in (*TEXTS, *ORDERS, *UNSEEN)]
-    texts += [source(f"{body}\nbad = n > 1000003").replace("SEEN = []", f"SEEN = []\n{first}") for first, body in KEPT]
-    path = tmp_path / "policy.py"
-    for text in texts:
-        path.write_text(text)
-        policy = _with_source(path)
-        assert why_not_provable(policy) or "proved" not in _outcomes(path)[2:], text
-
-
-def _outcomes(path: Path) -> list[str]:
-    return [v.outcome for v in prove(resolve(f"{path}:decide"), parse(LINE), max_drones=2, views=0)]
-
-
-def _with_source(path: Path) -> Guarded:
-    """A policy that is loaded as far as it can be."""
-    names: dict[str, object] = {}
-    exec(compile(source("pass"), path, "exec"), names)  # noqa: S102 - its own text
-    with contextlib.suppress(Exception):
-        exec(compile(path.read_bytes(), path, "exec"), names)  # noqa: S102
-    return Guarded(print, Source(path, "decide", names))
