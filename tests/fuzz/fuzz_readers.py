@@ -231,7 +231,7 @@ def _recording(path: Path) -> None:
     from sortie.perception.recordings.recording import open_recording
 
     rec = open_recording(path)
-    rec.boxes(0, 0), rec.truth(0), rec.rank(0, 0, "confidence"), rec.geometry
+    rec.boxes(0, 0), rec.truth(0), rec.rank(0, 0), rec.geometry
     if "features" in rec.large:
         rec.features(0, 0), rec.rank(0, 0)
 

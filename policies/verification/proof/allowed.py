@@ -143,9 +143,13 @@ def _is_listed(found: Any) -> bool:
     return is_module or of_math or any(found is known for known in _SORTIES)
 
 
-@functools.lru_cache(maxsize=64)
 def _parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_bytes())
+    return _tree(path.read_bytes())  # the file may have changed since it was last read
+
+
+@functools.lru_cache(maxsize=64)
+def _tree(source: bytes) -> ast.Module:
+    return ast.parse(source)
 
 
 def _is_constant(path: Path, name: str, names: Mapping[str, Any]) -> bool:

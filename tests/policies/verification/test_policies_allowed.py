@@ -64,3 +64,11 @@ def test_what_is_refused_is_named_with_its_line(body: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("name", POLICIES)
 def test_registered_policies_are_not_walked(name: str) -> None:
     assert why_not_provable(resolve(name)) == ""
+
+
+def test_a_file_that_was_edited_is_read_anew(tmp_path: Path) -> None:
+    file = tmp_path / "policy.py"
+    file.write_text("def decide(view):\n    return []\n")
+    assert why_not_provable(resolve(f"{file}:decide")) == ""
+    file.write_text("def decide(view):\n    return [*{1}]\n")
+    assert "line 2" in why_not_provable(resolve(f"{file}:decide"))
