@@ -106,11 +106,6 @@ def name_of(thing: object) -> str:
     return f"{source.__module__}.{source.__qualname__}"
 
 
-def runs_user_code(scenario: Scenario) -> bool:
-    """Whether a scenario names a model in a file of a user's own."""
-    return any(is_file(name) for _, name in named_models(scenario.model_dump(mode="json")))
-
-
 def policy_files(scenario: Scenario) -> list[str]:
     """The policies of a scenario that are in files, as it names them."""
     named = named_models(scenario.model_dump(mode="json"))
