@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +25,10 @@ study = typer.Typer(
 )
 TABLE, REPORT = "study.parquet", "README.md"
 WorkOption = Annotated[Path, typer.Option("--work", help="Folder for weights, checkpoints and finished frames.")]
+NetworkOption = Annotated[
+    list[str] | None,
+    typer.Option("--network", help="Measure this network of the plan. Can be given several times. Default: all."),
+]
 BenchOption = Annotated[Path, typer.Option("--bench", help="Folder of benchmarks.")]
 
 
@@ -53,10 +58,11 @@ def study_run(
     work: WorkOption = Path("runs/study"),
     bench_dir: BenchOption = Path("runs/bench"),
     frames: Annotated[int, typer.Option(help="Use this many frames of the test split, from the first.", min=2)] = 80,
+    network: NetworkOption = None,
     workers: WorkersOption = None,
     device: DeviceOption = None,
 ) -> None:
-    """Measure every network that has weights, and write the rows."""
+    """Measure the networks that have weights, and write the rows."""
     from research.flip.measure import StudyRow, to_table
     from research.flip.plan import read_plan
     from research.flip.run import SHIPPED, measure
@@ -66,9 +72,18 @@ def study_run(
     with stages() as progress:
         where = measuring_device(device)
         cores = workers or os.cpu_count() or 1
-        for job, some in measure(
-            plan, work, bench_dir, shipped=SHIPPED, frames=frames, workers=cores, device=where, progress=progress
-        ):
+        measured = measure(
+            plan,
+            work,
+            bench_dir,
+            shipped=SHIPPED,
+            frames=frames,
+            networks=network,
+            workers=cores,
+            device=where,
+            progress=progress,
+        )
+        for job, some in measured:
             rows += some
             out.print(f"{job} measured")
     if not rows:
@@ -128,17 +143,20 @@ def study_doses(
             help="Benchmark seed, first and last frame of its test split: 7:0-239. Can be given several times. Default: the plan's."
         ),
     ] = None,
+    network: NetworkOption = None,
     workers: WorkersOption = None,
     device: DeviceOption = None,
 ) -> None:
     """Measure whether the paper's flip appears when peers that sent nothing get more weight in the fusion."""
     from research.flip import dose_figure, doses
     from research.flip.dose_run import measure
+    from research.flip.run import chosen
     from research.paper import figures as common
     from research.train.devices import measuring_device
     from sortie.scenarios.report_text import interval, signed
 
     plan, rows = doses.read_plan(), list[doses.DoseRow]()
+    plan = replace(plan, networks=tuple(chosen(plan.networks, network)))
     budgets = [f"two − four, {budget:g}" for budget in (0.0, *plan.budgets)]
     heads = ("network", "dose", "weight on zeros", f"starved, {plan.starved:g}", *budgets)
     where = measuring_device(device)

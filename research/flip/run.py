@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,19 @@ def weights_of(job: str, *folders: Path) -> Path | None:
     return next((p for f in folders if (p := f / f"{job}.safetensors").is_file()), None)
 
 
+def chosen(planned: Iterable[str], networks: Sequence[str] | None) -> Sequence[str]:
+    """The networks that were asked for, all that are planned if None.
+
+    Raises:
+        InputError: one that is not in the plan.
+    """
+    planned = list(planned)
+    for name in networks or ():
+        if name not in planned:
+            raise InputError(f"{name} is not in the plan, must be one of {', '.join(planned)}")
+    return planned if networks is None else networks
+
+
 def train_job(
     plan: StudyPlan,
     job: str,
@@ -50,13 +63,11 @@ def train_job(
     Raises:
         InputError: a job that is not in the plan, or one that begins from weights that are not there.
     """
-    found = next(((v, s) for v, s in plan.jobs() if v.job(s) == job), None)
-    if found is None:
-        raise InputError(f"{job} is not in the plan, must be one of {', '.join(v.job(s) for v, s in plan.jobs())}")
+    by_name = {v.job(s): (v, s) for v, s in plan.jobs()}
+    variant, seed = by_name[chosen(by_name, [job])[0]]
     folders = [folder] if shipped is None else [folder, shipped]
     if weights_of(job, *folders) is not None:
         return None
-    variant, seed = found
     begins = variant.begins(seed)
     warm_start = weights_of(begins, *folders) if begins else None
     if begins and warm_start is None:
@@ -81,20 +92,25 @@ def measure(
     *,
     shipped: Path | None = None,
     frames: int = 80,
+    networks: Sequence[str] | None = None,
     workers: int = 1,
     device: torch.device = CPU,
     progress: Progress | None = None,
 ) -> Iterator[tuple[str, list[StudyRow]]]:
-    """Rows of every network that has weights, one network after the other; what has none gives no rows.
+    """Rows of every network that has weights, or of those in `networks`, one after the other; what has none gives no rows.
 
     Finished frames are kept in `folder`, so that a run that was cut off goes on where it was.
+
+    Raises:
+        InputError: a network that is not in the plan.
     """
     tell = progress or (lambda stage, done, of: None)
     folders = [folder] if shipped is None else [folder, shipped]
+    wanted = chosen([variant.job(seed) for variant, seed in plan.jobs()], networks)
     for variant, seed in plan.jobs():
         job = variant.job(seed)
         weights = weights_of(job, *folders)
-        if weights is None:
+        if weights is None or job not in wanted:
             continue
         instrument = CarNetInstrument.load(weights, device)
         first = variant is plan.variants[0] and seed == variant.seeds[0]

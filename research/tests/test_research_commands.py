@@ -19,7 +19,8 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(autouse=True)
 def _in_a_folder_with_small_splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(dataset.SIZES, "validation", (2, 1))
+    for split in ("validation", "tau"):
+        monkeypatch.setitem(dataset.SIZES, split, (2, 1))
 
 
 def run(line: str, *files: str) -> None:
@@ -42,6 +43,7 @@ def test_bench() -> None:
     run(f"bench show {folder} tau 0 --out sheet.png", "sheet.png")
     run(f"bench verify {folder}", f"{folder}/manifest.json")
     run("bench survey --scenes 1 --range 51.2 --density sparse")
+    run("bench difficulty --scenes 2 --workers 2 --store difficulty")
 
 
 def test_train_and_fit() -> None:
@@ -67,13 +69,13 @@ def test_paper() -> None:
 
 def test_study() -> None:
     run("study train dropout-1 --work work --bench bench")  # it has its weights
-    run("study run --frames 2 --work work --bench bench --workers 1", "work/study.parquet")
+    run("study run --frames 2 --network dropout-1 --work work --bench bench --workers 1", "work/study.parquet")
     run(
         f"study report {ROOT}/research/pages/study/study.parquet --out report",
         "report/README.md",
         "report/study.parquet",
     )
-    run("study doses --frames 7:0-1 --work work --bench bench --workers 1", "work/doses.png")
+    run("study doses --frames 7:0-1 --network full-1 --work work --bench bench --workers 1", "work/doses.png")
 
 
 def test_learn() -> None:
