@@ -113,7 +113,7 @@ mavproxy: ## install the ground station MAVProxy in .venv-mavproxy, for its test
 	test -x .venv-mavproxy/bin/python || $(PYTHON) -m venv .venv-mavproxy
 	.venv-mavproxy/bin/python -m pip install --quiet --retries 1 MAVProxy
 
-mutate: $(STAMP) ## change the code that decides figures in small ways, and count what no test notices (hours; MUTATE="--room fleet --sample 5")
+mutate: $(STAMP) ## change the code that decides figures in small ways, and count what no test notices (hours, can be resumed; MUTATE="--room fleet")
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[mutate]'
 	$(BIN)/python -m research.validation.mutate $(MUTATE)
 

@@ -1,78 +1,69 @@
-"""Mutation testing of the files that decide figures: small changes of code, one at a time, that a test must notice.
+"""Mutation testing of the code that decides figures: small changes, one at a time, that a test must notice.
 
-    make mutate                                       a sample of every room, in a quarter of an hour or two
-    python -m research.validation.mutate --room fleet --sample 0        every change of one room, hours
+    make mutate                                                    80 changes over all rooms, hours; it can be resumed
+    python -m research.validation.mutate --suite OTHER --log L     the same changes, with the tests of another checkout
+    python -m research.validation.mutate --pairs OLD NEW           two logs side by side
 
 The changes are those of cosmic-ray's operators: another operator, comparison or number, a condition turned round, a loop
 that ends at once. cosmic-ray's own runner changes the files in place and gives all of them one test command. Here the
-changes are made in a copy of the tree, each room has its own tests, and a sample is drawn (`--seed`). Changes without a
-meaning are left out: those of annotations, of assertions and of caches. So are bitwise operators, which any test notices.
+changes are made in a copy of the tree, and a sample is drawn (`--seed`): each room gives as many, each file in proportion
+to its places. Changes without a meaning are left out: those of annotations, of assertions and of caches. So are bitwise
+operators, which any test notices.
 
-It prints the survival rate by room, and each survivor with its line. CONTRIBUTING.md explains those that are left.
+A change is first tried with the tests of its own folder, then with those of its room, then with the whole short suite, and
+each ends at the first test that fails. A line of the log has the change, and the test that noticed it.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import json
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
+import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
-QUICK = ("-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--tb=line", "--no-header")
-LEFT_OUT = (".git", ".venv*", "runs", "docs", "notebooks", "*.egg-info", ".mypy_cache", ".ruff_cache", ".pytest_cache")
+QUICK = (
+    "-n0",
+    "-x",
+    "-q",
+    "-m",
+    "not slow",
+    "-p",
+    "no:cacheprovider",
+    "--tb=line",
+    "--no-header",
+    "-W",
+    "ignore::ResourceWarning",
+)
 CACHES = {"lru_cache", "cache", "cached_property"}
 LOUD = ("BitOr", "BitAnd", "BitXor", "Shift")
 """Operators of whole numbers, which fail on the first float that they meet: a test that runs the line notices them."""
-SLOWER = 10.0
-"""A change after which the tests take so many times as long as without is noticed: it hangs."""
+LIMIT_S = 3600.0
+"""A change after which the tests of one folder take so long is noticed: it hangs."""
+SEED = "57"
+CHANGES = 80
 
-
-class Room(NamedTuple):
-    """Files that decide figures, and the tests that must notice a change of them."""
-
-    files: tuple[str, ...]
-    tests: tuple[str, ...]
-
-
-ROOMS = {
-    "scenarios": Room(("scenarios/intervals.py", "scenarios/disc.py", "scenarios/link_state.py"), ("tests/scenarios",)),
-    "radio": Room(
-        ("radio/rates.py", "radio/goodput.py", "radio/relay.py", "radio/channel/snr.py", "radio/channel/pathloss.py"),
-        ("tests/radio",),
-    ),
-    "fleet": Room(
-        ("fleet/energy/battery.py", "fleet/energy/cell.py", "policies/staleness.py", "fleet/trust.py", "fleet/standings.py", "fleet/memory.py"),
-        ("tests/fleet/energy", "tests/fleet/flight", *(f"tests/fleet/test_fleet_{t}.py" for t in (
-            "clock", "computer", "joints", "plane", "probes", "trust"
-        ))),
-    ),
-    "policies": Room(
-        ("policies/damping.py", *(f"policies/catalogue/{f}.py" for f in (
-            "worked", "deputies", "adaptive", "baselines", "vantage", "freshness"
-        ))),
-        ("tests/policies/catalogue", "tests/policies/test_policies_damping.py", "tests/policies/test_policies_joints.py"),
-    ),
-    "perception": Room(
-        ("perception/metrics/ap.py", "perception/joining.py", "perception/lateness.py", "perception/budget.py",
-         "perception/surrogate/draws.py"),
-        ("tests/perception/metrics", "tests/perception/surrogate", *(f"tests/perception/test_perception_{t}.py" for t in (
-            "budget", "joining", "joints", "lateness"
-        ))),
-    ),
-    "sim": Room(
-        ("sim/results/outcome.py", "sim/results/mission_outcome.py", "sim/results/regions.py", "sim/engine/scoring.py", "sim/engine/fusing.py"),
-        ("tests/sim/results", "tests/sim/engine/test_sim_joints.py", "tests/sim/engine/test_sim_scoring_times.py", "tests/sim/engine/test_sim_fusing.py", "tests/sim/engine/test_sim_engine_handover_joints.py"),
-    ),
+ROOMS: dict[str, tuple[str, ...]] = {
+    "scenarios": ("intervals.py", "disc.py", "link_state.py", "formation.py", "control_variates.py", "streams.py", "schema/*.py"),
+    "radio": ("*.py", "channel/*.py", "mac/*.py"),
+    "fleet": ("*.py", "energy/*.py", "flight/*.py", "messages/*.py"),
+    "policies": ("*.py", "catalogue/*.py", "catalogue/prior/*.py"),
+    "perception": ("*.py", "metrics/*.py", "network/*.py", "network/fusion/*.py", "scene/*.py", "surrogate/*.py", "tracking/*.py"),
+    "sim": ("engine/*.py", "results/*outcome*.py", "results/accuracy.py", "results/regions.py", "results/disagreement.py",
+            "results/traffic.py", "results/link_traffic.py", "campaign/spread.py", "campaign/rows.py", "campaign/sensitivity.py"),
 }  # fmt: skip
+"""The files of each room that decide figures: not its reading, errors, pages and command line."""
 
 
 class Change(NamedTuple):
@@ -149,6 +140,12 @@ def changed(text: str, place: Place) -> Change | None:
         return None
 
 
+def files(tree: Path, room: str) -> dict[str, str]:
+    """The texts of a room's files that decide figures, by their paths in the tree."""
+    found = sorted({path for pattern in ROOMS[room] for path in (tree / room).glob(pattern)})
+    return {str(path.relative_to(tree)): path.read_text("utf-8") for path in found}
+
+
 def drawn(texts: dict[str, str], sample: int, seed: str) -> Iterator[Change]:
     """So many changes with a meaning, in a random order; 0: every one."""
     every = [place for file, text in texts.items() for place in places(file, text)]
@@ -164,57 +161,120 @@ def drawn(texts: dict[str, str], sample: int, seed: str) -> Iterator[Change]:
                 return
 
 
-def run(tree: Path, tests: Sequence[str], limit_s: float | None = None) -> bool:
-    """Whether the tests pass in a copy of the tree; False where they do not end."""
+def stages(tree: Path, file: str) -> list[list[str]]:
+    """The tests that a change of a file is tried with, one stage after the other: its folder's, its room's, all others."""
+    folders: list[str] = []
+    for parent in reversed(Path(file).parents[:-1]):
+        if (tree / "tests" / parent).is_dir():
+            folders.insert(0, f"tests/{parent.as_posix()}")
+    done: list[str] = []
+    found = []
+    for folder in [*folders, "tests"]:
+        found.append([folder, *(f"--ignore={one}" for one in done)])
+        done.append(folder)
+    return found
+
+
+FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+
+
+def noticed_by(tree: Path, tests: Sequence[str]) -> str | None:
+    """The first test that fails in a copy of the tree; None where all pass."""
     env = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-m", "pytest", *QUICK, *tests]
     process = subprocess.Popen(
-        command, cwd=tree, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        command, cwd=tree, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     )
     try:
-        return process.wait(limit_s) == 0
+        text, _ = process.communicate(timeout=LIMIT_S)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, 9)
-        process.wait()
-        return False
+        process.communicate()
+        return "no end"
+    if process.returncode in {0, 5}:  # 5: a folder without tests of its own
+        return None
+    first = FAILED.search(text)
+    return first[1] if first else text.strip().splitlines()[-1]
 
 
-def survivors(tree: Path, name: str, room: Room, sample: int, seed: int) -> tuple[int, list[str]]:
-    """How many changes of a room were tried, and those that no test noticed.
-
-    Raises:
-        SystemExit: its tests fail without any change.
-    """
-    texts = {file: (tree / file).read_text("utf-8") for file in room.files}
-    begin_s = time.monotonic()
-    if not run(tree, room.tests):
-        raise SystemExit(f"{name}: its tests fail without any change; see pytest {' '.join(room.tests)}")
-    limit_s = SLOWER * (time.monotonic() - begin_s) + 60.0
-    tried, left = 0, []
-    for change in drawn(texts, sample, f"{seed}/{name}"):
-        path = tree / change.file
-        path.write_text(change.text, "utf-8")
-        passed = run(tree, room.tests, limit_s)
-        path.write_text(texts[change.file], "utf-8")
-        where, tried = change.where(texts[change.file]), tried + 1
-        if passed:
-            left.append(where)
-        write(f"{name} {tried}: {'SURVIVED' if passed else 'noticed'}  {where}")
-    return tried, left
+def tried(tree: Path, change: Change) -> str | None:
+    """The test that notices a change, None if it survives. The file is as before afterwards, its time of change too."""
+    path = tree / change.file
+    before, stat = path.read_bytes(), path.stat()
+    path.write_text(change.text, "utf-8")
+    try:
+        return next((by for tests in stages(tree, change.file) if (by := noticed_by(tree, tests))), None)
+    finally:
+        path.write_bytes(before)
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # compiled loops are kept by it
 
 
-def write(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+def copy(suite: Path, tree: Path) -> None:
+    """The tree of the product that is here, with the tests of a checkout."""
+    left_out = (".git", ".venv*", "runs", "build", "*.egg-info", ".mypy_cache", ".ruff_cache", ".pytest_cache")
+    shutil.copytree(ROOT, tree, symlinks=True, ignore=shutil.ignore_patterns(*left_out))
+    if suite != ROOT:
+        shutil.rmtree(tree / "tests")
+        shutil.copytree(suite / "tests", tree / "tests", symlinks=True)
 
 
-def table(results: dict[str, tuple[int, list[str]]]) -> list[str]:
-    """The survival rate by room, as Markdown."""
-    rows = ["| room | changes | survived | share |", "|---|---|---|---|"]
-    for name, (tried, left) in results.items():
-        share = f"{len(left) / tried:.0%}" if tried else "–"
-        rows.append(f"| {name} | {tried} | {len(left)} | {share} |")
+def measure(suite: Path, log: Path, sample: int, seed: str, rooms: Sequence[str], workers: int) -> None:
+    """Try every drawn change that the log does not have yet, and write a line for each."""
+    known = {row["change"] for row in read(log)}
+    todo = []
+    for k, room in enumerate(ROOMS):
+        texts = files(ROOT, room)
+        count = sample // len(ROOMS) + (k < sample % len(ROOMS))
+        for change in drawn(texts, count, f"{seed}/{room}") if room in rooms else ():
+            where = change.where(texts[change.file])
+            if where not in known:
+                todo.append((room, where, change))
+    trees: list[Path] = []
+    lock, own = threading.Lock(), threading.local()
+
+    def one(job: tuple[str, str, Change]) -> None:
+        room, where, change = job
+        if not hasattr(own, "tree"):
+            with lock:
+                own.tree = trees.pop()
+        by = tried(own.tree, change)
+        with lock, log.open("a", encoding="utf-8") as lines:
+            lines.write(json.dumps({"room": room, "change": where, "by": by}, ensure_ascii=False) + "\n")
+            sys.stdout.write(f"{room}: {'SURVIVED' if by is None else by}  {where}\n")
+            sys.stdout.flush()
+
+    with tempfile.TemporaryDirectory(prefix="sortie-mutate-") as folder:
+        for k in range(workers):
+            copy(suite, Path(folder) / f"tree{k}")
+            trees.append(Path(folder) / f"tree{k}")
+        with ThreadPoolExecutor(workers) as pool:
+            for _ in pool.map(one, todo):
+                pass
+
+
+def read(log: Path) -> list[dict[str, str | None]]:
+    """The lines of a log; none if it is not there yet."""
+    return [json.loads(line) for line in log.read_text("utf-8").splitlines()] if log.exists() else []
+
+
+def table(logs: Sequence[list[dict[str, str | None]]]) -> list[str]:
+    """Survivors by room in each log, as Markdown."""
+    rows = ["| room | changes |" + " survived |" * len(logs), "|---|---|" + "---|" * len(logs)]
+    for room in (*ROOMS, "all"):
+        of = [[row for row in log if room in {"all", row["room"]}] for log in logs]
+        rows.append(f"| {room} | {len(of[0])} | " + " | ".join(f"{sum(r['by'] is None for r in o)}" for o in of) + " |")
     return rows
+
+
+def differing(old: list[dict[str, str | None]], new: list[dict[str, str | None]]) -> list[str]:
+    """A line for each change that only one of two logs noticed."""
+    before = {row["change"]: row["by"] for row in old}
+    lines = []
+    for row in new:
+        change, by = row["change"], row["by"]
+        if change in before and (before[change] is None) != (by is None):
+            lines.append(f"{'no longer noticed' if by is None else 'now noticed'}: {change}, by {by or before[change]}")
+    return lines
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -222,20 +282,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--room", action="append", choices=ROOMS, help="a room; more than once for several; left out, all"
     )
-    parser.add_argument("--sample", type=int, default=15, help="changes a room; 0 takes every one")
-    parser.add_argument("--seed", type=int, default=1, help="of the sample")
+    parser.add_argument("--sample", type=int, default=CHANGES, help="changes over all rooms; 0 takes every one")
+    parser.add_argument("--seed", default=SEED, help="of the sample")
+    parser.add_argument("--suite", type=Path, default=ROOT, help="a checkout whose tests are run")
+    parser.add_argument(
+        "--log", type=Path, default=Path("runs/mutate.jsonl"), help="what was tried; a later call goes on"
+    )
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="changes that are tried at once")
+    parser.add_argument("--pairs", type=Path, nargs=2, metavar=("OLD", "NEW"), help="compare two logs, and run nothing")
     asked = parser.parse_args(arguments)
-    results = {}
-    with tempfile.TemporaryDirectory(prefix="sortie-mutate-") as folder:
-        tree = Path(folder) / "tree"
-        shutil.copytree(ROOT, tree, symlinks=True, ignore=shutil.ignore_patterns(*LEFT_OUT))
-        for name in asked.room or ROOMS:
-            results[name] = survivors(tree, name, ROOMS[name], asked.sample, asked.seed)
-    for name, (_, left) in results.items():
-        for where in left:
-            write(f"survived in {name}: {where}")
-    for line in table(results):
-        write(line)
+    if asked.pairs:
+        old, new = (read(log) for log in asked.pairs)
+        lines = [*table([old, new]), *differing(old, new)]
+    else:
+        asked.log.parent.mkdir(parents=True, exist_ok=True)
+        measure(asked.suite, asked.log, asked.sample, asked.seed, asked.room or tuple(ROOMS), asked.workers)
+        log = read(asked.log)
+        lines = [*table([log]), *(f"survived in {row['room']}: {row['change']}" for row in log if row["by"] is None)]
+    sys.stdout.write("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -43,19 +43,30 @@ def test_a_change_names_its_line() -> None:
     assert change.where(PLAIN) == "a/b.py:8: return x / 2 if x > 1 else None  →  return x * 2 if x > 1 else None"
 
 
-def test_the_table_has_a_row_for_each_room() -> None:
-    assert mutate.table({"radio": (8, ["x", "y"]), "sim": (0, [])}) == [
-        "| room | changes | survived | share |",
-        "|---|---|---|---|",
-        "| radio | 8 | 2 | 25% |",
-        "| sim | 0 | 0 | – |",
+def test_two_logs_are_compared_by_room_and_by_change() -> None:
+    old = [{"room": "radio", "change": "x", "by": None}, {"room": "sim", "change": "y", "by": "tests/a.py::test_a"}]
+    new = [{"room": "radio", "change": "x", "by": "tests/b.py::test_b"}, {"room": "sim", "change": "y", "by": None}]
+    lines = mutate.table([old, new])
+    assert lines[0] == "| room | changes | survived | survived |"
+    for row in ("| radio | 1 | 1 | 0 |", "| sim | 1 | 0 | 1 |", "| fleet | 0 | 0 | 0 |", "| all | 2 | 1 | 1 |"):
+        assert row in lines
+    assert mutate.differing(old, new) == [
+        "now noticed: x, by tests/b.py::test_b",
+        "no longer noticed: y, by tests/a.py::test_a",
     ]
 
 
-def test_the_files_and_tests_that_it_names_are_there() -> None:
-    for room in mutate.ROOMS.values():
-        for name in (*room.files, *room.tests):
-            assert (mutate.ROOT / name).exists(), name
+def test_every_pattern_finds_files() -> None:
+    for room, patterns in mutate.ROOMS.items():
+        assert [one for one in patterns if not list((mutate.ROOT / room).glob(one))] == [], room
+
+
+def test_the_tests_of_the_nearest_folder_come_first() -> None:
+    assert mutate.stages(mutate.ROOT, "radio/mac/edca.py") == [
+        ["tests/radio/mac"],
+        ["tests/radio", "--ignore=tests/radio/mac"],
+        ["tests", "--ignore=tests/radio/mac", "--ignore=tests/radio"],
+    ]
 
 
 def test_a_sample_is_drawn_of_changes_with_a_meaning() -> None:
@@ -74,16 +85,21 @@ def test_what_a_test_holds_is_noticed_and_what_none_holds_survives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = "def half(x):\n    return x / 2 if x > 1 else None\n"
-    (tmp_path / "halves.py").write_text(code)
-    test = "from halves import half\n\ndef test_half():\n    assert half(4) == {}\n"
-    (tmp_path / "test_halves.py").write_text(test.format(2))
-    two = [mutate.Change("halves.py", code.replace(*pair)) for pair in (("x / 2", "x * 2"), ("> 1", "> 2"))]
+    (tmp_path / "radio").mkdir()
+    (tmp_path / "tests" / "radio").mkdir(parents=True)
+    (tmp_path / "radio" / "halves.py").write_text(code)
+    test = "from radio.halves import half\n\ndef test_half():\n    assert half(4) == 2\n"
+    (tmp_path / "tests" / "radio" / "test_halves.py").write_text(test)
+    two = [mutate.Change("radio/halves.py", code.replace(*pair)) for pair in (("x / 2", "x * 2"), ("> 1", "> 2"))]
+    monkeypatch.setattr(mutate, "ROOT", tmp_path)
+    monkeypatch.setattr(mutate, "ROOMS", {"radio": ("*.py",)})
     monkeypatch.setattr(mutate, "drawn", lambda *_: iter(two))
-    room = mutate.Room(("halves.py",), ("test_halves.py",))
-    left = "halves.py:2: return x / 2 if x > 1 else None  →  return x / 2 if x > 2 else None"
-    assert mutate.survivors(tmp_path, "toy", room, 0, 1) == (2, [left])
-    assert capsys.readouterr().out.splitlines()[1] == f"toy 2: SURVIVED  {left}"
-    assert (tmp_path / "halves.py").read_text() == code
-    (tmp_path / "test_halves.py").write_text(test.format(3))
-    with pytest.raises(SystemExit, match=r"toy: its tests fail without any change; see pytest test_halves\.py"):
-        mutate.survivors(tmp_path, "toy", room, 1, 1)
+    for _ in range(2):  # the second call finds everything in the log
+        mutate.measure(tmp_path, tmp_path / "log", 2, "1", ("radio",), 2)
+    by_new_line = {row["change"].split("→  ")[1]: row["by"] for row in mutate.read(tmp_path / "log")}
+    assert by_new_line == {
+        "return x * 2 if x > 1 else None": "tests/radio/test_halves.py::test_half",
+        "return x / 2 if x > 2 else None": None,
+    }
+    assert len((tmp_path / "log").read_text().splitlines()) == 2
+    assert (tmp_path / "radio" / "halves.py").read_text() == code
