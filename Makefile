@@ -40,8 +40,8 @@ screenshot: $(LIGHT) ## fly the paper's replay and take docs/sortie.png from the
 	$(BIN)/sortie fly paper_replay --set perception.detector=surrogate --out runs/screenshot --replace
 	$(BIN)/sortie view runs/screenshot --picture docs/sortie.png --at 64.2
 
-test: $(STAMP) ## run the test suite but for its slow tests, a worker a core
-	$(BIN)/python -m pytest -n auto -m 'not slow'
+test: $(STAMP) ## run the test suite but for its slow tests and those of pages, a worker a core
+	$(BIN)/python -m pytest -n auto -m 'not slow and not pages'
 
 test-all: $(STAMP) ## run the whole test suite, with other random examples each time
 	$(BIN)/python -m pytest -n auto --hypothesis-profile explore
@@ -78,9 +78,10 @@ notebooks: $(STAMP) ## execute the notebooks (NOTEBOOKS=notebooks/name.ipynb for
 outputs: $(STAMP) ## execute the notebooks and keep their outputs, which the site shows (NOTEBOOK=name for one)
 	$(BIN)/python docs/site/run_notebooks.py $(NOTEBOOK)
 
-docs: $(STAMP) ## build the documentation site into build/site; a broken link or page fails
+docs: $(STAMP) ## build the documentation site into build/site; a broken link, page or command fails
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
 	$(BIN)/python -m sphinx -W --keep-going -q -j auto -c docs/site . build/site
+	$(BIN)/python -m pytest -q -m 'pages and not slow' tests/site
 
 check: lint test ## lint, types, tests
 

@@ -38,7 +38,7 @@ QUICK = (
     "-x",
     "-q",
     "-m",
-    "not slow",
+    "not slow and not pages",
     "-p",
     "no:cacheprovider",
     "--tb=line",

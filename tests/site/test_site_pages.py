@@ -15,7 +15,7 @@ from places import ROOT
 import sortie
 from sortie.sim.cli.app import COMMANDS
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.pages
 
 SITE = ROOT / "docs" / "site"
 
@@ -87,8 +87,3 @@ def test_every_directive_of_a_page_is_one_of_ours() -> None:
 def test_the_gallery_shows_every_picture() -> None:
     shown = re.findall(r"!\[.+\]\((.*)\)", (SITE / "gallery.md").read_text("utf-8"))
     assert sorted((SITE / path).resolve() for path in shown) == sorted((ROOT / "docs").rglob("*.png"))
-
-
-@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))], ids=lambda p: p.stem)
-def test_pictures_have_words_for_those_who_do_not_see_them(page: Path) -> None:
-    assert "![](" not in page.read_text("utf-8")
