@@ -49,9 +49,8 @@ def project(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).mkdir()
         (folder / name / "__init__.py").write_text(f"MINE = {name!r}\n")
     (folder / "policies" / "contract.py").write_text("LIMIT = 3\n")
-    (folder / "test_mine.py").write_text(
-        "import sim\nfrom policies.contract import LIMIT\n\n\ndef test_mine():\n    assert (sim.MINE, LIMIT) == ('sim', 3)\n"
-    )
+    test = "def test_mine():\n    assert (sim.MINE, LIMIT) == ('sim', 3)\n"
+    (folder / "test_mine.py").write_text(f"import sim\nfrom policies.contract import LIMIT\n\n\n{test}")
     (folder / "mine.py").write_text(
         "import sortie\nfrom policies.contract import LIMIT\n\n\ndef decide(view):\n"
         "    return [sortie.Directive(view.ego, p, reason=f'at most {LIMIT}') for p in view.peers]\n"
@@ -109,5 +108,16 @@ def test_the_projects_own_packages_are_what_their_names_say(project: Path) -> No
 
 def test_outside_the_checkout_the_rooms_have_no_other_name(project: Path) -> None:
     """A plain import of a room fails where the project has none."""
-    code = f"import os, sys; os.chdir('/'); sys.path[:] = [p for p in sys.path if p]; import sortie\nfor name in {OWN!r}:\n    try:\n        __import__(name)\n    except ImportError:\n        continue\n    raise SystemExit(name)"
+    code = f"""
+import os, sys
+os.chdir("/")
+sys.path[:] = [path for path in sys.path if path]
+import sortie
+for name in {OWN!r}:
+    try:
+        __import__(name)
+    except ImportError:
+        continue
+    raise SystemExit(name)
+"""
     run(project, "-c", code)
