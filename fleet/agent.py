@@ -380,10 +380,20 @@ class Agent:
         """Peers to which the link's directive may change although the policy asks for nothing new."""
         found = self._overdue_ids
         count = self._find_overdue(
-            self.drone, now_s, self._fresh_s, self._period_s, self._rules.degraded_after_periods,
-            self.memory.clocks.delay_s, self.memory.ids, ages_s, self._heard_s, self._busy, self._at_rest, self._blamed,
+            self.drone,
+            now_s,
+            self._fresh_s,
+            self._period_s,
+            self._rules.degraded_after_periods,
+            self.memory.clocks.delay_s,
+            self.memory.ids,
+            ages_s,
+            self._heard_s,
+            self._busy,
+            self._at_rest,
+            self._blamed,
             found,
-        )  # fmt: skip
+        )
         return found[:count].tolist() if count else []
 
     def _note_links(self, stepped: Iterable[OutgoingLink], view: FleetView, now_s: float) -> None:
@@ -433,9 +443,17 @@ class Agent:
             what = (directive.representation, directive.rho, directive.roi, directive.fusion_weight)
             if what not in made:
                 payload = make_payload(
-                    directive, *pose, count_boxes, rules.tile_limit_bytes, tracks_in, people_in, self._found_last,
-                    classes=rules.classes, code_bytes=rules.code_bytes, bring_look=rules.maps_bring_looks,
-                )  # fmt: skip
+                    directive,
+                    *pose,
+                    count_boxes,
+                    rules.tile_limit_bytes,
+                    tracks_in,
+                    people_in,
+                    self._found_last,
+                    classes=rules.classes,
+                    code_bytes=rules.code_bytes,
+                    bring_look=rules.maps_bring_looks,
+                )
                 if payload is not None and (self.status.feature_space or self.status.codebook):
                     payload = payload._replace(
                         feature_space=self.status.feature_space,

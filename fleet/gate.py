@@ -121,18 +121,30 @@ def make_payload(
         people = None if people_in is None else people_in(roi)
         boxes = budget.boxes_sent(NAME_OF[rung], count_boxes(roi) + (0 if people is None else len(people)))
     # the directive goes with the payload, so that the receiver has representation, region and fusion weight
-    size_bytes = HEADER_BYTES + directive_bytes(directive) + budget.content_bytes(
-        NAME_OF[rung], cells=cells, boxes=boxes, classes=classes, code_bytes=code_bytes
-    )  # fmt: skip
+    size_bytes = (
+        HEADER_BYTES
+        + directive_bytes(directive)
+        + budget.content_bytes(NAME_OF[rung], cells=cells, boxes=boxes, classes=classes, code_bytes=code_bytes)
+    )
     if cells:
         size_bytes += budget.content_bytes("detections", boxes=boxes, classes=classes)
     if found is not None:
         boxes += found.number
         size_bytes += HEADER_BYTES + budget.content_bytes("detections", boxes=found.number, classes=classes)
     return Payload(
-        rung, rho, roi, weight, cells, boxes, index_bytes, size_bytes, tracks=tracks, people=people,
-        code_bytes=code_bytes if rung == _CODES else 0, found=found,
-    )  # fmt: skip
+        rung,
+        rho,
+        roi,
+        weight,
+        cells,
+        boxes,
+        index_bytes,
+        size_bytes,
+        tracks=tracks,
+        people=people,
+        code_bytes=code_bytes if rung == _CODES else 0,
+        found=found,
+    )
 
 
 class Gate:

@@ -13,7 +13,9 @@ from sortie.policies.contract import Coverage, Descriptor
 About = Literal["coverage", "goodput", "battery"]
 Claim = Literal["much", "little"]
 
-_ALL = {claim: bytes([state * 0b01010101]) * 64 for claim, state in (("much", Coverage.NOVEL), ("little", Coverage.UNSEEN))}  # fmt: skip
+_ALL = {
+    claim: bytes([state * 0b01010101]) * 64 for claim, state in (("much", Coverage.NOVEL), ("little", Coverage.UNSEEN))
+}
 MUCH_MBPS, LITTLE_MBPS = 500.0, 0.1
 MUCH_SOC, LITTLE_SOC = 1.0, 0.05
 

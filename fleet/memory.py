@@ -238,9 +238,15 @@ class PeerMemory:
                 looking.add(i)
             self._arrivals[i] = [a for a in later if a.t_done_s > too_old_s]
         self._standings = after = judge(
-            before, self.drone, heard, arrivals, self._rules.form, looking,
-            self._cameras, self._stations,
-        )  # fmt: skip
+            before,
+            self.drone,
+            heard,
+            arrivals,
+            self._rules.form,
+            looking,
+            self._cameras,
+            self._stations,
+        )
         strikes, were = after.rows["strikes"], before.rows["strikes"]
         self._doubted = frozenset(np.flatnonzero(strikes >= STRIKES_TO_DOUBT).tolist())
         moved = np.flatnonzero(strikes != were).tolist()
@@ -278,12 +284,25 @@ def hear(receivers: Sequence[PeerMemory], opened: Opened | Dropped, now_s: float
         return [(memory.drone, DropReason.MALFORMED) for memory in receivers]
     module, count = loops(), len(receivers)
     found = module.hear(
-        np.fromiter([memory.row for memory in receivers], np.int64, count), table.first,
-        np.fromiter([memory.status.clock_skew_s for memory in receivers], np.float64, count), sender,
-        descriptor.stamp_ns * 1e-9, _circle(descriptor), now_s, key_id is not None, np.uint64(counter), rules.period_s,
-        rules.descriptor_period_s, table.window, table.counters(key_id or 0), table.heard_s, table.stamps_s,
-        table.circles, table.watched, table.bits,
-    ).tobytes()  # fmt: skip
+        np.fromiter([memory.row for memory in receivers], np.int64, count),
+        table.first,
+        np.fromiter([memory.status.clock_skew_s for memory in receivers], np.float64, count),
+        sender,
+        descriptor.stamp_ns * 1e-9,
+        _circle(descriptor),
+        now_s,
+        key_id is not None,
+        np.uint64(counter),
+        rules.period_s,
+        rules.descriptor_period_s,
+        table.window,
+        table.counters(key_id or 0),
+        table.heard_s,
+        table.stamps_s,
+        table.circles,
+        table.watched,
+        table.bits,
+    ).tobytes()
     taken, unusual, refused = module.TAKEN, module.UNUSUAL, module.REFUSED
     if found.count(taken) == count:  # as nearly always
         for memory in receivers:

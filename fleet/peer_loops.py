@@ -53,9 +53,25 @@ def _count(words, window):
 
 @compiled
 def hear(
-    rows, first, skews_s, sender, stamp_s, circle, now_s, is_counted, counter, delay_s, period_s, window, counters, heard_s,
-    stamps_s, circles, watched, bits,
-):  # fmt: skip
+    rows,
+    first,
+    skews_s,
+    sender,
+    stamp_s,
+    circle,
+    now_s,
+    is_counted,
+    counter,
+    delay_s,
+    period_s,
+    window,
+    counters,
+    heard_s,
+    stamps_s,
+    circles,
+    watched,
+    bits,
+):
     """Take a datagram in at several receivers, drones `first` + `rows` [K]; returns what it is to each, [K]."""
     found = np.empty(len(rows), np.uint8)
     for k in range(len(rows)):
@@ -120,8 +136,20 @@ def near(ids, circles, x_m, y_m, reach_m):
 
 @within
 def overdue(
-    me, now_s, fresh_s, period_s, degraded, delay_s, ids, ages_s, heard_s, busy, at_rest, blamed, found,
-):  # fmt: skip
+    me,
+    now_s,
+    fresh_s,
+    period_s,
+    degraded,
+    delay_s,
+    ids,
+    ages_s,
+    heard_s,
+    busy,
+    at_rest,
+    blamed,
+    found,
+):
     """Peers whose links' directives must be looked at although nothing new was asked of them, to the front of `found`; returns
     how many.
 

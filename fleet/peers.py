@@ -24,9 +24,25 @@ def loops() -> Any:
     none, ids, flags = np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.uint8)
     bits, square = np.zeros((0, 1), np.uint64), np.zeros((0, 0))
     peer_loops.hear(
-        ids, 0, none, 0, 0.0, (0.0, 0.0, 0.0), 0.0, True, np.uint64(0), 1.0, 1.0, 1, square.astype(np.uint64), square, square,
-        square[..., None], square.astype(np.uint8), bits[None],
-    )  # fmt: skip
+        ids,
+        0,
+        none,
+        0,
+        0.0,
+        (0.0, 0.0, 0.0),
+        0.0,
+        True,
+        np.uint64(0),
+        1.0,
+        1.0,
+        1,
+        square.astype(np.uint64),
+        square,
+        square,
+        square[..., None],
+        square.astype(np.uint8),
+        bits[None],
+    )
     peer_loops.fill(0.0, 1.0, 1, ids, none, bits, none, none)
     peer_loops.ages(0.0, 0.0, ids, none, none, none)
     peer_loops.near(ids, square, 0.0, 0.0, 0.0)

@@ -90,9 +90,12 @@ class FlightSenses:
         position, orientation, velocity, believed = (
             map(tuple, states[:, drone].tolist())
             for states in (
-                poses.position_m, poses.orientation_xyzw, self._motion.velocity_mps[frames], poses.est_position_m,
+                poses.position_m,
+                poses.orientation_xyzw,
+                self._motion.velocity_mps[frames],
+                poses.est_position_m,
             )
-        )  # fmt: skip
+        )
         yaw = poses.est_yaw_rad[:, drone].tolist()
         radius = footprint_radius_m(poses.est_position_m[:, drone, 2], cameras).tolist()
         if drone in self._blind:
@@ -102,10 +105,21 @@ class FlightSenses:
         return [
             Sensed(
                 Capture(drone, frame * self._frame_s, at, turn, est, heading, cameras=cameras),
-                v, r, view, turned(turn, wrong) if wrong else turn,
+                v,
+                r,
+                view,
+                turned(turn, wrong) if wrong else turn,
             )
             for frame, v, r, view, at, turn, est, heading, wrong in zip(
-                range(frames.start, frames.start + len(yaw)), velocity, radius, views, position, orientation, believed,
-                yaw, wrong_rad, strict=True,
+                range(frames.start, frames.start + len(yaw)),
+                velocity,
+                radius,
+                views,
+                position,
+                orientation,
+                believed,
+                yaw,
+                wrong_rad,
+                strict=True,
             )
-        ]  # fmt: skip
+        ]

@@ -37,8 +37,16 @@ class Standing(NamedTuple):
 
 UNJUDGED = Standing()
 ROW = np.dtype(
-    [("is_there", "?"), ("fine", "?"), ("strikes", "u1"), ("seconds", "i4"), ("unheard", "i4"), ("first_soc", "f8"), ("least_soc", "f8")]
-)  # fmt: skip
+    [
+        ("is_there", "?"),
+        ("fine", "?"),
+        ("strikes", "u1"),
+        ("seconds", "i4"),
+        ("unheard", "i4"),
+        ("first_soc", "f8"),
+        ("least_soc", "f8"),
+    ]
+)
 
 
 class Standings(Mapping[int, Standing]):

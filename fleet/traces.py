@@ -106,8 +106,11 @@ def read_traces(path: str | Path, drones: int, origin: Origin | None = None) -> 
     path = Path(path)
     columns = read_columns(path, BOUNDS)
     for what, names in (
-        ("a pose", POSITION), ("a place on the globe", GLOBE), ("an attitude", ATTITUDE), ("a velocity", VELOCITY),
-    ):  # fmt: skip
+        ("a pose", POSITION),
+        ("a place on the globe", GLOBE),
+        ("an attitude", ATTITUDE),
+        ("a velocity", VELOCITY),
+    ):
         if 0 < sum(name in columns for name in names) < len(names):
             raise TraceError(f"{path}: {what} needs all of {', '.join(names)}")
     for some, others in (((POSITION[0],), (GLOBE[0],)), (("yaw_deg", ATTITUDE[0]), COMPASS)):
@@ -164,9 +167,15 @@ def follow(motion: Trajectories, traces: Mapping[int, DroneTrace], frame_s: floa
     if not posed:
         return motion
     names = (
-        "position_m", "orientation_xyzw", "velocity_mps", "acceleration_mps2", "body_rates_radps", "yaw_rad",
-        "est_position_m", "est_yaw_rad",
-    )  # fmt: skip
+        "position_m",
+        "orientation_xyzw",
+        "velocity_mps",
+        "acceleration_mps2",
+        "body_rates_radps",
+        "yaw_rad",
+        "est_position_m",
+        "est_yaw_rad",
+    )
     new: dict[str, Array] = {name: scratch.copied(getattr(motion, name)) for name in names}
     for drone, pose in posed.items():
         t_s = np.clip(motion.time_s, pose.time_s[0], pose.time_s[-1])

@@ -155,9 +155,11 @@ def judge(
 def discounted(d: Descriptor) -> Descriptor:
     """A doubted drone's descriptor as policies get to read it: where it is, and nothing of what it says of itself."""
     return d._replace(
-        coverage_grid=UNKNOWN_GRID, novelty_flags=0, battery_soc=0.0,
+        coverage_grid=UNKNOWN_GRID,
+        novelty_flags=0,
+        battery_soc=0.0,
         peer_goodput_mbps=(0.0,) * len(d.peer_goodput_mbps),
-    )  # fmt: skip
+    )
 
 
 # --- the three checks ----------------------------------------------------------------------------

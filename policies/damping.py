@@ -46,9 +46,23 @@ def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float
     optional: list[Any]
     # unpacked and built again for speed: every drone does this in every frame
     (
-        stamp, agent, at, turn, velocity, footprint, own_soc, own_cpu, own_gpu, own_links, grid, flags, phase, region, targets,
+        stamp,
+        agent,
+        at,
+        turn,
+        velocity,
+        footprint,
+        own_soc,
+        own_cpu,
+        own_gpu,
+        own_links,
+        grid,
+        flags,
+        phase,
+        region,
+        targets,
         *optional,
-    ) = measured  # fmt: skip
+    ) = measured
     soc, cpu, gpu, links, last = own_soc, own_cpu, own_gpu, own_links, before.peer_goodput_mbps
     if measured.roster is not None and measured.roster != before.roster:
         last = goodput_to_members(before, measured.roster)
@@ -68,9 +82,23 @@ def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float
     if soc == own_soc and cpu == own_cpu and gpu == own_gpu and links == own_links:
         return measured
     return Descriptor(
-        stamp, agent, at, turn, velocity, footprint, soc, cpu, gpu, links, grid, flags, phase, region, targets,
+        stamp,
+        agent,
+        at,
+        turn,
+        velocity,
+        footprint,
+        soc,
+        cpu,
+        gpu,
+        links,
+        grid,
+        flags,
+        phase,
+        region,
+        targets,
         *optional,
-    )  # fmt: skip
+    )
 
 
 class DampedLink(NamedTuple):

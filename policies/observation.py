@@ -88,7 +88,18 @@ def _row(me: Descriptor, d: Descriptor, age_s: float) -> list[float]:
         region = [1.0, x_m / 100, y_m / 100, d.region.radius_m / 100]
     cells = np.unpackbits(np.frombuffer(d.coverage_grid, np.uint8), bitorder="little").reshape(-1, 2) @ (1, 2)
     return [
-        1.0, age_s, *place, *(v / 10 for v in d.velocity_mps), d.footprint_radius_m / 100, d.battery_soc,
-        d.cpu_headroom, d.gpu_headroom, me.goodput_to(d.agent_id) / 100, me.link_state(d.agent_id) / LinkState.MEASURED, *phase, *region,
-        float((cells >= Coverage.WELL).mean()), float(bool(d.priority_target_ids)),
-    ]  # fmt: skip
+        1.0,
+        age_s,
+        *place,
+        *(v / 10 for v in d.velocity_mps),
+        d.footprint_radius_m / 100,
+        d.battery_soc,
+        d.cpu_headroom,
+        d.gpu_headroom,
+        me.goodput_to(d.agent_id) / 100,
+        me.link_state(d.agent_id) / LinkState.MEASURED,
+        *phase,
+        *region,
+        float((cells >= Coverage.WELL).mean()),
+        float(bool(d.priority_target_ids)),
+    ]

@@ -21,25 +21,27 @@ from sortie.scenarios.plugins.user_calls import Guarded, guarded
 
 __all__ = ["POLICIES", "describe_error", "parameters", "resolve"]
 
-POLICIES: Mapping[str, Callable[..., Sequence[Directive]]] = MappingProxyType({
-    "worked": worked,
-    "all-4": baselines.everyone,
-    "best-2": baselines.best_k,
-    "worst-2": baselines.worst_k,
-    "random-2": baselines.random_k,
-    "best-2-receivers": baselines.best_k_receivers,
-    "worst-2-receivers": baselines.worst_k_receivers,
-    "random-2-receivers": baselines.random_k_receivers,
-    "silence": baselines.silence,
-    "boxes": adaptive.boxes,
-    "uncertain-boxes": other_representations.uncertain_boxes,
-    "codes": other_representations.codes,
-    "deputies": deputies,
-    "adaptive": adaptive.adaptive,
-    "learned": adaptive.learned,
-    "vantage": vantage,
-    **{name: method.policy for name, method in METHODS.items()},
-})  # fmt: skip
+POLICIES: Mapping[str, Callable[..., Sequence[Directive]]] = MappingProxyType(
+    {
+        "worked": worked,
+        "all-4": baselines.everyone,
+        "best-2": baselines.best_k,
+        "worst-2": baselines.worst_k,
+        "random-2": baselines.random_k,
+        "best-2-receivers": baselines.best_k_receivers,
+        "worst-2-receivers": baselines.worst_k_receivers,
+        "random-2-receivers": baselines.random_k_receivers,
+        "silence": baselines.silence,
+        "boxes": adaptive.boxes,
+        "uncertain-boxes": other_representations.uncertain_boxes,
+        "codes": other_representations.codes,
+        "deputies": deputies,
+        "adaptive": adaptive.adaptive,
+        "learned": adaptive.learned,
+        "vantage": vantage,
+        **{name: method.policy for name, method in METHODS.items()},
+    }
+)
 """One line for each policy. Its keyword-only arguments are its parameters."""
 
 

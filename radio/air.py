@@ -108,9 +108,16 @@ class Air:
         if Overrides.wanted(settings):
             self._overrides = Overrides(settings, trace, n_drones, seed=seed, replication=replication, frame_s=frame_s)
         self._broadcasts = Broadcasts(
-            settings.group_rate_mbps, n_drones, self.counters, self._gone,
-            seed=seed, replication=replication, frame_s=frame_s, publish_spread=publish_spread, as_lists=n_drones <= SQUARE,
-        )  # fmt: skip
+            settings.group_rate_mbps,
+            n_drones,
+            self.counters,
+            self._gone,
+            seed=seed,
+            replication=replication,
+            frame_s=frame_s,
+            publish_spread=publish_spread,
+            as_lists=n_drones <= SQUARE,
+        )
         self._service = Service(settings, self.channel.noise_dbm)
         self.medium = Medium[Sample, Broadcast](
             env,
@@ -296,9 +303,20 @@ class Air:
         drained_bits, gone = self._drained(sender, now), sender in self._gone
         use = (-1, UNUSED, self._snr_of(sender, hop)[1], -1) if gone else self._use(sender, hop)
         s = self._in_flight[number] = Sample(
-            number, sender, receiver, kind, payload_bytes, reliable, now, now + deadline_s, on_done,
-            fragments(payload_bytes, piece_bytes or self._settings.fragment_bytes), use, drained_bits, piece_bytes or 0,
-        )  # fmt: skip
+            number,
+            sender,
+            receiver,
+            kind,
+            payload_bytes,
+            reliable,
+            now,
+            now + deadline_s,
+            on_done,
+            fragments(payload_bytes, piece_bytes or self._settings.fragment_bytes),
+            use,
+            drained_bits,
+            piece_bytes or 0,
+        )
         s.receiver = hop
         self.counters.data_sent_bytes += payload_bytes
         if gone:

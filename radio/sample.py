@@ -57,16 +57,57 @@ class Sample(AirJob):
     """A sample, its current pass through the medium, and the goodput measurement that it carries."""
 
     __slots__ = (
-        "arrived", "begun_s", "drained_bits", "fragments", "full_mbps", "hops", "key", "kind", "left", "lost", "mark_bits", "mark_frames",
-        "mark_s", "mcs", "on_done", "origin", "pass_wire", "payload_bytes", "piece_bytes", "pieces", "receiver", "reliable",
-        "repairs", "repairs_before", "sent_before", "snr_db", "t_first_s", "t_queued_s", "t_sent_s", "target", "unreachable", "use", "wire_bytes",
-    )  # fmt: skip
+        "arrived",
+        "begun_s",
+        "drained_bits",
+        "fragments",
+        "full_mbps",
+        "hops",
+        "key",
+        "kind",
+        "left",
+        "lost",
+        "mark_bits",
+        "mark_frames",
+        "mark_s",
+        "mcs",
+        "on_done",
+        "origin",
+        "pass_wire",
+        "payload_bytes",
+        "piece_bytes",
+        "pieces",
+        "receiver",
+        "reliable",
+        "repairs",
+        "repairs_before",
+        "sent_before",
+        "snr_db",
+        "t_first_s",
+        "t_queued_s",
+        "t_sent_s",
+        "target",
+        "unreachable",
+        "use",
+        "wire_bytes",
+    )
 
     def __init__(
-        self, number: int, sender: int, receiver: int, kind: str, payload_bytes: int, reliable: bool, t_sent_s: float,
-        deadline_s: float, on_done: Callable[[Transmission], None], fragments: int, use: UseNow, drained_bits: float,
+        self,
+        number: int,
+        sender: int,
+        receiver: int,
+        kind: str,
+        payload_bytes: int,
+        reliable: bool,
+        t_sent_s: float,
+        deadline_s: float,
+        on_done: Callable[[Transmission], None],
+        fragments: int,
+        use: UseNow,
+        drained_bits: float,
         piece_bytes: int,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Args: `fragments` of the whole sample; `use` of its first link; `drained_bits` what the sender had got through when this was written;
         the rest as in `Air.send`."""
         AirJob.__init__(self, number, sender, deadline_s)
@@ -157,10 +198,28 @@ class Sample(AirJob):
         sent_frames = self.sent_before if self.unreachable else self.sent_frames
         wire_bytes = round(self.wire_bytes + sent_frames * self.pass_wire)
         row = (
-            self.number, self.origin, self.target, self.kind, self.payload_bytes, wire_bytes,
-            self.t_sent_s, self.deadline_s, self.t_first_s, t_done_s, status, reason, self.fragments, self.lost + len(self.dropped),
-            self.repairs, self.mcs, self.snr_db, self.granted_s, self.hops, arrived, missing,
-        )  # fmt: skip
+            self.number,
+            self.origin,
+            self.target,
+            self.kind,
+            self.payload_bytes,
+            wire_bytes,
+            self.t_sent_s,
+            self.deadline_s,
+            self.t_first_s,
+            t_done_s,
+            status,
+            reason,
+            self.fragments,
+            self.lost + len(self.dropped),
+            self.repairs,
+            self.mcs,
+            self.snr_db,
+            self.granted_s,
+            self.hops,
+            arrived,
+            missing,
+        )
         return tuple.__new__(Transmission, row)  # half the time of the constructor
 
 
@@ -205,8 +264,14 @@ class Service:
         self._passes: dict[tuple[int, int, int, int, bool], tuple[int, int, float]] = {}
 
     def use(
-        self, sender: int, receiver: int, now_s: float, known_snr_db: float, receiver_gone: bool, given: LinkNow | None = None,
-    ) -> Use:  # fmt: skip
+        self,
+        sender: int,
+        receiver: int,
+        now_s: float,
+        known_snr_db: float,
+        receiver_gone: bool,
+        given: LinkNow | None = None,
+    ) -> Use:
         """How a link is used from now on.
 
         Args:

@@ -22,8 +22,20 @@ _HOME = Path(__file__).parents[1]
 _USED_UP = (errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE)
 """The disk, a quota or the number of open files."""
 
-EXTRAS = {"matplotlib": "report", "SALib": "campaign", "threadpoolctl": "campaign", "cyclonedds": "dds", "pettingzoo": "env",
-          "gymnasium": "env", "rosbags": "ros2", "zarr": "zarr", "distributed": "campaign", "torch": "torch", "rerun": "view", "pymavlink": "mavlink"}  # fmt: skip
+EXTRAS = {
+    "matplotlib": "report",
+    "SALib": "campaign",
+    "threadpoolctl": "campaign",
+    "cyclonedds": "dds",
+    "pettingzoo": "env",
+    "gymnasium": "env",
+    "rosbags": "ros2",
+    "zarr": "zarr",
+    "distributed": "campaign",
+    "torch": "torch",
+    "rerun": "view",
+    "pymavlink": "mavlink",
+}
 """Which extra brings a library that not everybody needs."""
 
 

@@ -454,9 +454,13 @@ def campaign(
             by_torch_plan = plan_by_torch(study, units, plan)
             ensure_usable(folder / FOLDER, by_torch_plan)
         with open_engine(
-            count, scheduler, security=files, wait_s=wait_for_workers_s, notice=tell,
+            count,
+            scheduler,
+            security=files,
+            wait_s=wait_for_workers_s,
+            notice=tell,
             memory_b=None if worker_memory_gb is None else round(worker_memory_gb * 1e9),
-        ) as engine:  # fmt: skip
+        ) as engine:
             watch = (lambda p: None) if progress is None else progress
             how: dict[str, Any] = {"retry_failed": retry_failed, "progress": watch}
             done = [run_campaign(plan, folder, engine, resume_only=resume, **how)]

@@ -85,12 +85,19 @@ class FleetBatteries:
         self._packs, self._now_s = packs, 0.0
         self._loads = [
             (
-                p.drivetrain_efficiency, p.avionics_w, p.compute_idle_w, p.compute_active_w - p.compute_idle_w,
-                p.radio_idle_w, p.radio_tx_w - p.radio_idle_w, p.landing_soc, p.cutoff_cell_v,
-                p.ambient_c is not None, p.polarisation.resistance_mohm > 0,
+                p.drivetrain_efficiency,
+                p.avionics_w,
+                p.compute_idle_w,
+                p.compute_active_w - p.compute_idle_w,
+                p.radio_idle_w,
+                p.radio_tx_w - p.radio_idle_w,
+                p.landing_soc,
+                p.cutoff_cell_v,
+                p.ambient_c is not None,
+                p.polarisation.resistance_mohm > 0,
             )
             for p in packs
-        ]  # fmt: skip
+        ]
         self._traces = {i: trace for i, trace in (traces or {}).items() if i not in self._mains}
         # what a trace says of a charge was turned into energy by the built-in cell
         named = [(pack.cell_model, str(pack.cell_params)) for pack in packs]

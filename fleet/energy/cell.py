@@ -20,9 +20,14 @@ Array = npt.NDArray[np.float64]
 _SOC = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 _CELL_V = (3.2, 3.68, 3.74, 3.79, 3.87, 3.98, 4.20)
 _CELL_SLOPE_V = (
-    6.9, 1.0666666666666673, 0.36986301369862934, 0.30769230769230715, 0.46315789473684216, 0.733333333333333,
+    6.9,
+    1.0666666666666673,
+    0.36986301369862934,
+    0.30769230769230715,
+    0.46315789473684216,
+    0.733333333333333,
     1.3750000000000022,
-)  # fmt: skip
+)
 """Slopes of the monotone cubic through the points (PCHIP: Fritsch & Butland 1984), as scipy.interpolate has them;
 importing that for seven numbers would take longer than a sortie's batteries do."""
 

@@ -71,9 +71,15 @@ def steered(
 def _copied(flown: Trajectories) -> dict[str, Array]:
     """Copies of what moves change."""
     names = (
-        "position_m", "velocity_mps", "acceleration_mps2", "orientation_xyzw", "body_rates_radps", "yaw_rad",
-        "est_position_m", "est_yaw_rad",
-    )  # fmt: skip
+        "position_m",
+        "velocity_mps",
+        "acceleration_mps2",
+        "orientation_xyzw",
+        "body_rates_radps",
+        "yaw_rad",
+        "est_position_m",
+        "est_yaw_rad",
+    )
     return {name: scratch.copied(getattr(flown, name)) for name in names}
 
 
@@ -90,9 +96,14 @@ def _orientation(
 
 
 def _put(
-    new: Mapping[str, Array], base: Trajectories, drone: int, rest: slice, velocity: Array, acceleration: Array,
+    new: Mapping[str, Array],
+    base: Trajectories,
+    drone: int,
+    rest: slice,
+    velocity: Array,
+    acceleration: Array,
     orientation: Array,
-) -> None:  # fmt: skip
+) -> None:
     """Write a drone's motion down; what it believes of its heading keeps its error."""
     yaw = yaw_rad(orientation)
     believed = yaw + base.est_yaw_rad[rest, drone] - base.yaw_rad[rest, drone]

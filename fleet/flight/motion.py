@@ -154,10 +154,19 @@ def shapes_of(drones: int) -> dict[str, tuple[int, ...]]:
     """What `Trajectories` has of each frame, by name."""
     n = drones
     return {
-        "time_s": (), "position_m": (n, 3), "orientation_xyzw": (n, 4), "velocity_mps": (n, 3), "acceleration_mps2": (n, 3),
-        "body_rates_radps": (n, 3), "wind_mps": (n, 3), "yaw_rad": (n,), "est_position_m": (n, 3), "est_yaw_rad": (n,),
-        "frame_position_m": (3,), "frame_yaw_rad": (),
-    }  # fmt: skip
+        "time_s": (),
+        "position_m": (n, 3),
+        "orientation_xyzw": (n, 4),
+        "velocity_mps": (n, 3),
+        "acceleration_mps2": (n, 3),
+        "body_rates_radps": (n, 3),
+        "wind_mps": (n, 3),
+        "yaw_rad": (n,),
+        "est_position_m": (n, 3),
+        "est_yaw_rad": (n,),
+        "frame_position_m": (3,),
+        "frame_yaw_rad": (),
+    }
 
 
 class _Flight:

@@ -105,8 +105,9 @@ class SteeredWay:
             ramp, step, slope = spread(time_s - change.begin_s - change.width_s / 2, change.width_s)
             by = np.array(change.by_mps)
             position, speed, push = (
-                total + part[:, None] * by for total, part in zip((position, speed, push), (ramp, step, slope), strict=True)
-            )  # fmt: skip
+                total + part[:, None] * by
+                for total, part in zip((position, speed, push), (ramp, step, slope), strict=True)
+            )
         return position, speed, push
 
     def until(self, now_s: float) -> tuple[SteeredWay, float]:

@@ -97,8 +97,9 @@ class GroupWay:
         since_s = time_s[:, None] - self._turn_s
         _, turned, turning = spread(since_s, self._width_s)
         yaw, rate, rate_change = (
-            np.asarray(np.einsum("tw,w->t", parts, self._turn)) for parts in (turned, turning, bend(since_s, self._width_s))
-        )  # fmt: skip
+            np.asarray(np.einsum("tw,w->t", parts, self._turn))
+            for parts in (turned, turning, bend(since_s, self._width_s))
+        )
         frame = FramePath(position[:, :2], velocity[:, :2], acceleration[:, :2], self._course + yaw, rate, rate_change)
         return GroupPath(frame, position[:, 2], velocity[:, 2], acceleration[:, 2])
 

@@ -20,10 +20,28 @@ Column = npt.NDArray[Any]
 MAGIC = b"\xa3\x95"
 _FMT_TYPE, _FMT_BYTES = 128, 89
 _BINARY = {
-    "a": "(32,)<i2", "b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "f": "<f4", "d": "<f8",
-    "n": "S4", "N": "S16", "Z": "S64", "c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "L": "<i4", "M": "u1",
-    "q": "<i8", "Q": "<u8", "g": "<f2",
-}  # fmt: skip
+    "a": "(32,)<i2",
+    "b": "i1",
+    "B": "u1",
+    "h": "<i2",
+    "H": "<u2",
+    "i": "<i4",
+    "I": "<u4",
+    "f": "<f4",
+    "d": "<f8",
+    "n": "S4",
+    "N": "S16",
+    "Z": "S64",
+    "c": "<i2",
+    "C": "<u2",
+    "e": "<i4",
+    "E": "<u4",
+    "L": "<i4",
+    "M": "u1",
+    "q": "<i8",
+    "Q": "<u8",
+    "g": "<f2",
+}
 _Kinds = dict[int, tuple[str, int, str, tuple[str, ...]]]
 """Type → name, length with its header, format, fields."""
 _SCALE = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}

@@ -21,9 +21,19 @@ MAGIC = b"ULog\x01\x12\x35"
 _HEADER_BYTES = 16
 _KINDS = frozenset(b"BFIMPQAERDLCSO")
 _BINARY = {
-    "int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
-    "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8", "bool": "?", "char": "S1",
-}  # fmt: skip
+    "int8_t": "i1",
+    "uint8_t": "u1",
+    "int16_t": "<i2",
+    "uint16_t": "<u2",
+    "int32_t": "<i4",
+    "uint32_t": "<u4",
+    "int64_t": "<i8",
+    "uint64_t": "<u8",
+    "float": "<f4",
+    "double": "<f8",
+    "bool": "?",
+    "char": "S1",
+}
 _FIELD = re.compile(r"(\w+)(?:\[(\d{1,5})\])? (\w+)", re.ASCII)
 _KIND = re.compile(b"[" + bytes(sorted(_KINDS)) + b"]")
 MAX_NESTING = 16

@@ -97,12 +97,27 @@ def encode_compact(d: Descriptor, form: Form) -> bytes:
     flags = (d.novelty_flags & 0x7F) | (_REGION_FLAG if region else 0)
     second, nanosecond = divmod(d.stamp_ns, 1_000_000_000)
     head = _HEAD.pack(
-        MAGIC, *form, second, nanosecond, WIDE_ID if is_wide(d) else d.agent_id, d.task_phase, flags, len(goodput), len(targets)
-    )  # fmt: skip
+        MAGIC,
+        *form,
+        second,
+        nanosecond,
+        WIDE_ID if is_wide(d) else d.agent_id,
+        d.task_phase,
+        flags,
+        len(goodput),
+        len(targets),
+    )
     numbers = [
-        *d.position_m, *d.orientation_xyzw, *d.velocity_mps, d.footprint_radius_m, d.battery_soc, d.cpu_headroom,
-        d.gpu_headroom, *goodput, *(region or ()),
-    ]  # fmt: skip
+        *d.position_m,
+        *d.orientation_xyzw,
+        *d.velocity_mps,
+        d.footprint_radius_m,
+        d.battery_soc,
+        d.cpu_headroom,
+        d.gpu_headroom,
+        *goodput,
+        *(region or ()),
+    ]
     bits = _BitWriter()
     for value, bounds in zip(numbers, _ranges(len(goodput), region is not None), strict=True):
         bits.put(_to_int(value, bounds, form.number_bits), form.number_bits)
@@ -121,7 +136,9 @@ def decode_compact(data: bytes) -> Descriptor:
     """
     if len(data) < _HEAD.size:
         raise MalformedDatagram(f"{len(data)} B, must be at least {_HEAD.size}")
-    magic, cells, cell_bits, number_bits, second, nanosecond, agent_id, phase, flags, peers, targets = _HEAD.unpack_from(data)  # fmt: skip
+    magic, cells, cell_bits, number_bits, second, nanosecond, agent_id, phase, flags, peers, targets = (
+        _HEAD.unpack_from(data)
+    )
     if magic != MAGIC or cells not in GRID_CELLS or cell_bits not in GRID_BITS or number_bits not in NUMBER_BITS:
         raise MalformedDatagram(f"form ({magic:#x}, {cells}, {cell_bits}, {number_bits}) is none")
     ranges = _ranges(peers, bool(flags & _REGION_FLAG))
@@ -143,9 +160,15 @@ def decode_compact(data: bytes) -> Descriptor:
 
 
 def _checked(
-    stamp_ns: int, agent_id: int, values: list[float], peers: int, grid: bytes, flags: int, phase: TaskPhase,
+    stamp_ns: int,
+    agent_id: int,
+    values: list[float],
+    peers: int,
+    grid: bytes,
+    flags: int,
+    phase: TaskPhase,
     ids: tuple[int, ...],
-) -> Descriptor:  # fmt: skip
+) -> Descriptor:
     x, y, z, qx, qy, qz, qw, vx, vy, vz, footprint_m, soc, cpu, gpu = values[:14]
     length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     if not 0.9 < length < 1.1:
@@ -156,9 +179,22 @@ def _checked(
     if footprint_m < 0 or min(goodput, default=0.0) < 0 or (disc and disc[2] <= 0):
         raise MalformedDatagram("a radius or goodput is below 0")
     return Descriptor(
-        stamp_ns, agent_id, (x, y, z), (qx / length, qy / length, qz / length, qw / length), (vx, vy, vz), footprint_m,
-        soc, cpu, gpu, goodput, grid, flags & 0x7F, phase, Disc(*disc) if disc else None, ids,
-    )  # fmt: skip
+        stamp_ns,
+        agent_id,
+        (x, y, z),
+        (qx / length, qy / length, qz / length, qw / length),
+        (vx, vy, vz),
+        footprint_m,
+        soc,
+        cpu,
+        gpu,
+        goodput,
+        grid,
+        flags & 0x7F,
+        phase,
+        Disc(*disc) if disc else None,
+        ids,
+    )
 
 
 @lru_cache(maxsize=256)

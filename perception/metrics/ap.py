@@ -42,9 +42,27 @@ from sortie.perception.types import Boxes
 from sortie.scenarios.disc import Disc
 
 __all__ = [  # the overlap's two main functions are had from here too
-    "CONVENTIONS", "ROTATED", "Convention", "Judged", "Matched", "area", "average_precision", "best_first",
-    "best_pairs", "corners", "hits", "iou_pairs", "judge", "match", "match_many", "paired", "ranked", "ranks", "suppress", "suppressed",
-]  # fmt: skip
+    "CONVENTIONS",
+    "ROTATED",
+    "Convention",
+    "Judged",
+    "Matched",
+    "area",
+    "average_precision",
+    "best_first",
+    "best_pairs",
+    "corners",
+    "hits",
+    "iou_pairs",
+    "judge",
+    "match",
+    "match_many",
+    "paired",
+    "ranked",
+    "ranks",
+    "suppress",
+    "suppressed",
+]
 
 Bools = NDArray[np.bool_]
 

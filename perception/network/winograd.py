@@ -24,8 +24,15 @@ BAND = 4
 _POINTS = 36
 """What a tile becomes, numbers a channel."""
 _FILTER = np.array(
-    [[1 / 4, 0, 0], [-1 / 6, -1 / 6, -1 / 6], [-1 / 6, 1 / 6, -1 / 6], [1 / 24, 1 / 12, 1 / 6], [1 / 24, -1 / 12, 1 / 6], [0, 0, 1]]
-)  # fmt: skip
+    [
+        [1 / 4, 0, 0],
+        [-1 / 6, -1 / 6, -1 / 6],
+        [-1 / 6, 1 / 6, -1 / 6],
+        [1 / 24, 1 / 12, 1 / 6],
+        [1 / 24, -1 / 12, 1 / 6],
+        [0, 0, 1],
+    ]
+)
 _PACKS = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise")  # type: ignore[no-untyped-call]
 """Whether weights can be packed ahead: else a product takes two to three times as long."""
 _ZERO, _TWO, _FOUR, _FIVE, _EIGHT = (np.float32(v) for v in (0.0, 2.0, 4.0, 5.0, 8.0))

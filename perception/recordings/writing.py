@@ -40,10 +40,15 @@ def write_recording(
     each = [_table(path, f"boxes of frame {f}", b, 6) for f, frame in enumerate(boxes) for b in frame]
     cars = [_table(path, f"truth of frame {f}", c, 5) for f, c in enumerate(truth)]
     small: dict[str, NDArray[Any]] = {
-        "format": np.array(FORMAT), "cell_m": np.array(float(cell_m)), "t_s": np.asarray(t_s), "pose": np.asarray(pose),
-        "boxes": np.concatenate([np.zeros((0, 6)), *each]), "boxes_offset": np.cumsum([0, *map(len, each)]),
-        "truth": np.concatenate([np.zeros((0, 5)), *cars]), "truth_offset": np.cumsum([0, *map(len, cars)]),
-    }  # fmt: skip
+        "format": np.array(FORMAT),
+        "cell_m": np.array(float(cell_m)),
+        "t_s": np.asarray(t_s),
+        "pose": np.asarray(pose),
+        "boxes": np.concatenate([np.zeros((0, 6)), *each]),
+        "boxes_offset": np.cumsum([0, *map(len, each)]),
+        "truth": np.concatenate([np.zeros((0, 5)), *cars]),
+        "truth_offset": np.cumsum([0, *map(len, cars)]),
+    }
     small |= {k: np.asarray(v) for k, v in (("est_pose", est_pose), ("scene", scene)) if v is not None}
     large = {} if confidence is None else {"confidence": _halves(path, "confidence", confidence)}
     drones = checked(path, small, large).drones

@@ -72,8 +72,17 @@ class HeightField:
     def hide(self, states: NDArray[np.uint8], at: NDArray[np.int64], *lines: Any) -> None:
         """Set cells to 0 of which less than half of the open ground is in sight; arguments as for `sight_loops.hide`."""
         loops().hide(
-            states, at, *lines, self._flat, self._roofed, self.columns, self.x0_m, self.y0_m, CAR_TOP_M, self._steps(CAR_TOP_M)
-        )  # fmt: skip
+            states,
+            at,
+            *lines,
+            self._flat,
+            self._roofed,
+            self.columns,
+            self.x0_m,
+            self.y0_m,
+            CAR_TOP_M,
+            self._steps(CAR_TOP_M),
+        )
 
     def _steps(self, from_m: float) -> int:
         """Steps that a ray takes from a height until it is above everything."""

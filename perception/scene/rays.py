@@ -35,9 +35,19 @@ def _cell(x: Any, y: Any, scale: Any, rows: Any, columns: Any) -> Any:
 
 @compiled
 def see(
-    rays: Any, turn: Any, eye: Any, res_m: Any, top_m: Any, heights: Any, coarses: Any, fars: Any, colours: Any,
-    gain: Any, noise: Any, out: Any,
-) -> None:  # fmt: skip
+    rays: Any,
+    turn: Any,
+    eye: Any,
+    res_m: Any,
+    top_m: Any,
+    heights: Any,
+    coarses: Any,
+    fars: Any,
+    colours: Any,
+    gain: Any,
+    noise: Any,
+    out: Any,
+) -> None:
     """The colours that rays meet, into `out` uint8 [rays, 3].
 
     Args:

@@ -83,9 +83,15 @@ def hide(
                                 slope_x, slope_y = (x_m - x) / fall_m, (y_m - y) / fall_m
                                 there += 1
                                 seen += _is_clear(
-                                    tops_m, columns, _F(px), _F(py), _F(slope_x * (_STEP_M / _RES_M)),
-                                    _F(slope_y * (_STEP_M / _RES_M)), from_m, steps,
-                                )  # fmt: skip
+                                    tops_m,
+                                    columns,
+                                    _F(px),
+                                    _F(py),
+                                    _F(slope_x * (_STEP_M / _RES_M)),
+                                    _F(slope_y * (_STEP_M / _RES_M)),
+                                    from_m,
+                                    steps,
+                                )
                     known[cell] = 1 if there > 0 and 2 * seen >= there else -1
                 if known[cell] < 0:
                     states[frame, drone, row, column] = 0

@@ -20,21 +20,60 @@ _ALL = slice(None)
 NO_PEER = -8.0
 """Stands for the confidence of a peer that sent nothing (a logit)."""
 OF_THE_LOOK = (
-    "range", "visible", "margin", "nadir", "moving", "length", "across", "crowd", "altitude", "strange", "square", "next", "next_along",
+    "range",
+    "visible",
+    "margin",
+    "nadir",
+    "moving",
+    "length",
+    "across",
+    "crowd",
+    "altitude",
+    "strange",
+    "square",
+    "next",
+    "next_along",
     "next_across",
-)  # fmt: skip
+)
 """What fusion takes over from the ego's own look."""
 FUSED_COVARIATES = (
-    "own", "first", "second", "mean", "many", "senders", "silent", "weight", "shift_first", "shift_mean", "spread", "density", "part", "margin",
+    "own",
+    "first",
+    "second",
+    "mean",
+    "many",
+    "senders",
+    "silent",
+    "weight",
+    "shift_first",
+    "shift_mean",
+    "spread",
+    "density",
+    "part",
+    "margin",
     *(f"own_{name}" for name in OF_THE_LOOK),
-)  # fmt: skip
+)
 _OWN = [LOOK_COVARIATES.index(name) for name in OF_THE_LOOK]
 _MOVING = LOOK_COVARIATES.index("moving")
 _STYLES = ("old_town", "suburb", "yard")
 ALARM_COVARIATES = (
-    "cars", "brightness", "shade", "received", "silent", "seams", "sharing", "plenty", "buildings", "trees",
-    *_STYLES, "square", "aimed", "moving", "late", "gone",
-)  # fmt: skip
+    "cars",
+    "brightness",
+    "shade",
+    "received",
+    "silent",
+    "seams",
+    "sharing",
+    "plenty",
+    "buildings",
+    "trees",
+    *_STYLES,
+    "square",
+    "aimed",
+    "moving",
+    "late",
+    "gone",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +158,7 @@ class FeatureShares:
         egos = np.array([column[ego] for ego, _ in jobs], np.intp)
         return cls(
             egos, sender, filled[..., 8], filled[..., 9], filled[..., 2:5], filled[..., 1], filled[..., 5:8], missing
-        )  # fmt: skip
+        )
 
 
 def _allowed(roi: Floats, pose: Floats) -> Floats:
@@ -237,9 +276,22 @@ def covariates(
     most = np.log(np.maximum(part * CELLS**2, 1.0)) / 8.0
     own = looks.covariates[pairs.look]
     columns = (
-        confidence[pairs.look] if own_confidence is None else own_confidence, first, second, mean, many, total, silent, total / (1.0 + total + silent), shift_first, off / count,
-        spread, most[pairs.row], part[pairs.row], deep / count, *(own[:, c] for c in _OWN),
-    )  # fmt: skip
+        confidence[pairs.look] if own_confidence is None else own_confidence,
+        first,
+        second,
+        mean,
+        many,
+        total,
+        silent,
+        total / (1.0 + total + silent),
+        shift_first,
+        off / count,
+        spread,
+        most[pairs.row],
+        part[pairs.row],
+        deep / count,
+        *(own[:, c] for c in _OWN),
+    )
     return beside(n, columns)
 
 
@@ -314,10 +366,23 @@ def alarm_covariates(
     moves = np.concatenate([np.zeros(1), np.cumsum(looks.covariates[:, _MOVING], dtype=np.float64)])
     moving = np.diff(moves[looks.first])[exchange.ego] / 10.0
     columns = (
-        np.log1p(cars) - 3.6, scene.brightness - 1.0, shade, received / 4.0, silent / 4.0, seams, shares / 4.0, plenty,
-        scene.building_density - 0.6, scene.tree_density - 0.5, *(scene.style == name for name in _STYLES),
-        square(fleet.yaw_rad[exchange.ego]), aimed, moving, age_s / 0.2, moving * age_s / 0.2,
-    )  # fmt: skip
+        np.log1p(cars) - 3.6,
+        scene.brightness - 1.0,
+        shade,
+        received / 4.0,
+        silent / 4.0,
+        seams,
+        shares / 4.0,
+        plenty,
+        scene.building_density - 0.6,
+        scene.tree_density - 0.5,
+        *(scene.style == name for name in _STYLES),
+        square(fleet.yaw_rad[exchange.ego]),
+        aimed,
+        moving,
+        age_s / 0.2,
+        moving * age_s / 0.2,
+    )
     return beside(m, columns)
 
 

@@ -25,9 +25,26 @@ from sortie.perception.types import Capture
 
 Ints = NDArray[np.intp]
 LOOK_COVARIATES = (
-    "range", "nadir", "margin", "visible", "across", "tone", "tint", "moving", "length", "lit", "shade", "brightness",
-    "crowd", "altitude", "strange", "square", "next", "next_along", "next_across",
-)  # fmt: skip
+    "range",
+    "nadir",
+    "margin",
+    "visible",
+    "across",
+    "tone",
+    "tint",
+    "moving",
+    "length",
+    "lit",
+    "shade",
+    "brightness",
+    "crowd",
+    "altitude",
+    "strange",
+    "square",
+    "next",
+    "next_along",
+    "next_across",
+)
 LEARNED_AT_M = 60.0
 """The height at which networks are trained: what is higher or lower is strange to them."""
 NEXT_M = 8.0
@@ -245,11 +262,26 @@ class Eyes:
         shade = (1.0 - overcast) * min(length, 2.5)
         light = np.where(lit, 1.0, 0.6 + 0.4 * overcast)
         columns = (
-            reach / 100.0, nadir, np.clip(margin, -0.4, 0.4), visible / 3.0, np.abs(np.sin(yaw - bearing)),
-            (traffic.tone[car] * light - _ROAD_TONE) * brightness, traffic.tint[car] * light * brightness, moving,
-            traffic.seen_size_m[car, 0] - 4.6, lit, shade, brightness - 1.0, crowd, eye[:, 2] / LEARNED_AT_M - 1.0,
-            np.abs(eye[:, 2] / LEARNED_AT_M - 1.0), square(yaw - fleet.yaw_rad[capture]), close, way[:, 0], way[:, 1],
-        )  # fmt: skip
+            reach / 100.0,
+            nadir,
+            np.clip(margin, -0.4, 0.4),
+            visible / 3.0,
+            np.abs(np.sin(yaw - bearing)),
+            (traffic.tone[car] * light - _ROAD_TONE) * brightness,
+            traffic.tint[car] * light * brightness,
+            moving,
+            traffic.seen_size_m[car, 0] - 4.6,
+            lit,
+            shade,
+            brightness - 1.0,
+            crowd,
+            eye[:, 2] / LEARNED_AT_M - 1.0,
+            np.abs(eye[:, 2] / LEARNED_AT_M - 1.0),
+            square(yaw - fleet.yaw_rad[capture]),
+            close,
+            way[:, 0],
+            way[:, 1],
+        )
         return beside(len(car), columns)
 
     def _seen(self, xy: Floats, eye: Floats, t_s: Floats, truck: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -84,9 +84,18 @@ def followed(tracks: Tracks, cues: Mapping[int, Cue], before: Mapping[int, int],
     for target, cue in cues.items():
         near[target], cost[target] = np.empty(n, np.bool_), np.empty(n)
         agree_loop()(
-            tracks.kind, tracks.confirmed, tracks.t_s, tracks.seen_s, tracks.xy_m, tracks.velocity_mps, tracks.covariance,
-            cue, t_s, near[target], cost[target],
-        )  # fmt: skip
+            tracks.kind,
+            tracks.confirmed,
+            tracks.t_s,
+            tracks.seen_s,
+            tracks.xy_m,
+            tracks.velocity_mps,
+            tracks.covariance,
+            cue,
+            t_s,
+            near[target],
+            cost[target],
+        )
     out = {
         target: track
         for target, track in before.items()
@@ -107,7 +116,16 @@ def agree_loop() -> Any:
 
     none = Tracks.empty()
     agree(
-        none.kind, none.confirmed, none.t_s, none.seen_s, none.xy_m, none.velocity_mps, none.covariance,
-        (0.0, 0.0, 0.0, 0.0), 0.0, none.confirmed, none.t_s,
-    )  # fmt: skip
+        none.kind,
+        none.confirmed,
+        none.t_s,
+        none.seen_s,
+        none.xy_m,
+        none.velocity_mps,
+        none.covariance,
+        (0.0, 0.0, 0.0, 0.0),
+        0.0,
+        none.confirmed,
+        none.t_s,
+    )
     return agree

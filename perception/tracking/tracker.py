@@ -90,9 +90,18 @@ def _corrected(ahead: Tracks, boxes: Boxes, i: Ints, j: Ints) -> Tracks:
     score = ahead.score + np.maximum(1.0 / looks, SMOOTHING) * (score - ahead.score)
     confirmed = ahead.confirmed | ((hits >= CONFIRM_HITS) & (looks <= CONFIRM_LOOKS))
     return replace(
-        ahead, xy_m=xy, velocity_mps=velocity, covariance=covariance, size_m=size, yaw_rad=yaw, score=score, hits=hits,
-        looks=looks, seen_s=seen_s, confirmed=confirmed,
-    )  # fmt: skip
+        ahead,
+        xy_m=xy,
+        velocity_mps=velocity,
+        covariance=covariance,
+        size_m=size,
+        yaw_rad=yaw,
+        score=score,
+        hits=hits,
+        looks=looks,
+        seen_s=seen_s,
+        confirmed=confirmed,
+    )
 
 
 def _survivors(tracks: Tracks) -> Tracks:
@@ -116,7 +125,19 @@ def _begun(boxes: Boxes, owner: Ints, looks_s: Floats, next_id: Ints) -> tuple[T
     xy, size, yaw, score = (v.astype(np.float64) for v in (boxes.xy_m, boxes.size_m, boxes.yaw_rad, boxes.score))
     tentative = np.zeros(n, bool)
     begun = Tracks(
-        owner, next_id[owner] + rank, at, xy, np.zeros((n, 2)), table, size, yaw, score, one, one, at, tentative,
+        owner,
+        next_id[owner] + rank,
+        at,
+        xy,
+        np.zeros((n, 2)),
+        table,
+        size,
+        yaw,
+        score,
+        one,
+        one,
+        at,
+        tentative,
         boxes.kind,
-    )  # fmt: skip
+    )
     return begun, next_id + count

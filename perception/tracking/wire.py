@@ -28,10 +28,18 @@ from sortie.scenarios.disc import Disc
 
 TRACK = np.dtype(
     [
-        ("xy", "<i2", 2), ("velocity", "<i2", 2), ("id", "<u2"), ("yaw", "<u2"), ("size", "u1", 2), ("score", "u1"),
-        ("deviation", "u1", 2), ("correlation", "i1"), ("unseen", "u1"), ("kind", "u1"),
+        ("xy", "<i2", 2),
+        ("velocity", "<i2", 2),
+        ("id", "<u2"),
+        ("yaw", "<u2"),
+        ("size", "u1", 2),
+        ("score", "u1"),
+        ("deviation", "u1", 2),
+        ("correlation", "i1"),
+        ("unseen", "u1"),
+        ("kind", "u1"),
     ]
-)  # fmt: skip
+)
 _TURN = 2.0 * np.pi / 65536
 _DEVIATION = np.array([0.02, 0.05])
 
@@ -87,11 +95,21 @@ def unpacked(datagram: bytes, owner: int, origin_m: Sequence[float], t_s: float)
     joint = read["correlation"] / 127.0 * deviation[:, 0] * deviation[:, 1]
     zero: NDArray[np.int64] = np.zeros(n, np.int64)
     return Tracks(
-        np.full(n, owner, np.int64), read["id"].astype(np.int64), np.full(n, t_s), read["xy"] * 0.01 + (origin_m[0], origin_m[1]),
-        read["velocity"] * 0.01, np.stack([deviation[:, 0] ** 2, joint, deviation[:, 1] ** 2], axis=1), read["size"] * 0.05,
-        read["yaw"] * _TURN, read["score"] / 255.0, zero, zero, t_s - read["unseen"] * 0.02, np.ones(n, bool),
+        np.full(n, owner, np.int64),
+        read["id"].astype(np.int64),
+        np.full(n, t_s),
+        read["xy"] * 0.01 + (origin_m[0], origin_m[1]),
+        read["velocity"] * 0.01,
+        np.stack([deviation[:, 0] ** 2, joint, deviation[:, 1] ** 2], axis=1),
+        read["size"] * 0.05,
+        read["yaw"] * _TURN,
+        read["score"] / 255.0,
+        zero,
+        zero,
+        t_s - read["unseen"] * 0.02,
+        np.ones(n, bool),
         read["kind"].astype(np.int8),
-    )  # fmt: skip
+    )
 
 
 def _rounded(values: Floats, unit: float | Floats, kind: str) -> NDArray[np.int64]:

@@ -66,13 +66,18 @@ def _serve(view: FleetView, me: Descriptor, peer: int, rho: float, why: str) -> 
         weak = NO_GOODPUT.get(me.link_state(peer)) or f"goodput {goodput_mbps:.2g} < {MIN_GOODPUT_MBPS:g} Mb/s"
         cause = "battery < 30 %" if me.battery_soc < LOW_BATTERY else weak
         return Directive(
-            view.ego, peer, Representation.DETECTIONS, 0.0, roi, SLOW_RATE_HZ, SLOW_DEADLINE_S, weight,
+            view.ego,
+            peer,
+            Representation.DETECTIONS,
+            0.0,
+            roi,
+            SLOW_RATE_HZ,
+            SLOW_DEADLINE_S,
+            weight,
             reason=f"{why}, {cause}",
-        )  # fmt: skip
+        )
     rate_hz = FULL_RATE_HZ if me.battery_soc >= HIGH_BATTERY else HALF_RATE_HZ
-    return Directive(
-        view.ego, peer, Representation.FEATURES, rho, roi, rate_hz, fusion_weight=weight, reason=why
-    )  # fmt: skip
+    return Directive(view.ego, peer, Representation.FEATURES, rho, roi, rate_hz, fusion_weight=weight, reason=why)
 
 
 def _appointed(view: FleetView, receiver: int) -> list[int]:

@@ -183,9 +183,17 @@ class Channel:
         self._crowd: Crowd | None = None
         if n_drones > SQUARE:
             self._crowd = Crowd(
-                settings, n_drones, self._drawn, self._field,
-                n_early=early, earshot_m=earshot_m(settings), always=always, seed=seed, replication=replication, frame_s=frame_s,
-            )  # fmt: skip
+                settings,
+                n_drones,
+                self._drawn,
+                self._field,
+                n_early=early,
+                earshot_m=earshot_m(settings),
+                always=always,
+                seed=seed,
+                replication=replication,
+                frame_s=frame_s,
+            )
         self._block = EPOCH if self._crowd else max(1, min(1024, _BLOCK_NUMBERS // (n_drones * n_drones)))
         self.links = all_links(0 if self._crowd else n_drones)
         self.now = self.before = FrameLinks(self.links, np.empty(0))

@@ -41,9 +41,18 @@ class Broadcasts:
     """
 
     def __init__(
-        self, rate_mbps: float, n: int, counters: Counters, gone: Set[int],
-        *, seed: int, replication: int, frame_s: float, publish_spread: float, as_lists: bool,
-    ) -> None:  # fmt: skip
+        self,
+        rate_mbps: float,
+        n: int,
+        counters: Counters,
+        gone: Set[int],
+        *,
+        seed: int,
+        replication: int,
+        frame_s: float,
+        publish_spread: float,
+        as_lists: bool,
+    ) -> None:
         self._rate_mbps, self._n, self._counters, self._gone, self._as_lists = rate_mbps, n, counters, gone, as_lists
         self._airtime_s: dict[int, float] = {}  # by payload, bytes
         self._others = [(*range(i), *range(i + 1, n)) for i in range(n)] if as_lists else []

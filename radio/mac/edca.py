@@ -47,14 +47,57 @@ NOTHING, GROUP, DATA, BLOCK_REQUEST, RTS, CTS, ANSWER = range(7)
 
 # columns of a station; first come all those that a frame changes at those who only hear it
 (
-    TX_END, RESPONSE_AT, TIMEOUT_AT, GRANT, GRANT_LOW, ARRIVE_AT, LOCK, DEAF,
-    LOOKED_AT, IS_BUSY, CANDIDATE, CANDIDATE_AT, CANDIDATE_LINK, TOUCHED, EIFS_UNTIL, SEGMENTS,
-    LOCK_AT, LOCK_LINK, NAV, IDLE_AT, BEGIN, BEGIN_LOW, SLOTS, SLOTS_LOW,
-    TX_KIND, TX_TO, TX_ACCESS, TX_COUNT, TX_MCS, TX_NAV, TX_BEGIN, TX_JOB,
-    RESPONSE_KIND, RESPONSE_TO, RESPONSE_NS, AWAITS, ACCESS,
-    WINDOW, WINDOW_LOW, FAILS, FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW,
-    REQUEST, SENT, DRAWN, COMING, TRANSMITTED_NS,
-) = range(50)  # fmt: skip
+    TX_END,
+    RESPONSE_AT,
+    TIMEOUT_AT,
+    GRANT,
+    GRANT_LOW,
+    ARRIVE_AT,
+    LOCK,
+    DEAF,
+    LOOKED_AT,
+    IS_BUSY,
+    CANDIDATE,
+    CANDIDATE_AT,
+    CANDIDATE_LINK,
+    TOUCHED,
+    EIFS_UNTIL,
+    SEGMENTS,
+    LOCK_AT,
+    LOCK_LINK,
+    NAV,
+    IDLE_AT,
+    BEGIN,
+    BEGIN_LOW,
+    SLOTS,
+    SLOTS_LOW,
+    TX_KIND,
+    TX_TO,
+    TX_ACCESS,
+    TX_COUNT,
+    TX_MCS,
+    TX_NAV,
+    TX_BEGIN,
+    TX_JOB,
+    RESPONSE_KIND,
+    RESPONSE_TO,
+    RESPONSE_NS,
+    AWAITS,
+    ACCESS,
+    WINDOW,
+    WINDOW_LOW,
+    FAILS,
+    FAILS_LOW,
+    HEAD,
+    HEAD_LOW,
+    TAIL,
+    TAIL_LOW,
+    REQUEST,
+    SENT,
+    DRAWN,
+    COMING,
+    TRANSMITTED_NS,
+) = range(50)
 HEARING_COLUMNS, STATION_COLUMNS = 24, 56
 """Whole lines of a processor's cache; the last columns are empty."""
 HEARS, ACTS, SENDS = 1, 2, 3
@@ -64,9 +107,26 @@ NEXT_AT, INCIDENT = range(2)
 
 # columns of a job
 (
-    KIND, STATION, FLOW, FOLLOWING, COUNT, FULL_BYTES, LAST_BYTES, DROPPED, IS_LIVE, JOB_ACCESS, READY_AT, IS_TOLD, VAIN_TRIES,
-    ANSWERS, LOW, HIGH, ARRIVED, AIR_NS, HEAD_AT,
-) = range(19)  # fmt: skip
+    KIND,
+    STATION,
+    FLOW,
+    FOLLOWING,
+    COUNT,
+    FULL_BYTES,
+    LAST_BYTES,
+    DROPPED,
+    IS_LIVE,
+    JOB_ACCESS,
+    READY_AT,
+    IS_TOLD,
+    VAIN_TRIES,
+    ANSWERS,
+    LOW,
+    HIGH,
+    ARRIVED,
+    AIR_NS,
+    HEAD_AT,
+) = range(19)
 JOB_COLUMNS = 19
 
 # columns of a flow
@@ -76,9 +136,23 @@ FLOW_RATE, FLOW_LOSS, FLOW_BURST = range(3)
 
 # the settings, as integers and as floats
 (
-    C_STATIONS, C_AIFSN, C_AIFSN_LOW, C_WINDOW, C_WINDOW_LOW, C_LARGEST, C_LARGEST_LOW, C_RETRIES, C_BLOCK, C_RTS,
-    C_FRAME, C_BY_FRAME, C_PREAMBLE_NS, C_SYMBOL_NS, C_LEARNS, C_EXTRA,
-) = range(16)  # fmt: skip
+    C_STATIONS,
+    C_AIFSN,
+    C_AIFSN_LOW,
+    C_WINDOW,
+    C_WINDOW_LOW,
+    C_LARGEST,
+    C_LARGEST_LOW,
+    C_RETRIES,
+    C_BLOCK,
+    C_RTS,
+    C_FRAME,
+    C_BY_FRAME,
+    C_PREAMBLE_NS,
+    C_SYMBOL_NS,
+    C_LEARNS,
+    C_EXTRA,
+) = range(16)
 # totals, and then who is on the air, by ascending id
 G_SINCE, G_GROUPS, G_OTHERS, G_GROUP_NS, G_OTHER_NS, G_SENDERS, G_FIRST = range(7)
 
@@ -908,9 +982,38 @@ def conclude(s, t, S, N, P, W, G, J, M, T, OUT, told, DROPS, LS, C, F, keys, beg
 
 @part
 def run(
-    until, S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, LI, LF, OUT, TOUCH, begin, receiver, gain, extra, fade,
-    keys, RATES, LIMITS, ORDER, C, F, curves,
-):  # fmt: skip
+    until,
+    S,
+    N,
+    P,
+    W,
+    WHY,
+    G,
+    J,
+    M,
+    T,
+    SEG_AT,
+    SEG,
+    LS,
+    DROPS,
+    D,
+    LI,
+    LF,
+    OUT,
+    TOUCH,
+    begin,
+    receiver,
+    gain,
+    extra,
+    fade,
+    keys,
+    RATES,
+    LIMITS,
+    ORDER,
+    C,
+    F,
+    curves,
+):
     """Run the stations until something has to be told, until a time, or until the table of drops must be read first.
 
     Returns: the time reached, and how many rows of OUT are to be told; −1 where the drops must be read.
@@ -934,9 +1037,38 @@ def run(
                 x += 1
                 continue
             told = finish(  # which takes it out
-                s, t, S, N, D, P, W, WHY, G, J, M, T, SEG_AT, SEG, OUT, told, DROPS, begin, receiver, gain, extra, LI, LF, LS,
-                RATES, LIMITS, C, F, curves, keys, TOUCH,
-            )  # fmt: skip
+                s,
+                t,
+                S,
+                N,
+                D,
+                P,
+                W,
+                WHY,
+                G,
+                J,
+                M,
+                T,
+                SEG_AT,
+                SEG,
+                OUT,
+                told,
+                DROPS,
+                begin,
+                receiver,
+                gain,
+                extra,
+                LI,
+                LF,
+                LS,
+                RATES,
+                LIMITS,
+                C,
+                F,
+                curves,
+                keys,
+                TOUCH,
+            )
         waiting = 0
         for first in range(0, n, BLOCK):
             soonest = FAR
@@ -1121,9 +1253,7 @@ copy_bytes = intrinsic(_copy_bytes)
 
 
 @part
-def copy_station(
-    s, what, S, W, WHY, J, M, T, SEG_AT, SEG, S2, W2, WHY2, J2, M2, T2, SEG_AT2, SEG2, begin
-):  # fmt: skip
+def copy_station(s, what, S, W, WHY, J, M, T, SEG_AT, SEG, S2, W2, WHY2, J2, M2, T2, SEG_AT2, SEG2, begin):
     """Make a station's rows equal in the second state, with its links' and its jobs'; what is not in use is left out."""
     copy_bytes(S2[s].ctypes.data, S[s].ctypes.data, 8 * (HEARING_COLUMNS if what == HEARS else STATION_COLUMNS))
     if S[s, LOCK] >= 0:
@@ -1147,9 +1277,36 @@ def copy_station(
 
 @part
 def copy(
-    S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, S2, N2, P2, W2, WHY2, G2, J2, M2, T2, SEG_AT2, SEG2, LS2,
-    DROPS2, begin, C,
-):  # fmt: skip
+    S,
+    N,
+    P,
+    W,
+    WHY,
+    G,
+    J,
+    M,
+    T,
+    SEG_AT,
+    SEG,
+    LS,
+    DROPS,
+    D,
+    S2,
+    N2,
+    P2,
+    W2,
+    WHY2,
+    G2,
+    J2,
+    M2,
+    T2,
+    SEG_AT2,
+    SEG2,
+    LS2,
+    DROPS2,
+    begin,
+    C,
+):
     """Make the second state equal to the first, where they differ: a station that hears nothing costs nothing."""
     for k in range(1, D[0] + 1):  # first of all, for a row may have become another station's
         if D[(D.shape[0] + 1) // 2 + D[k]] == HEARS:
@@ -1162,9 +1319,7 @@ def copy(
     for k in range(1, D[0] + 1):
         s = D[k]
         flag = (D.shape[0] + 1) // 2 + s
-        copy_station(
-            s, D[flag], S, W, WHY, J, M, T, SEG_AT, SEG, S2, W2, WHY2, J2, M2, T2, SEG_AT2, SEG2, begin
-        )  # fmt: skip
+        copy_station(s, D[flag], S, W, WHY, J, M, T, SEG_AT, SEG, S2, W2, WHY2, J2, M2, T2, SEG_AT2, SEG2, begin)
         D[flag] = 0
     D[0] = 0
     copy_bytes(N2.ctypes.data, N.ctypes.data, 8 * N.size)
@@ -1265,9 +1420,38 @@ def ahead(at, entered, since, until):
         if first == SIZES:
             enter(entered, S, N, D, J)
         reached, told = run(
-            goal, S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, LI, LF, OUT, TOUCH, begin, receiver, gain, extra,
-            fade, keys, RATES, LIMITS, ORDER, C, F, curves,
-        )  # fmt: skip
+            goal,
+            S,
+            N,
+            P,
+            W,
+            WHY,
+            G,
+            J,
+            M,
+            T,
+            SEG_AT,
+            SEG,
+            LS,
+            DROPS,
+            D,
+            LI,
+            LF,
+            OUT,
+            TOUCH,
+            begin,
+            receiver,
+            gain,
+            extra,
+            fade,
+            keys,
+            RATES,
+            LIMITS,
+            ORDER,
+            C,
+            F,
+            curves,
+        )
         if first > SIZES or until < since or told < 0:
             return reached, told
         S2 = carray(pointer(at[21]), (n, STATION_COLUMNS), np.int64)
@@ -1284,7 +1468,34 @@ def ahead(at, entered, since, until):
         LS2 = carray(pointer(at[32]), (flows, mcs + 1, 2), np.int64)
         DROPS2 = carray(pointer(at[33]), (drops, 2), np.int64)
         copy(
-            S, N, P, W, WHY, G, J, M, T, SEG_AT, SEG, LS, DROPS, D, S2, N2, P2, W2, WHY2, G2, J2, M2, T2, SEG_AT2, SEG2, LS2,
-            DROPS2, begin, C,
-        )  # fmt: skip
+            S,
+            N,
+            P,
+            W,
+            WHY,
+            G,
+            J,
+            M,
+            T,
+            SEG_AT,
+            SEG,
+            LS,
+            DROPS,
+            D,
+            S2,
+            N2,
+            P2,
+            W2,
+            WHY2,
+            G2,
+            J2,
+            M2,
+            T2,
+            SEG_AT2,
+            SEG2,
+            LS2,
+            DROPS2,
+            begin,
+            C,
+        )
         first, goal = SIZES + 13, until

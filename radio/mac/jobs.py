@@ -35,9 +35,24 @@ class AirJob:
     """
 
     __slots__ = (
-        "arrived_frames", "deadline_s", "dropped", "flow", "frames", "full_bytes", "granted_s", "here", "keeps_frames",
-        "last_bytes", "live", "number", "pass_granted_s", "row", "sender", "sent_frames", "t_start_s",
-    )  # fmt: skip
+        "arrived_frames",
+        "deadline_s",
+        "dropped",
+        "flow",
+        "frames",
+        "full_bytes",
+        "granted_s",
+        "here",
+        "keeps_frames",
+        "last_bytes",
+        "live",
+        "number",
+        "pass_granted_s",
+        "row",
+        "sender",
+        "sent_frames",
+        "t_start_s",
+    )
 
     def __init__(self, number: int, sender: int, deadline_s: float) -> None:
         self.number = number

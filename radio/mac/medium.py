@@ -113,9 +113,28 @@ class _State:
         """
         count, full_bytes, last_bytes = frames
         _write_row(
-            self.rows, row * _ROW_BYTES, kind, station, flow, self.entered, count, full_bytes, last_bytes, 0, 1, access, at_ns,
-            0, 0, 0, 0, 0, 0, air_ns, -1,
-        )  # fmt: skip
+            self.rows,
+            row * _ROW_BYTES,
+            kind,
+            station,
+            flow,
+            self.entered,
+            count,
+            full_bytes,
+            last_bytes,
+            0,
+            1,
+            access,
+            at_ns,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            air_ns,
+            -1,
+        )
 
     def copy(self) -> _State:
         """Another one that is equal."""
@@ -201,13 +220,23 @@ class Medium(Generic[J, F]):
         mcs = len(self._rates)
         self._settled = _State(
             (
-                stations, np.vstack([np.full(n, e.FAR), np.zeros(n, np.int64)]), np.zeros(n), np.zeros(0), np.zeros(0, np.uint8), np.zeros(e.G_FIRST + n, np.int64),
-                np.zeros((_JOBS, e.JOB_COLUMNS), np.int64), np.zeros((n, window), np.uint8),
-                np.zeros((n, window), np.int32), np.zeros((n, e.OVERLAPS), np.int64), np.zeros((n, e.OVERLAPS)),
-                np.zeros((_FLOWS, mcs + 1, 2), np.int64), np.zeros((_DROPS_KEPT + n * window, 2), np.int64),
+                stations,
+                np.vstack([np.full(n, e.FAR), np.zeros(n, np.int64)]),
+                np.zeros(n),
+                np.zeros(0),
+                np.zeros(0, np.uint8),
+                np.zeros(e.G_FIRST + n, np.int64),
+                np.zeros((_JOBS, e.JOB_COLUMNS), np.int64),
+                np.zeros((n, window), np.uint8),
+                np.zeros((n, window), np.int32),
+                np.zeros((n, e.OVERLAPS), np.int64),
+                np.zeros((n, e.OVERLAPS)),
+                np.zeros((_FLOWS, mcs + 1, 2), np.int64),
+                np.zeros((_DROPS_KEPT + n * window, 2), np.int64),
             ),
-            _JOBS, self._ns(env.now) - 1,
-        )  # fmt: skip
+            _JOBS,
+            self._ns(env.now) - 1,
+        )
         self._settled.arrays[_G][e.G_SINCE] = self._ns(env.now)
         self._planned = self._settled.copy()
         self._differing = np.zeros(2 * n + 1, np.int64)
@@ -272,24 +301,62 @@ class Medium(Generic[J, F]):
                 settled = self._settled
             a = settled.arrays
             if len(old[1]):
-                e.relink(a[_S], a[_N], self._differing, a[_P], a[_W], a[_WHY], old[0], old[1], old[2].copy(), begin, receiver, gain,
-                         self._fade, self._keys, ints)  # fmt: skip
+                e.relink(
+                    a[_S],
+                    a[_N],
+                    self._differing,
+                    a[_P],
+                    a[_W],
+                    a[_WHY],
+                    old[0],
+                    old[1],
+                    old[2].copy(),
+                    begin,
+                    receiver,
+                    gain,
+                    self._fade,
+                    self._keys,
+                    ints,
+                )
         self.replan()
 
     def _share(self) -> None:
-        self._shared_addresses = _addresses((
-            self._differing, self._flow_ints, self._flow_floats, self._out, self._touch, self._begin, self._receiver, self._gain, self._extra, self._fade, self._keys,
-            self._rates, self._limits, self._orders, self._ints, self._floats, self._curves,
-        ))  # fmt: skip
+        self._shared_addresses = _addresses(
+            (
+                self._differing,
+                self._flow_ints,
+                self._flow_floats,
+                self._out,
+                self._touch,
+                self._begin,
+                self._receiver,
+                self._gain,
+                self._extra,
+                self._fade,
+                self._keys,
+                self._rates,
+                self._limits,
+                self._orders,
+                self._ints,
+                self._floats,
+                self._curves,
+            )
+        )
         self._settled.table = self._planned.table = None
 
     def _make_table(self) -> IntArray:
         """Sizes and addresses of the settled state's arrays, the planned one's, and those that they share."""
         a = self._settled.arrays
         sizes = (
-            self._n, len(self._receiver), len(a[_J]), self._window, len(a[_LS]), len(self._rates), len(a[_DROPS]),
+            self._n,
+            len(self._receiver),
+            len(a[_J]),
+            self._window,
+            len(a[_LS]),
+            len(self._rates),
+            len(a[_DROPS]),
             len(self._extra),
-        )  # fmt: skip
+        )
         addresses = (*self._settled.addresses, *self._planned.addresses, *self._shared_addresses)
         self._settled.table = table = np.array([*sizes, *addresses], np.int64)
         return table
@@ -690,12 +757,21 @@ def _tables(
     first, second = classes[0], classes[-1]
     ints = np.zeros(16, np.int64)
     values = {
-        e.C_STATIONS: n, e.C_AIFSN: first.aifsn, e.C_AIFSN_LOW: second.aifsn, e.C_WINDOW: first.cw_min,
-        e.C_WINDOW_LOW: second.cw_min, e.C_LARGEST: first.cw_max, e.C_LARGEST_LOW: second.cw_max,
-        e.C_RETRIES: settings.retry_limit, e.C_BLOCK: window, e.C_RTS: settings.rts,
-        e.C_BY_FRAME: settings.fading == "frame", e.C_PREAMBLE_NS: round(standard.preamble_s * 1e9),
-        e.C_SYMBOL_NS: round(standard.symbol_s * 1e9), e.C_LEARNS: settings.rate_control == "minstrel",
-    }  # fmt: skip
+        e.C_STATIONS: n,
+        e.C_AIFSN: first.aifsn,
+        e.C_AIFSN_LOW: second.aifsn,
+        e.C_WINDOW: first.cw_min,
+        e.C_WINDOW_LOW: second.cw_min,
+        e.C_LARGEST: first.cw_max,
+        e.C_LARGEST_LOW: second.cw_max,
+        e.C_RETRIES: settings.retry_limit,
+        e.C_BLOCK: window,
+        e.C_RTS: settings.rts,
+        e.C_BY_FRAME: settings.fading == "frame",
+        e.C_PREAMBLE_NS: round(standard.preamble_s * 1e9),
+        e.C_SYMBOL_NS: round(standard.symbol_s * 1e9),
+        e.C_LEARNS: settings.rate_control == "minstrel",
+    }
     for column, value in values.items():
         ints[column] = value
     legacy_noise = 20.0 / settings.bandwidth_mhz

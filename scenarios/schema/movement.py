@@ -142,8 +142,11 @@ class Leg(Section):
     def _fits_its_action(self) -> Leg:
         moves = self.action in ("go", "return")
         for name, there in (
-            ("to_m", self.action == "go"), ("for_s", self.action == "hold"), ("altitude_m", moves), ("speed_mps", moves),
-        ):  # fmt: skip
+            ("to_m", self.action == "go"),
+            ("for_s", self.action == "hold"),
+            ("altitude_m", moves),
+            ("speed_mps", moves),
+        ):
             value = getattr(self, name)
             if value is not None and not there:
                 raise inconsistent((name,), f"{value}", f"left out for {self.action}")

@@ -208,8 +208,9 @@ class Scenario(Section):
     def _drones_named(self) -> Iterator[tuple[tuple[str | int, ...], int]]:
         """Every drone that a section outside of `fleet` names, and where."""
         ends: dict[str, Sequence[BaseEvent | DecisionExpectation]] = {
-            "events": self.events, "expect_decisions": self.expect_decisions,
-        }  # fmt: skip
+            "events": self.events,
+            "expect_decisions": self.expect_decisions,
+        }
         for section, each in ends.items():
             for i, one in enumerate(each):
                 for end in ("drone", "peer"):

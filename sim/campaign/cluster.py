@@ -240,7 +240,11 @@ def _certificates(files: Security | None) -> Any:
         context.load_cert_chain(cert, key, password=lambda: "")
     except (ssl.SSLError, OSError, ValueError) as error:
         raise RunError(f"--security {cert} {key}: not a certificate and its key ({_in_one_line(error)})") from error
-    ours = {f"tls_{who}_{what}": path for who in ("client", "scheduler", "worker") for what, path in (("cert", cert), ("key", key))}  # fmt: skip
+    ours = {
+        f"tls_{who}_{what}": path
+        for who in ("client", "scheduler", "worker")
+        for what, path in (("cert", cert), ("key", key))
+    }
     return Certificates(require_encryption=True, tls_ca_file=ca, **ours)
 
 

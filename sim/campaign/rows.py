@@ -21,10 +21,27 @@ Floats = NDArray[np.float64]
 BINS = 4
 ACCURACIES = ("full_scene", "mission")
 MORE_IS_BETTER = {"soc", "battery", "data_delivered", "delivered", "voltage_v", "airborne", "connected_drones"}
-LESS_IS_BETTER = {"bytes", "energy_j", "deadline_miss_rate", "age_s", "data_age_s", "switches", "medium_busy_fraction",
-                  "context_share", "data_rate_mbps", "payload_fates", "descriptor_drops", "feature_payload_bytes",
-                  "invariant_violations", "violated_ticks", "violations_by_cause", "shield_interventions",
-                  "distrusted_by", "lost", "lost_to"}  # fmt: skip
+LESS_IS_BETTER = {
+    "bytes",
+    "energy_j",
+    "deadline_miss_rate",
+    "age_s",
+    "data_age_s",
+    "switches",
+    "medium_busy_fraction",
+    "context_share",
+    "data_rate_mbps",
+    "payload_fates",
+    "descriptor_drops",
+    "feature_payload_bytes",
+    "invariant_violations",
+    "violated_ticks",
+    "violations_by_cause",
+    "shield_interventions",
+    "distrusted_by",
+    "lost",
+    "lost_to",
+}
 """Parts of a metric's path; of several the last one decides."""
 
 

@@ -18,9 +18,17 @@ from sortie.sim.folders import RunError
 
 TABLE = "runs/table.parquet"
 FIXED: dict[str, pa.DataType] = {
-    "run": pa.int64(), "unit": pa.int64(), "cell": pa.int64(), "replication": pa.int64(), "policy": pa.string(),
-    "seed": pa.int64(), "status": pa.string(), "error": pa.string(), "fingerprint": pa.string(), "key": pa.string(),
-}  # fmt: skip
+    "run": pa.int64(),
+    "unit": pa.int64(),
+    "cell": pa.int64(),
+    "replication": pa.int64(),
+    "policy": pa.string(),
+    "seed": pa.int64(),
+    "status": pa.string(),
+    "error": pa.string(),
+    "fingerprint": pa.string(),
+    "key": pa.string(),
+}
 """Columns of every table. Each varied field (its value) and each metric (float, null without one) adds a column."""
 
 

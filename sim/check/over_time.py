@@ -207,9 +207,13 @@ def flights_of(subject: Subject, rule: Invariant, scenario: Scenario, count: int
     """
     data = scenario.model_dump(mode="json", exclude_unset=True)
     data["policy"] = data.get("policy", {}) | {
-        "name": subject.name, "params": dict(subject.params), "invariants": rule.text,
-        "changes": [], "commands": [], "of_makes": False,
-    }  # fmt: skip
+        "name": subject.name,
+        "params": dict(subject.params),
+        "invariants": rule.text,
+        "changes": [],
+        "commands": [],
+        "of_makes": False,
+    }
     data["expect"] = [{"metric": "policies.invariant_violations", "equals": 0, "because": rule.text}]
     for number in range(count):
         rng = stream(scenario.seed, number, (), "verify.flights")
@@ -218,9 +222,12 @@ def flights_of(subject: Subject, rule: Invariant, scenario: Scenario, count: int
             at_s, lasts_s = rng.uniform(0, scenario.duration_s), rng.uniform(0.2, 4.0)
             drops.append(
                 {
-                    "kind": "link_drop", "at_s": round(at_s, 2), "until_s": round(at_s + lasts_s, 2),
-                    "drone": int(rng.integers(scenario.fleet.drones)), "loss_db": 120,
+                    "kind": "link_drop",
+                    "at_s": round(at_s, 2),
+                    "until_s": round(at_s + lasts_s, 2),
+                    "drone": int(rng.integers(scenario.fleet.drones)),
+                    "loss_db": 120,
                 }
-            )  # fmt: skip
+            )
         events = [*data.get("events", []), *drops]
         yield Scenario.model_validate({**data, "seed": scenario.seed + number, "events": events})

@@ -79,10 +79,20 @@ app.add_typer(recording.app, name="recording")
 campaign.app.command("worst")(worst.worst)
 app.add_typer(campaign.app, name="campaign")
 COMMANDS: dict[str, Callable[..., None]] = {
-    "fly": fly.fly, "compare": compare.compare, "check": check.check, "view": view.view, "list": listing.list_, "new": new.new,
-    "verify": verify.verify, "export": export.export, "report": report.report, "rank": rank.rank,
-    "replay": replay.replay, "import": import_log.import_log, "live": live.live,
-}  # fmt: skip
+    "fly": fly.fly,
+    "compare": compare.compare,
+    "check": check.check,
+    "view": view.view,
+    "list": listing.list_,
+    "new": new.new,
+    "verify": verify.verify,
+    "export": export.export,
+    "report": report.report,
+    "rank": rank.rank,
+    "replay": replay.replay,
+    "import": import_log.import_log,
+    "live": live.live,
+}
 for name, command in COMMANDS.items():
     app.command(name)(command)
 

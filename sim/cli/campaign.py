@@ -106,10 +106,19 @@ def run(
             folder = out_dir or campaign_folder(name)
             with _bar(name) as show:
                 done = sortie.campaign(
-                    campaign, out=folder, workers=workers, scheduler=scheduler, security=security,
-                    worker_memory_gb=worker_memory, wait_for_workers_s=wait_for_workers, by_torch=by_torch,
-                    resume=resume, retry_failed=retry_failed, progress=show, notice=_notice,
-                )  # fmt: skip
+                    campaign,
+                    out=folder,
+                    workers=workers,
+                    scheduler=scheduler,
+                    security=security,
+                    worker_memory_gb=worker_memory,
+                    wait_for_workers_s=wait_for_workers,
+                    by_torch=by_torch,
+                    resume=resume,
+                    retry_failed=retry_failed,
+                    progress=show,
+                    notice=_notice,
+                )
     except KeyboardInterrupt as end:
         where = "" if folder is None else f" in {folder}"
         what, code = ("ended by SIGTERM", ENDED) if isinstance(end, EndedError) else ("interrupted", INTERRUPTED)

@@ -135,19 +135,30 @@ def compare(
             first = [f"seed={seed}", f"perception.scene.seed={in_town_of(base, seed).perception.scene.seed}"]
         with stages() as stage_bar:
             compared = sortie.compare(
-                scenario, labels, [*(set_ or []), *first], own_fusion=own_fusion,
-                progress=lambda stage, done, of: stage_bar(stage, done, round(of)), half_width=half_width, metric=metric, pilot=pilot, most_seeds=most_seeds,
+                scenario,
+                labels,
+                [*(set_ or []), *first],
+                own_fusion=own_fusion,
+                progress=lambda stage, done, of: stage_bar(stage, done, round(of)),
+                half_width=half_width,
+                metric=metric,
+                pilot=pilot,
+                most_seeds=most_seeds,
                 kept=kept or True,
-            )  # fmt: skip
+            )
     else:
         refuse(context, PRECISE, "--half-width")
         chosen = chosen_seeds(base, seed, seeds)
         with bars() as bar:
             each = {label: bar(label, len(chosen) * base.duration_s) for label in labels}
             compared = sortie.compare(
-                scenario, labels, set_ or [], seeds=chosen, own_fusion=own_fusion,
+                scenario,
+                labels,
+                set_ or [],
+                seeds=chosen,
+                own_fusion=own_fusion,
                 progress=lambda label, at, t_s: each[label](chosen.index(at) * base.duration_s + t_s),
-            )  # fmt: skip
+            )
     out.print(compared.summary())
     if out_file is not None:
         write_text(out_file, json.dumps(_plain(compared), indent=2, allow_nan=False) + "\n")
@@ -157,9 +168,17 @@ def compare(
         print_written("kept in", report)
     if readme is not None:
         command = compare_command(
-            scenario, policies, seed, seeds, set_ or [], own_fusion=own_fusion, half_width=half_width, metric=metric, pilot=pilot,
+            scenario,
+            policies,
+            seed,
+            seeds,
+            set_ or [],
+            own_fusion=own_fusion,
+            half_width=half_width,
+            metric=metric,
+            pilot=pilot,
             most_seeds=most_seeds,
-        )  # fmt: skip
+        )
         section = comparison_markdown(Flown(compared.sorties, compared.gains), command, compared.precision)
         write_text(readme, with_section(readme, section, BEGIN, END))
         print_written("the comparison in", readme, " written")

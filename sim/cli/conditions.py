@@ -53,15 +53,26 @@ def compare_conditions(
     flown = [p for p in policies if p in FIXED]
     oracle = "oracle" if flown else fixed
     table = _figures(
-        "all conditions", "policy", "AP", f"over {fixed}, 95 %", f"of {oracle}", "data", "kJ", "missed",
-    )  # fmt: skip
+        "all conditions",
+        "policy",
+        "AP",
+        f"over {fixed}, 95 %",
+        f"of {oracle}",
+        "data",
+        "kJ",
+        "missed",
+    )
     for r in rows:
         gain = "–" if r.policy == fixed else points(r.gain, "+.1f")
         table.add_row(
-            r.policy, f"{r.ap:.3f}", gain,
-            "–" if r.of_oracle is None else f"{r.of_oracle:.0%}", size(r.data_bytes), f"{r.energy_j / 1e3:.1f}",
+            r.policy,
+            f"{r.ap:.3f}",
+            gain,
+            "–" if r.of_oracle is None else f"{r.of_oracle:.0%}",
+            size(r.data_bytes),
+            f"{r.energy_j / 1e3:.1f}",
             "–" if r.miss_rate is None else f"{r.miss_rate:.1%}",
-        )  # fmt: skip
+        )
     out.print(table)
     best = f", the best of {', '.join(flown)} (they follow one rule in every condition)" if flown else ""
     share = (

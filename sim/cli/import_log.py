@@ -230,9 +230,15 @@ def slug(log: Path) -> str:
 def described(columns: Mapping[str, Array]) -> str:
     """What a trace has, in words."""
     names = {
-        "x_m": "position", "qx": "attitude", "vx_mps": "velocity", "soc": "charge", "voltage_v": "voltage",
-        "current_a": "current", "rssi_dbm": "RSSI (dBm)", "rssi_percent": "RSSI (percent)",
-    }  # fmt: skip
+        "x_m": "position",
+        "qx": "attitude",
+        "vx_mps": "velocity",
+        "soc": "charge",
+        "voltage_v": "voltage",
+        "current_a": "current",
+        "rssi_dbm": "RSSI (dBm)",
+        "rssi_percent": "RSSI (percent)",
+    }
     return ", ".join(word for name, word in names.items() if name in columns)
 
 

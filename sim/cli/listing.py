@@ -101,9 +101,15 @@ def _invariants() -> Lines:
 
 
 LISTS: Mapping[str, Callable[[], Lines]] = {
-    "policy": _policies, "detector": _detectors, "fusion": _fusions, "event": _events, "mobility": _mobility, "scenarios": _scenarios,
-    "campaigns": _campaigns, "invariants": _invariants,
-}  # fmt: skip
+    "policy": _policies,
+    "detector": _detectors,
+    "fusion": _fusions,
+    "event": _events,
+    "mobility": _mobility,
+    "scenarios": _scenarios,
+    "campaigns": _campaigns,
+    "invariants": _invariants,
+}
 """Those that know more than names."""
 WHAT = f"{', '.join(KINDS)}, scenarios, campaigns, invariants"
 

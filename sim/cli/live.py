@@ -158,9 +158,13 @@ def _show(result: LiveResult) -> None:
     table = Table(*columns, title="on the bus, all keep-last-1")
     for t in result.topics:
         table.add_row(
-            t.topics.replace("to_drone_*", "…"), t.qos.partition(",")[0], f"{t.samples_per_s:.1f}",
-            f"{t.bytes_per_s / 1e3:.1f}", _share(t.heard_share), _share(t.delivered_share),
-        )  # fmt: skip
+            t.topics.replace("to_drone_*", "…"),
+            t.qos.partition(",")[0],
+            f"{t.samples_per_s:.1f}",
+            f"{t.bytes_per_s / 1e3:.1f}",
+            _share(t.heard_share),
+            _share(t.delivered_share),
+        )
     out.print(table)
     table = Table(
         "drone", "CPU", "published", "heard", "lost", "refused", "fallback", "publishes within", title="processes"
@@ -168,10 +172,15 @@ def _show(result: LiveResult) -> None:
     for d in result.each:
         refused = ", ".join(f"{n} {why}" for why, n in d.refused.items()) or "0"
         table.add_row(
-            f"{d.drone}", f"{d.cpu_percent:.1f} %", f"{d.published}", f"{d.heard}", f"{d.dropped_by_loss}", refused,
+            f"{d.drone}",
+            f"{d.cpu_percent:.1f} %",
+            f"{d.published}",
+            f"{d.heard}",
+            f"{d.dropped_by_loss}",
+            refused,
             f"{d.fallbacks}",
             f"{1e3 * d.publishes_within_s:.0f} ms",
-        )  # fmt: skip
+        )
     out.print(table)
     lines = describe_changes(result)
     for line in lines[:SHOWN]:

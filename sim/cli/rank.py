@@ -61,9 +61,16 @@ def rank(
     """
     with stages() as report:
         ranking = sortie.rank(
-            split_policies(policies), suite=suite, against=None if against is None else split_policies(against),
-            again=again, by_torch=by_torch, further=further, workers=workers, folder=out_dir, progress=report,
-        )  # fmt: skip
+            split_policies(policies),
+            suite=suite,
+            against=None if against is None else split_policies(against),
+            again=again,
+            by_torch=by_torch,
+            further=further,
+            workers=workers,
+            folder=out_dir,
+            progress=report,
+        )
     out.print(ranking.summary())
     ranking.save(out_dir)
     print_written("kept in", out_dir, ": ranking.json, ranking.png")

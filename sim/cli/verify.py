@@ -42,9 +42,14 @@ Kept = tuple[str, FleetView | None, Scenario]
 WRITTEN = "# A counterexample, written by sortie verify.\n"
 FOR_POLICIES = ("invariants", "drones", "budget", "views", "scenario", "courses", "flights", "out_dir")
 COLOURS = {
-    "holds": "green", "fails": "red", "unusual": "yellow", "not tried enough": "yellow",
-    "proved": "green", "refuted": "red", "tried": "yellow",
-}  # fmt: skip
+    "holds": "green",
+    "fails": "red",
+    "unusual": "yellow",
+    "not tried enough": "yellow",
+    "proved": "green",
+    "refuted": "red",
+    "tried": "yellow",
+}
 
 
 def verify(

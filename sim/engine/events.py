@@ -43,8 +43,16 @@ from sortie.sim.engine.world import World, at, with_frame
 
 OVERSIZED_BYTES = 2000
 LASTING = (
-    LinkDrop, Jam, Lie, GnssLoss, Own, PositionFault, HeadingFault, CameraBlocked, SlowPerception,
-)  # fmt: skip
+    LinkDrop,
+    Jam,
+    Lie,
+    GnssLoss,
+    Own,
+    PositionFault,
+    HeadingFault,
+    CameraBlocked,
+    SlowPerception,
+)
 """Events that have an end."""
 FleetEvent = DroneJoins | DroneLeaves | DroneLost | BatteryFault | CellFailure
 """Events that change nothing where the drone is on the ground, or flies already."""

@@ -75,16 +75,23 @@ def needs(scenario: Scenario) -> Needs:
     width = {name: row_bytes(columns, n) for name, columns in TABLES.items()}
     groups, people = len(scenario.mission.phases_of), len(scenario.perception.people)
     certain = {
-        "states": n * frames, "descriptors": n * math.ceil(frames / scenario.context.publish_every), "receptions": frames,
-        "mission": groups * frames, "people": people * frames, "medium": math.ceil(scenario.duration_s),
-    }  # fmt: skip
+        "states": n * frames,
+        "descriptors": n * math.ceil(frames / scenario.context.publish_every),
+        "receptions": frames,
+        "mission": groups * frames,
+        "people": people * frames,
+        "medium": math.ceil(scenario.duration_s),
+    }
     links = n * (n - 1)
     fusions = 0 if scenario.perception.detector == "none" else scenario.scored_drones * len(scenario.scored_frames)
     cars = _cars_in_range(scenario) if fusions else 0
     possible = {
-        "ages": links * frames, "transmissions": links * frames, "fusions": fusions,
-        "truths": cars * fusions, "detections": 2 * cars * fusions,
-    }  # fmt: skip
+        "ages": links * frames,
+        "transmissions": links * frames,
+        "fusions": fusions,
+        "truths": cars * fusions,
+        "detections": 2 * cars * fusions,
+    }
     floats = AIRFRAME_FLOATS * n + sum(math.prod(shape) for shape in shapes_of(n).values())
     motion = floats * FLOAT_BYTES * frames
     sure = sum(width[name] * rows for name, rows in certain.items())

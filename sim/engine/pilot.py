@@ -316,9 +316,11 @@ class Pilot:
         for rule in (r for r in self._keeper.rules if not r.over_time):
             for d in violations(rule, shown, directives, self._fresh):
                 failed(
-                    -1 if d is None else d.destination, self.policy.name, rule.text,
+                    -1 if d is None else d.destination,
+                    self.policy.name,
+                    rule.text,
                     describe_directives(directives if d is None else [d]),
-                )  # fmt: skip
+                )
         for peer in set(shown.peers) - {d.destination for d in directives}:
             failed(peer, self.policy.name, "one directive a link", "none for this one")
         before, self._last_shown = self._last_shown, (shown, directives)

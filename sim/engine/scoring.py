@@ -163,10 +163,16 @@ class Scorer:
             shares = [s for s in shares if s.boxes is None]  # boxes that came with a map are no payload of their own
             rows["fusions"].append(
                 (
-                    now_s, drone, [s.capture.drone for s in shares], [s.representation for s in shares],
-                    [now_s - s.capture.t_s for s in shares], [s.weight for s in shares], len(boxes), len(truth),
+                    now_s,
+                    drone,
+                    [s.capture.drone for s in shares],
+                    [s.representation for s in shares],
+                    [now_s - s.capture.t_s for s in shares],
+                    [s.weight for s in shares],
+                    len(boxes),
+                    len(truth),
                 )
-            )  # fmt: skip
+            )
 
     def _with_classes(self, truth: Boxes, t_s: float, here: Capture) -> Boxes:
         """The vehicles about an ego with their classes, and the people there."""

@@ -307,9 +307,27 @@ def build(
     schedule(scenario, world, transport, membership, own_events, seed=seed, replication=replication)
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(
-        scenario, env, recorder, scene, batteries, air, world, transport, membership, own_events, choreography, steering, pilots, agents, detector, scorer,
-        finding, audit, notes, journal,
-    )  # fmt: skip
+        scenario,
+        env,
+        recorder,
+        scene,
+        batteries,
+        air,
+        world,
+        transport,
+        membership,
+        own_events,
+        choreography,
+        steering,
+        pilots,
+        agents,
+        detector,
+        scorer,
+        finding,
+        audit,
+        notes,
+        journal,
+    )
 
 
 def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer: Observer | None = None) -> None:

@@ -105,7 +105,7 @@ class Transport:
         """Hand a method's request or answer to the radio; it takes airtime, and nothing waits for it."""
         number = self.air.send(
             drone, peer, size_bytes, kind=HANDSHAKE, reliable=False, deadline_s=deadline_s, on_done=self._done
-        )  # fmt: skip
+        )
         self._pending[number] = (
             Payload(Representation.NONE, 0.0, None, 0.0, 0, 0, 0, size_bytes),
             capture,
@@ -143,11 +143,31 @@ def _unfold_transmissions(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     t = dict(zip(Transmission._fields, zip(*transmissions, strict=True), strict=True))
     p = dict(zip(Payload._fields, zip(*payloads, strict=True), strict=True))
     return [
-        t["t_sent_s"], t["sender"], t["receiver"], t["kind"], captured_s, p["rho"], p["cells"], p["boxes"],
-        p["index_bytes"], t["payload_bytes"], t["wire_bytes"], t["deadline_s"], t["t_start_s"], t["t_done_s"],
-        t["status"], t["reason"], t["fragments"], t["fragments_lost"], t["repairs"], t["mcs"], t["snr_db"],
-        t["airtime_s"], t["hops"], t["arrived_bytes"],
-    ]  # fmt: skip
+        t["t_sent_s"],
+        t["sender"],
+        t["receiver"],
+        t["kind"],
+        captured_s,
+        p["rho"],
+        p["cells"],
+        p["boxes"],
+        p["index_bytes"],
+        t["payload_bytes"],
+        t["wire_bytes"],
+        t["deadline_s"],
+        t["t_start_s"],
+        t["t_done_s"],
+        t["status"],
+        t["reason"],
+        t["fragments"],
+        t["fragments_lost"],
+        t["repairs"],
+        t["mcs"],
+        t["snr_db"],
+        t["airtime_s"],
+        t["hops"],
+        t["arrived_bytes"],
+    ]
 
 
 class _Modem:

@@ -123,8 +123,13 @@ class World:
         errors: Mapping[int, np.ndarray],
     ) -> None:
         self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
-            env, motion, batteries, air, scene, plan,
-        )  # fmt: skip
+            env,
+            motion,
+            batteries,
+            air,
+            scene,
+            plan,
+        )
         self.drones = drones
         n = len(drones)
         self.extra_loss_db: np.ndarray | None = weaker_senders_db(scenario)

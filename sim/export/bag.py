@@ -129,20 +129,34 @@ def _qos(type_: str, *, stays: bool) -> Any:
     reliability = QosReliability.BEST_EFFORT if type_ == DESCRIPTOR_NAME else QosReliability.RELIABLE
     durability = QosDurability.TRANSIENT_LOCAL if stays else QosDurability.VOLATILE
     ever = QosTime(9223372036, 854775807)
-    return Qos(
-        QosHistory.KEEP_LAST, depth, reliability, durability, ever, ever, QosLiveliness.AUTOMATIC, ever, False
-    )  # fmt: skip
+    return Qos(QosHistory.KEEP_LAST, depth, reliability, durability, ever, ever, QosLiveliness.AUTOMATIC, ever, False)
 
 
 def _makers(types: Any) -> SimpleNamespace:
     """The message classes by their short names."""
     names = (
-        "builtin_interfaces/msg/Duration", "builtin_interfaces/msg/Time", "geometry_msgs/msg/Point",
-        "geometry_msgs/msg/Pose", "geometry_msgs/msg/Quaternion", "geometry_msgs/msg/Transform",
-        "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/Vector3", "sensor_msgs/msg/CompressedImage",
-        "sensor_msgs/msg/NavSatStatus", "std_msgs/msg/ColorRGBA", "std_msgs/msg/Header", "visualization_msgs/msg/Marker",
-        "visualization_msgs/msg/MeshFile", POSE, TF, BATTERY, LOG, FIX, CLOCK, MARKERS,
-    )  # fmt: skip
+        "builtin_interfaces/msg/Duration",
+        "builtin_interfaces/msg/Time",
+        "geometry_msgs/msg/Point",
+        "geometry_msgs/msg/Pose",
+        "geometry_msgs/msg/Quaternion",
+        "geometry_msgs/msg/Transform",
+        "geometry_msgs/msg/TransformStamped",
+        "geometry_msgs/msg/Vector3",
+        "sensor_msgs/msg/CompressedImage",
+        "sensor_msgs/msg/NavSatStatus",
+        "std_msgs/msg/ColorRGBA",
+        "std_msgs/msg/Header",
+        "visualization_msgs/msg/Marker",
+        "visualization_msgs/msg/MeshFile",
+        POSE,
+        TF,
+        BATTERY,
+        LOG,
+        FIX,
+        CLOCK,
+        MARKERS,
+    )
     return SimpleNamespace(**{name.rsplit("/", 1)[1]: types[name] for name in names})
 
 
@@ -197,9 +211,12 @@ def _flight(record: SortieRecord, make: SimpleNamespace, begin_ns: int, origin: 
             moved = make.TransformStamped(header(t_s, "world"), name, make.Transform(make.Vector3(x, y, z), turn))
             yield Message(t_s, "/tf", TF, make.TFMessage([moved]))
             fix = make.NavSatFix(
-                header(t_s, name), make.NavSatStatus(0 if state.fixed else -1, 1), *geodetic(state.position_m, origin),
-                np.zeros(9), 0,
-            )  # fmt: skip
+                header(t_s, name),
+                make.NavSatStatus(0 if state.fixed else -1, 1),
+                *geodetic(state.position_m, origin),
+                np.zeros(9),
+                0,
+            )
             yield Message(t_s, f"/{name}/fix", FIX, fix)
             yield Message(t_s, f"/{name}/battery", BATTERY, _battery(make, header(t_s, name), row))
 

@@ -22,8 +22,11 @@ def layout(drones: int) -> dict[str, Any]:
         panels["map!fleet"]["topicColors"][f"/drone_{i}/fix"] = colour
         panels["Plot!battery"]["paths"].append(
             {
-                "value": f"/drone_{i}/battery.percentage", "label": f"drone {i}", "color": colour, "enabled": True,
+                "value": f"/drone_{i}/battery.percentage",
+                "label": f"drone {i}",
+                "color": colour,
+                "enabled": True,
                 "timestampMethod": "headerStamp",
             }
-        )  # fmt: skip
+        )
     return made

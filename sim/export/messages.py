@@ -55,7 +55,7 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
             feature_space=spaces[row["drone"]],
             codebook=books[row["drone"]],
             priority_target_ids=(targets[frame, group_of(row["drone"])],) if row["novelty_flags"] & TARGET_FLAG else (),
-        )  # fmt: skip
+        )
         roster = roster_at(row["drone"], row["t_s"])
         if n > LISTED_IDS:  # the record lists goodput as the descriptor did
             descriptor = descriptor._replace(roster=roster)

@@ -147,8 +147,10 @@ class SceneMarkers:
         for seen in sightings(tables, regions):
             markers = []
             for name, boxes, colours in (
-                ("found", seen.hits, c.FOUND), ("missed", seen.missed, c.MISSED), ("false", seen.false, c.FALSE),
-            ):  # fmt: skip
+                ("found", seen.hits, c.FOUND),
+                ("missed", seen.missed, c.MISSED),
+                ("false", seen.false, c.FALSE),
+            ):
                 markers += self._box_markers(name, seen.t_s, boxes, colours)
             yield seen.t_s, f"/drone_{seen.drone}/boxes", self._array(seen.t_s, markers)
 
@@ -183,11 +185,16 @@ class SceneMarkers:
         rows = np.column_stack([boxes.xy_m, boxes.yaw_rad, boxes.size_m, np.clip(boxes.score, 0.0, 1.0)])
         return [
             self._marker(
-                name, _CUBE, t_s, (x, y, BOX_HEIGHT_M / 2), (length, width, BOX_HEIGHT_M),
-                (*colours[kind].tolist(), 60 + 120 * score), yaw,
+                name,
+                _CUBE,
+                t_s,
+                (x, y, BOX_HEIGHT_M / 2),
+                (length, width, BOX_HEIGHT_M),
+                (*colours[kind].tolist(), 60 + 120 * score),
+                yaw,
             )
             for (x, y, yaw, length, width, score), kind in zip(rows.tolist(), boxes.kind.tolist(), strict=True)
-        ]  # fmt: skip
+        ]
 
     def _lines(self, name: str, kind: int, t_s: float, points: Any, width_m: float, colour: Any) -> Any:
         marker = self._marker(name, kind, t_s, (0.0, 0.0, 0.0), (width_m, 0.0, 0.0), colour)
@@ -200,13 +207,26 @@ class SceneMarkers:
         make = self._make
         turn = make.Quaternion(0.0, 0.0, float(np.sin(yaw_rad / 2)), float(np.cos(yaw_rad / 2)))
         return make.Marker(
-            header=make.Header(self._time(t_s), "world"), ns=name, id=0, type=kind, action=action,
-            pose=make.Pose(make.Point(*at), turn), scale=make.Vector3(*size), color=self._colour(colour),
-            lifetime=make.Duration(0, 0), frame_locked=False, points=[], colors=[], texture_resource="",
+            header=make.Header(self._time(t_s), "world"),
+            ns=name,
+            id=0,
+            type=kind,
+            action=action,
+            pose=make.Pose(make.Point(*at), turn),
+            scale=make.Vector3(*size),
+            color=self._colour(colour),
+            lifetime=make.Duration(0, 0),
+            frame_locked=False,
+            points=[],
+            colors=[],
+            texture_resource="",
             texture=make.CompressedImage(make.Header(self._time(t_s), ""), "", np.zeros(0, np.uint8)),
-            uv_coordinates=[], text="", mesh_resource="", mesh_file=make.MeshFile("", np.zeros(0, np.uint8)),
+            uv_coordinates=[],
+            text="",
+            mesh_resource="",
+            mesh_file=make.MeshFile("", np.zeros(0, np.uint8)),
             mesh_use_embedded_materials=False,
-        )  # fmt: skip
+        )
 
     def _array(self, t_s: float, markers: list[Any]) -> Any:
         """The markers numbered, after one that deletes those before."""

@@ -156,9 +156,14 @@ class MavlinkEndpoint:
     """
 
     def __init__(
-        self, address: str, pace: float | None = 1.0, origin: Origin | None = None, key: bytes | None = None,
-        *, clock: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+        self,
+        address: str,
+        pace: float | None = 1.0,
+        origin: Origin | None = None,
+        key: bytes | None = None,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         if pace is not None and not 1e-3 <= pace <= 1e3:
             raise RunError(f"pace is {pace:g}, must be 0.001 to 1000, or 0 for as fast as possible")
         self._pace, self._origin, self._key, self._clock = pace, origin, key, clock

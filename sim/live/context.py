@@ -38,8 +38,19 @@ from sortie.sim.engine.tracking import FleetTracking, TargetSeen
 from sortie.sim.engine.world import INSTANT_S, cars_in_reach
 
 _REPLAYED_EVENTS = frozenset(
-    {"drone_joins", "drone_leaves", "drone_lost", "landed", "power_lost", "stays_down", "battery_fault", "cell_failure", "link_drop", "link_back"}
-)  # fmt: skip
+    {
+        "drone_joins",
+        "drone_leaves",
+        "drone_lost",
+        "landed",
+        "power_lost",
+        "stays_down",
+        "battery_fault",
+        "cell_failure",
+        "link_drop",
+        "link_back",
+    }
+)
 _RESTED = Platform(1.0, 1.0, 1.0)
 Bounds = tuple[float, float, float, float]
 
@@ -158,9 +169,9 @@ def _only(motion: Trajectories, drone: int) -> Trajectories:
     values = {f.name: getattr(motion, f.name) for f in fields(motion)}
     fleet_wide = {"time_s", "frame_position_m", "frame_yaw_rad"}
     assert all(value.shape[1] == n for name, value in values.items() if name not in fleet_wide)  # noqa: S101
-    return Trajectories(**{
-        name: value if name in fleet_wide else value[:, drone : drone + 1].copy() for name, value in values.items()
-    })  # fmt: skip
+    return Trajectories(
+        **{name: value if name in fleet_wide else value[:, drone : drone + 1].copy() for name, value in values.items()}
+    )
 
 
 class ReplaySenses:

@@ -84,9 +84,13 @@ def fly_one(orders: Orders, pipe: Connection) -> None:
             if go is None:
                 return
         node = LiveNode(
-            Bus(orders.domain), Seals(orders.secrets, drone), drone, scenario.fleet.drones,
-            seed=scenario.seed, loss=orders.loss,
-        )  # fmt: skip
+            Bus(orders.domain),
+            Seals(orders.secrets, drone),
+            drone,
+            scenario.fleet.drones,
+            seed=scenario.seed,
+            loss=orders.loss,
+        )
         senses: ReplaySenses | MavlinkSenses = replay
         if orders.mavlink is not None:
             link = MavlinkLink(orders.mavlink, orders.origin, orders.mavlink_key)

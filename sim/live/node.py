@@ -188,9 +188,19 @@ class LiveNode:
         """The counts, and what happened since the last report."""
         new, self._new = self._new, SinceLastReport()
         return Report(
-            self.drone, self._began_s, t_s, time.process_time() - self._began_cpu_s, self._published, self._heard, self._lost,
-            dict(self._refused), self._late_s, dict(self._sent), dict(self._received), new,
-        )  # fmt: skip
+            self.drone,
+            self._began_s,
+            t_s,
+            time.process_time() - self._began_cpu_s,
+            self._published,
+            self._heard,
+            self._lost,
+            dict(self._refused),
+            self._late_s,
+            dict(self._sent),
+            dict(self._received),
+            new,
+        )
 
     # --- sortie.fleet.agent.Modem -----------------------------------------------------------------------
 

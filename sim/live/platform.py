@@ -145,9 +145,14 @@ class MavlinkSenses:
         position, attitude, heading = (np.asarray([[v]]) for v in (state.position_m, state.orientation_xyzw, yaw))
         ((view,),) = views(Poses(position, attitude, heading, position, heading), self._replay.height_field, [cameras])
         capture = Capture(
-            self._drone, state.pose_s + self._offset_s, state.position_m, state.orientation_xyzw, state.position_m,
-            float(yaw), cameras=cameras,
-        )  # fmt: skip
+            self._drone,
+            state.pose_s + self._offset_s,
+            state.position_m,
+            state.orientation_xyzw,
+            state.position_m,
+            float(yaw),
+            cameras=cameras,
+        )
         return Sensed(capture, state.velocity_mps, radius_m, view, capture.orientation_xyzw)
 
     @property

@@ -114,9 +114,17 @@ def _plain(d: Directive) -> Directive:
     """The directive in types that every process knows; a policy may use subclasses of its own."""
     roi = None if d.roi is None else Disc(*(float(v) for v in d.roi))
     return Directive(
-        int(d.source), int(d.destination), Representation(int(d.representation)), float(d.rho), roi, float(d.rate_hz),
-        float(d.deadline_s), float(d.fusion_weight), int(d.duty_percent), str(d.reason),
-    )  # fmt: skip
+        int(d.source),
+        int(d.destination),
+        Representation(int(d.representation)),
+        float(d.rho),
+        roi,
+        float(d.rate_hz),
+        float(d.deadline_s),
+        float(d.fusion_weight),
+        int(d.duty_percent),
+        str(d.reason),
+    )
 
 
 def take_notices(recorder: Recorder) -> tuple[Notice, ...]:

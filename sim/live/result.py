@@ -137,11 +137,19 @@ def summarise(
     context_bytes = context.bytes + directives.bytes
     each = [
         DroneResult(
-            r.drone, 100 * r.cpu_s / max(r.t_s - r.begin_s, 1e-9), r.published, r.heard, r.lost, r.refused,
-            sum(r.received[kind].samples for kind in PAYLOADS), r.fallbacks, r.policy_restarts, r.late_s,
+            r.drone,
+            100 * r.cpu_s / max(r.t_s - r.begin_s, 1e-9),
+            r.published,
+            r.heard,
+            r.lost,
+            r.refused,
+            sum(r.received[kind].samples for kind in PAYLOADS),
+            r.fallbacks,
+            r.policy_restarts,
+            r.late_s,
         )
         for r in fleet.last.values()
-    ]  # fmt: skip
+    ]
     return LiveResult(
         scenario=scenario.name,
         policy=named_policy(scenario.policy.name, scenario.policy.params).name,

@@ -131,9 +131,22 @@ def fly_live(
         held = secrets_of(master, drone) if authentic else None
         vehicle = mavlink[drone] if drone < len(mavlink) else None
         return Orders(
-            scenario, drone, found[drone], from_s, end_s, loss, domain, present, held, fallback or DETECTIONS,
-            decide_within_s, vehicle, origin, mavlink_key, late,
-        )  # fmt: skip
+            scenario,
+            drone,
+            found[drone],
+            from_s,
+            end_s,
+            loss,
+            domain,
+            present,
+            held,
+            fallback or DETECTIONS,
+            decide_within_s,
+            vehicle,
+            origin,
+            mavlink_key,
+            late,
+        )
 
     try:
         flown += [_start(orders_of(drone, begin_s, late=False)) for drone in sorted(present)]
@@ -188,11 +201,15 @@ def _frame_of(t_s: float, scenario: Scenario) -> float:
 
 
 def _check(
-    scenario: Scenario, begin_s: float, end_s: float, loss: float, kill: tuple[int, float] | None,
+    scenario: Scenario,
+    begin_s: float,
+    end_s: float,
+    loss: float,
+    kill: tuple[int, float] | None,
     start: tuple[int, float] | None,
     decide_within_s: float | None,
     mavlink: Sequence[str],
-) -> None:  # fmt: skip
+) -> None:
     drones = scenario.fleet.drones
     if drones > MAX_DRONES:
         raise RunError(f"fleet.drones is {drones}, live flights have at most {MAX_DRONES}: each is a process")

@@ -42,9 +42,16 @@ def take_picture(recording: Path, picture: Path, at_s: float, *, size: tuple[int
     if not picture.absolute().parent.is_dir():
         raise RunError(f"{picture}: its folder does not exist")
     command = [
-        viewer_binary(), "--headless", "--bind", "127.0.0.1", "--port", "0",
-        "--window-size", f"{size[0]}x{size[1]}", str(recording.absolute()),
-    ]  # fmt: skip
+        viewer_binary(),
+        "--headless",
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--window-size",
+        f"{size[0]}x{size[1]}",
+        str(recording.absolute()),
+    ]
     with tempfile.TemporaryFile() as said:
         viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True)  # noqa: S603
         try:

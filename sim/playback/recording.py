@@ -31,9 +31,20 @@ from sortie.sim.results.spool import InTime, batches
 
 APPLICATION = "sortie"
 DRAWN = (
-    "states", "people", "mission", "descriptors", "directives", "transmissions", "fusions", "detections", "truths", "ages",
-    "medium", "receptions", "events",
-)  # fmt: skip
+    "states",
+    "people",
+    "mission",
+    "descriptors",
+    "directives",
+    "transmissions",
+    "fusions",
+    "detections",
+    "truths",
+    "ages",
+    "medium",
+    "receptions",
+    "events",
+)
 """The tables that a playback shows."""
 BLOCK_DRONE_S = 600.0
 """So many drones times seconds are drawn at once, which takes some 100 MB."""

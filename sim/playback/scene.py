@@ -129,9 +129,10 @@ class Drawing:
                 rr.Boxes3D(
                     centers=np.column_stack([(low + high) / 2, top / 2]),
                     half_sizes=np.column_stack([(high - low) / 2, top / 2]),
-                    colors=tone, fill_mode="solid",
+                    colors=tone,
+                    fill_mode="solid",
                 ),
-            )  # fmt: skip
+            )
         trees = np.concatenate([b.trees for b in self._scene.town.blocks(x0, y0, x1, y1)])
         trees = trees[inside(trees[:, :2], self._scene.rect)]
         if len(trees):
@@ -354,9 +355,12 @@ def _drone(canvas: Canvas, path: str, colour: palette.Rgba) -> None:
     # Not static, because a drone that comes down goes grey; a static colour would win over that.
     canvas.columns(f"{path}/body", np.zeros(1), rr.Boxes3D.columns(colors=_body_colours(colour)).partition([4]))
     rotors = rr.Cylinders3D(
-        lengths=[0.12] * 4, radii=[1.05] * 4, centers=[(x, y, 0.35) for x in (arm, -arm) for y in (arm, -arm)],
-        colors=[(*colour[:3], 255)] * 4, fill_mode="solid",
-    )  # fmt: skip
+        lengths=[0.12] * 4,
+        radii=[1.05] * 4,
+        centers=[(x, y, 0.35) for x in (arm, -arm) for y in (arm, -arm)],
+        colors=[(*colour[:3], 255)] * 4,
+        fill_mode="solid",
+    )
     canvas.static(f"{path}/rotors", rotors)
     canvas.static(f"{path}/name", rr.Points3D([(0, 0, 5.0)], radii=[0.01], colors=[colour], show_labels=True))
 
@@ -364,9 +368,12 @@ def _drone(canvas: Canvas, path: str, colour: palette.Rgba) -> None:
 def _mast(canvas: Canvas, path: str, colour: palette.Rgba, height_m: float) -> None:
     """A ground station: a mast from the ground to its antenna, and a ball where the antenna is."""
     mast = rr.Cylinders3D(
-        lengths=[max(height_m, 0.1)], radii=[0.25], centers=[(0, 0, -height_m / 2)], colors=[(150, 150, 155, 255)],
+        lengths=[max(height_m, 0.1)],
+        radii=[0.25],
+        centers=[(0, 0, -height_m / 2)],
+        colors=[(150, 150, 155, 255)],
         fill_mode="solid",
-    )  # fmt: skip
+    )
     canvas.static(f"{path}/mast", mast)
     canvas.static(f"{path}/antenna", rr.Points3D([(0, 0, 0)], radii=[1.2], colors=[colour]))
     canvas.static(f"{path}/name", rr.Points3D([(0, 0, 5.0)], radii=[0.01], colors=[colour], show_labels=True))

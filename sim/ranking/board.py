@@ -37,28 +37,40 @@ def summary(ranked: Ranked) -> Summary:
     """The ranking as it is printed: tables of 80 columns, and what they say of the policies that were asked for."""
     title = f"{ranked.suite} ({ranked.digest}), {ranked.conditions} conditions, {ranked.detector}"
     tables = [
-        _table(ranked, title, {
-            "AP, 95 % interval": lambda r: interval(r.score.mean, r.score.low, r.score.high, lambda v: f"{v:.3f}"),
-            "mission": _of("ap50.mission", number),
-            "full": _of("ap50.full_scene", number),
-            "HOTA": _of("tracking.hota", number),
-            "failed": lambda r: f"{len(r.failed)}" if r.failed else NONE,
-        }),
-        _table(ranked, "mission and cost, a sortie", {
-            "found": _of("mission.target_detected_share", percent),
-            "seen": _of("mission.region_observed_share", percent),
-            "data": _of("bytes.data_sent", size),
-            "missed": _of("deadline_miss_rate", percent),
-            "energy": lambda r: number(r.energy_j / 1e3, ".2f", "kJ"),
-        }),
-        _table(ranked, "context, rules and time, a sortie", {
-            "context": _of("bytes.context_sent", size),
-            "radio": _of("energy_j.radio", lambda v: f"{v:.0f} J"),
-            "unsafe": _of("policies.violated_ticks", lambda v: f"{v:.0f}"),
-            "verified": lambda r: ranked.verified[r.policy].text,
-            "decides": lambda r: number(ranked.decision_us(r.policy), ".0f", "µs"),
-        }),
-    ]  # fmt: skip
+        _table(
+            ranked,
+            title,
+            {
+                "AP, 95 % interval": lambda r: interval(r.score.mean, r.score.low, r.score.high, lambda v: f"{v:.3f}"),
+                "mission": _of("ap50.mission", number),
+                "full": _of("ap50.full_scene", number),
+                "HOTA": _of("tracking.hota", number),
+                "failed": lambda r: f"{len(r.failed)}" if r.failed else NONE,
+            },
+        ),
+        _table(
+            ranked,
+            "mission and cost, a sortie",
+            {
+                "found": _of("mission.target_detected_share", percent),
+                "seen": _of("mission.region_observed_share", percent),
+                "data": _of("bytes.data_sent", size),
+                "missed": _of("deadline_miss_rate", percent),
+                "energy": lambda r: number(r.energy_j / 1e3, ".2f", "kJ"),
+            },
+        ),
+        _table(
+            ranked,
+            "context, rules and time, a sortie",
+            {
+                "context": _of("bytes.context_sent", size),
+                "radio": _of("energy_j.radio", lambda v: f"{v:.0f} J"),
+                "unsafe": _of("policies.violated_ticks", lambda v: f"{v:.0f}"),
+                "verified": lambda r: ranked.verified[r.policy].text,
+                "decides": lambda r: number(ranked.decision_us(r.policy), ".0f", "µs"),
+            },
+        ),
+    ]
     return Summary(*tables, *sentences(ranked))
 
 
@@ -195,10 +207,15 @@ def draw(ranked: Ranked, path: Path) -> Path:
     heights = _spread([(y - low) / (high - low) for y in seen])
     for row, x, y, height, colour in zip(rows, sent, seen, heights, colours, strict=True):
         ax.annotate(
-            f"{place_text(row.place)}  {row.policy.rpartition('/')[2]}", (x, y), (1.04, height), textcoords="axes fraction",
-            fontsize=11, va="center", color="0.1" if colour == "0.45" else colour,
+            f"{place_text(row.place)}  {row.policy.rpartition('/')[2]}",
+            (x, y),
+            (1.04, height),
+            textcoords="axes fraction",
+            fontsize=11,
+            va="center",
+            color="0.1" if colour == "0.45" else colour,
             arrowprops={"arrowstyle": "-", "color": "0.75", "lw": 0.6},
-        )  # fmt: skip
+        )
     ax.set_xlabel("payload bytes sent in a sortie, MB (linear below 1)", fontsize=13)
     ax.set_ylabel("AP@0.5, mean over conditions", fontsize=13)
     ax.tick_params(labelsize=12)

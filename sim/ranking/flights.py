@@ -23,11 +23,26 @@ from sortie.sim.identity import flight_code, packages
 from sortie.sim.studies.conditions import scenario_of
 
 METRICS = (
-    "ap50.mission", "ap50.full_scene", "tracking.hota", "bytes.data_sent", "bytes.context_sent", "energy_j.total",
-    "energy_j.fault", "energy_j.radio", "deadline_miss_rate", "mission.target_detected_share", "mission.target_in_view_share",
-    "mission.region_observed_share", "mission.flown_share", "policies.violated_ticks", "policies.invariant_violations",
-    "switches", "age_s.p99", "policy_eval_us.p50", "policy_eval_us.p99",
-)  # fmt: skip
+    "ap50.mission",
+    "ap50.full_scene",
+    "tracking.hota",
+    "bytes.data_sent",
+    "bytes.context_sent",
+    "energy_j.total",
+    "energy_j.fault",
+    "energy_j.radio",
+    "deadline_miss_rate",
+    "mission.target_detected_share",
+    "mission.target_in_view_share",
+    "mission.region_observed_share",
+    "mission.flown_share",
+    "policies.violated_ticks",
+    "policies.invariant_violations",
+    "switches",
+    "age_s.p99",
+    "policy_eval_us.p50",
+    "policy_eval_us.p99",
+)
 """What is kept of each flight: numbers of its outcome, by their names."""
 KEPT = "flights.jsonl"
 BY_TORCH = ("perception.detector=torch", "perception.sample_rate_hz=0.5")
@@ -120,9 +135,12 @@ def _task(suite: ConditionSet, condition: Condition, policy: str, read: Callable
 
     sections = with_files(scenario.model_dump(mode="json", exclude_none=True), place)
     task = {
-        "scenario": sections, "seed": scenario.seed, "replication": 0, "metrics": METRICS,
+        "scenario": sections,
+        "seed": scenario.seed,
+        "replication": 0,
+        "metrics": METRICS,
         **read(tuple(named_models(sections)), tuple(named_files(sections))),
-    }  # fmt: skip
+    }
     return json.dumps(task, sort_keys=True)
 
 

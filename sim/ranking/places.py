@@ -159,12 +159,14 @@ def standings(
     place = places(list(scored), pairs)
     rows = [
         Standing(
-            policy, place[policy], scored[policy].mean(SHARE),
+            policy,
+            place[policy],
+            scored[policy].mean(SHARE),
             tuple(c.name for c in suite.conditions if flights[policy][c.name].error),
             {name: _mean(name, flights[policy].values()) for name in METRICS},
         )
         for policy in scored
-    ]  # fmt: skip
+    ]
     return sorted(rows, key=lambda r: -r.score.mean), pairs
 
 

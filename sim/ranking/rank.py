@@ -186,10 +186,23 @@ def rank(
     flights = {p: flights[p] for p in decides}
     rows, pairs = standings(asked, flights, control)
     return Ranked(
-        suite, digest, code_version(), None if stored is None else stored.sortie, stale, speed,
-        "torch" if by_torch else "surrogate", tuple(rows), tuple(pairs), flights, verified, tuple(own), taken,
-        len(asked.conditions), control, 1.0 if control is None else _width(pairs, standings(asked, flights)[1]),
-    )  # fmt: skip
+        suite,
+        digest,
+        code_version(),
+        None if stored is None else stored.sortie,
+        stale,
+        speed,
+        "torch" if by_torch else "surrogate",
+        tuple(rows),
+        tuple(pairs),
+        flights,
+        verified,
+        tuple(own),
+        taken,
+        len(asked.conditions),
+        control,
+        1.0 if control is None else _width(pairs, standings(asked, flights)[1]),
+    )
 
 
 def _further(suite: str, draws: int | None) -> list[Condition]:

@@ -28,8 +28,17 @@ SECONDS = 20
 MISSIONS = ("search", "track", "handover")
 """`handover` searches first, and tracks from a third of the flight on."""
 TROUBLES = (
-    "clear", "weak", "jammed", "cut_off", "tired", "battery_fault", "lie", "spoof", "sensor_fault", "drone_lost",
-)  # fmt: skip
+    "clear",
+    "weak",
+    "jammed",
+    "cut_off",
+    "tired",
+    "battery_fault",
+    "lie",
+    "spoof",
+    "sensor_fault",
+    "drone_lost",
+)
 BUDGETS = (0.005, 0.5)
 CHARGED, TIRED = (0.5, 1.0), (0.15, 0.29)
 """State of charge at take-off, by and large and where the trouble is that batteries are tired."""

@@ -16,8 +16,12 @@ from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 import pyarrow as pa
 
 _PLAIN: dict[Any, pa.DataType] = {
-    bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string(), bytes: pa.binary(),
-}  # fmt: skip
+    bool: pa.bool_(),
+    int: pa.int64(),
+    float: pa.float64(),
+    str: pa.string(),
+    bytes: pa.binary(),
+}
 
 
 class _Form(NamedTuple):

@@ -24,8 +24,17 @@ def explain_metric(metric: str, record: SortieRecord, result: dict[str, Any]) ->
         facts.append(_grounded(record))
     if top in ("ap50", "mission", "data_age_s", "phases"):
         facts.append(_fused(record, result))
-    if top in ("bytes", "context_share", "data_rate_mbps", "deadline_miss_rate", "payload_fates", "phases", "ap50",
-               "medium_busy_fraction", "data_age_s"):  # fmt: skip
+    if top in (
+        "bytes",
+        "context_share",
+        "data_rate_mbps",
+        "deadline_miss_rate",
+        "payload_fates",
+        "phases",
+        "ap50",
+        "medium_busy_fraction",
+        "data_age_s",
+    ):
         facts.append(_payloads(result))
     if top in ("context", "age_s"):
         facts.append(f"descriptors lost: {losses_in_words(result['context']) or 'none'}")

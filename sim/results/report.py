@@ -115,12 +115,19 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     return [
         *tiles,
         ("Data delivered", size(data["data_delivered"]), f"of {size(data['data_sent'])} sent"),
-        ("Deadlines missed", percent(result["deadline_miss_rate"]), f"channel busy {percent(result['medium_busy_fraction'])}"),
+        (
+            "Deadlines missed",
+            percent(result["deadline_miss_rate"]),
+            f"channel busy {percent(result['medium_busy_fraction'])}",
+        ),
         ("Context plane", size(data["context_sent"]), f"{percent(result['context_share'])} of all bytes"),
         ("Descriptors lost", percent(result["context"]["lost"]), losses_in_words(result["context"]) or "of receptions"),
         ("Energy", f"{result['energy_j']['total'] / 1e3:.1f} kJ", f"least charge left {percent(least)}"),
-        *((f"metrics.{name}", number(value, ".4g"), "a metric of your own") for name, value in result["metrics"].items()),
-    ]  # fmt: skip
+        *(
+            (f"metrics.{name}", number(value, ".4g"), "a metric of your own")
+            for name, value in result["metrics"].items()
+        ),
+    ]
 
 
 def _own_files(result: dict[str, Any]) -> Html:
@@ -151,12 +158,16 @@ def _numbers(result: dict[str, Any], fleet: Fleet) -> Html:
     """Phases, then drones and ground stations."""
     phases = [
         table_row(
-            "td", f"{p['phase']}, {p['begin_s']:g}–{p['end_s']:g} s", number(p["ap50"]["full_scene"]),
-            number(p["ap50"]["mission"]), f"{p['data_rate_mbps']:.1f} Mb/s", percent(p["deadline_miss_rate"]),
+            "td",
+            f"{p['phase']}, {p['begin_s']:g}–{p['end_s']:g} s",
+            number(p["ap50"]["full_scene"]),
+            number(p["ap50"]["mission"]),
+            f"{p['data_rate_mbps']:.1f} Mb/s",
+            percent(p["deadline_miss_rate"]),
             percent(p["context"]["lost"]),
         )
         for p in result["phases"]
-    ]  # fmt: skip
+    ]
     drones = [_drone_row(i, d, fleet.station(int(i))) for i, d in result["drones"].items()]
     head = table_row("th", "phase", "AP full scene", "AP mission", "data", "deadlines missed", "descriptors lost")
     other = table_row("th", "drone", "charge left", "energy", "voltage", "at the end")

@@ -35,9 +35,14 @@ Drawer = Callable[["Axes", SortieRecord], None]
 DRONES = ("#2f6fd0", "#d9780f", "#8a4fd0", "#0f9a8b", "#d0407a", "#9a8a12", "#4f88b8", "#b5603c", "#6a9a3a", "#85756d")
 """Colours of drones, on white."""
 SENT = {
-    "features": "#3f9a52", "codes": "#2a8a9a", "detections": "#d08a1d", "uncertain_boxes": "#c05a2a", "tracks": "#4f7fd0",
-    "raw": "#b04fb0", "nothing": "#d5d7db",
-}  # fmt: skip
+    "features": "#3f9a52",
+    "codes": "#2a8a9a",
+    "detections": "#d08a1d",
+    "uncertain_boxes": "#c05a2a",
+    "tracks": "#4f7fd0",
+    "raw": "#b04fb0",
+    "nothing": "#d5d7db",
+}
 HANDSHAKES = "#a89a3c"
 FATES = {"lost": "#d02f45", "expired": "#8a90a0"}
 MISSION, EVENT, JAMMER = "#d02fae", "#8a6a00", "#c8201f"
@@ -102,11 +107,23 @@ def drawn(plots: Sequence[tuple[str, float, Callable[[Axes], None]]]) -> dict[st
     except ImportError as error:
         raise RunError("matplotlib is missing: pip install 'sortie-sim[report]'") from error
     style: dict[Any, Any] = {
-        "svg.hashsalt": "sortie", "svg.fonttype": "none", "text.parse_math": False, "font.family": "sans-serif", "font.size": 12.0,
-        "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#888888", "axes.grid": True,
-        "grid.color": "#e6e6e6", "axes.axisbelow": True, "legend.frameon": False, "legend.fontsize": 12.0,
-        "legend.handlelength": 1.2, "legend.borderaxespad": 0.2, "legend.labelspacing": 0.3,
-    }  # fmt: skip
+        "svg.hashsalt": "sortie",
+        "svg.fonttype": "none",
+        "text.parse_math": False,
+        "font.family": "sans-serif",
+        "font.size": 12.0,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.edgecolor": "#888888",
+        "axes.grid": True,
+        "grid.color": "#e6e6e6",
+        "axes.axisbelow": True,
+        "legend.frameon": False,
+        "legend.fontsize": 12.0,
+        "legend.handlelength": 1.2,
+        "legend.borderaxespad": 0.2,
+        "legend.labelspacing": 0.3,
+    }
     made = {}
     with mpl.rc_context(style), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing")  # a browser draws the letters, with fonts of its own
@@ -159,9 +176,16 @@ def mark_moments(axes: Axes, record: SortieRecord) -> None:
         label = " ".join(text for text, _ in said)
         if t_s >= free_s:  # a label that would lie on the one before is left out
             axes.annotate(
-                label, (t_s, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
-                ha="center", va="bottom", color=said[-1][1], fontsize=11,
-            )  # fmt: skip
+                label,
+                (t_s, 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(0, 2),
+                textcoords="offset points",
+                ha="center",
+                va="bottom",
+                color=said[-1][1],
+                fontsize=11,
+            )
             free_s = t_s + (0.012 + 0.012 * len(label)) * end_s
     axes.set_xlim(0.0, end_s)
     axes.set_xlabel("s", loc="right", labelpad=-2)

@@ -45,7 +45,9 @@ class Checks:
         self._ranges: dict[str, tuple[float, float]] = {
             **dict.fromkeys(("drone", "peer", "receiver", "peers", "cut_drones", "members", "other"), drones),
             **dict.fromkeys(("agent_id", "source", "destination"), drones),
-            **dict.fromkeys(("bottleneck_sender", "bottleneck_receiver", "events.drone", "violations.peer"), drones_or_none),
+            **dict.fromkeys(
+                ("bottleneck_sender", "bottleneck_receiver", "events.drone", "violations.peer"), drones_or_none
+            ),
             **dict.fromkeys(("mcs", "target", "car", "person"), number_or_none),
             **dict.fromkeys(("soc", "battery_soc", "cpu_headroom", "gpu_headroom", "busy_fraction", "trust"), share),
             **dict.fromkeys(("t_s", "begin_s"), instant),
@@ -60,7 +62,7 @@ class Checks:
             "views.descriptors": (0, rows.get(views.DESCRIPTORS, 0) - 1),
             "views.directives": (0, rows.get(views.DIRECTIVES, 0) - 1),
             **dict.fromkeys(("fusions.detections", "fusions.truths"), (0, 2**31)),
-        }  # fmt: skip
+        }
 
     def check(self, name: str, table: pa.Table) -> None:
         """Refuse a table with a value that no run has.
@@ -162,10 +164,22 @@ def ensure_each_once(tables: Mapping[str, pa.Table]) -> None:
 
 _MAY_BE_MISSING = frozenset({"region", "roster", "roi", "viewpoint"})
 """Optional parts of what policies read and answer; no other value may be missing."""
-_MAY_BE_NAN = frozenset({
-    "region_x_m", "region_y_m", "region_radius_m", "roi_x_m", "roi_y_m", "roi_radius_m", "target_x_m", "target_y_m",
-    "bottleneck_mbps", "t_start_s", "t_done_s", "snr_db",
-})  # fmt: skip
+_MAY_BE_NAN = frozenset(
+    {
+        "region_x_m",
+        "region_y_m",
+        "region_radius_m",
+        "roi_x_m",
+        "roi_y_m",
+        "roi_radius_m",
+        "target_x_m",
+        "target_y_m",
+        "bottleneck_mbps",
+        "t_start_s",
+        "t_done_s",
+        "snr_db",
+    }
+)
 """Columns in which NaN says that there is none. A link that carries nothing may have an SNR of minus infinity."""
 _CHOICES: dict[str, list[str]] = {
     "representation": [*REPRESENTATION_OF],
@@ -185,9 +199,12 @@ _LENGTHS: dict[str, dict[str, int | str | None]] = {
     "descriptors": {"coverage_grid": COVERAGE_BYTES, "goodput_mbps": None},
     views.DECISIONS: {"ages_s": "descriptors"},
     views.DESCRIPTORS: {
-        "coverage_grid": COVERAGE_BYTES, "position_m": 3, "orientation_xyzw": 4, "velocity_mps": 3,
+        "coverage_grid": COVERAGE_BYTES,
+        "position_m": 3,
+        "orientation_xyzw": 4,
+        "velocity_mps": 3,
     },
-}  # fmt: skip
+}
 """How many values a cell has: so many, as many as another column, or (None) one for each other drone."""
 
 

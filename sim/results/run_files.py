@@ -36,9 +36,15 @@ WRITTEN |= {".DS_Store"}  # a desktop that looked in
 MOST_BYTES = 64 << 20
 """Of a file that is no table."""
 _TOTALS = (
-    "context_descriptor_bytes", "context_directive_bytes", "medium_busy_fraction", "policy_changes",
-    "shield_interventions", "invariant_violations", "violated_ticks", *(f"{VIOLATIONS_OF}{cause}" for cause in CAUSES),
-)  # fmt: skip
+    "context_descriptor_bytes",
+    "context_directive_bytes",
+    "medium_busy_fraction",
+    "policy_changes",
+    "shield_interventions",
+    "invariant_violations",
+    "violated_ticks",
+    *(f"{VIOLATIONS_OF}{cause}" for cause in CAUSES),
+)
 """Those that the outcome needs."""
 
 Text = Annotated[str, Field(max_length=MOST_CHARACTERS)]

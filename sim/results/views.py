@@ -85,13 +85,17 @@ class Journal:
         known, answers = self._descriptors, self._directives
         self._rows.append(
             _Row(
-                self._env.now, drone, policy, view.period_s, view.detached_after_periods,
+                self._env.now,
+                drone,
+                policy,
+                view.period_s,
+                view.detached_after_periods,
                 tuple([known.setdefault(d, len(known)) for d in view.descriptors.values()]),
                 tuple([view.age_s[i] for i in view.descriptors]),
                 tuple([answers.setdefault(tuple(d), len(answers)) for d in directives]),
                 viewpoint,
             )
-        )  # fmt: skip
+        )
 
     def tables(self) -> dict[str, pa.Table]:
         """All decisions so far as Arrow tables."""

@@ -146,11 +146,15 @@ def summarise(cells: Sequence[Cell]) -> list[Summary]:
         mean = float(ap[p].mean())
         rows.append(
             Summary(
-                p, mean, (gain.mean, gain.low, gain.high), mean / oracle if oracle else None,
-                float(np.mean([c.data_bytes for c in mine])), float(np.mean([c.energy_j for c in mine])),
+                p,
+                mean,
+                (gain.mean, gain.low, gain.high),
+                mean / oracle if oracle else None,
+                float(np.mean([c.data_bytes for c in mine])),
+                float(np.mean([c.energy_j for c in mine])),
                 mean_of_known(c.miss_rate for c in mine),
             )
-        )  # fmt: skip
+        )
     return rows
 
 

@@ -406,9 +406,17 @@ def precision_of(flown: Flown, policies: Sequence[str], settings: Settings, dete
     paired = {row.seed for row in flown.torch}
     reached = _narrow(flown, policies, settings, control=flown.control)
     return Precision(
-        detector, settings.metric, settings.half_width, reached, len(paired),
-        sum(row.seed not in paired for row in flown.surrogate), flown.control, tuple(contrasts), (torch_s, cheap_s), ratio,
-    )  # fmt: skip
+        detector,
+        settings.metric,
+        settings.half_width,
+        reached,
+        len(paired),
+        sum(row.seed not in paired for row in flown.surrogate),
+        flown.control,
+        tuple(contrasts),
+        (torch_s, cheap_s),
+        ratio,
+    )
 
 
 def results(flown: Flown, contenders: Sequence[Contender]) -> tuple[tuple[Compared, ...], tuple[Gain, ...]]:

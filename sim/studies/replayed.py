@@ -26,9 +26,16 @@ NO_PEER = -1
 MOST = 12
 """Rows of the table of first differences, and of the most frequent ones in each of the others."""
 _COLUMNS = {
-    "t_s": pa.float64(), "drone": pa.int32(), "decision": pa.int32(), "peer": pa.int32(), "fields": pa.list_(pa.string()),
-    "flown": pa.string(), "replayed": pa.string(), "flown_reason": pa.string(), "replayed_reason": pa.string(),
-}  # fmt: skip
+    "t_s": pa.float64(),
+    "drone": pa.int32(),
+    "decision": pa.int32(),
+    "peer": pa.int32(),
+    "fields": pa.list_(pa.string()),
+    "flown": pa.string(),
+    "replayed": pa.string(),
+    "flown_reason": pa.string(),
+    "replayed_reason": pa.string(),
+}
 CSV_HEAD = ",".join(f'"{name}"' for name in _COLUMNS)
 """The first line of a table of differences."""
 

@@ -29,9 +29,15 @@ class Handshake(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.look = nn.Sequential(
-            nn.Conv2d(CHANNELS, 32, 3, 2, 1), nn.ReLU(), nn.Conv2d(32, 32, 3, 2, 1), nn.ReLU(),
-            nn.AdaptiveAvgPool2d(POOLED), nn.Flatten(), nn.Linear(32 * POOLED**2, 128), nn.ReLU(),
-        )  # fmt: skip
+            nn.Conv2d(CHANNELS, 32, 3, 2, 1),
+            nn.ReLU(),
+            nn.Conv2d(32, 32, 3, 2, 1),
+            nn.ReLU(),
+            nn.AdaptiveAvgPool2d(POOLED),
+            nn.Flatten(),
+            nn.Linear(32 * POOLED**2, 128),
+            nn.ReLU(),
+        )
         self.query = nn.Linear(128, QUERY)
         self.key = nn.Linear(128, KEY)
         self.match = nn.Linear(QUERY, KEY, bias=False)

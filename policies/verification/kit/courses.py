@@ -20,9 +20,20 @@ Values = Mapping[str, tuple[float, ...]]
 """The values that drawn signals take, by name."""
 
 _USUAL: dict[str, float] = {
-    "soc": 1.0, "cpu": 1.0, "gpu": 1.0, "phase": TaskPhase.SEARCH, "region": 1.0, "targets": 0.0, "person": 0.0,
-    "lost": 0.0, "goodput": 50.0, "x_m": 0.0, "y_m": 0.0, "vx_mps": 0.0, "vy_mps": 0.0,
-}  # fmt: skip
+    "soc": 1.0,
+    "cpu": 1.0,
+    "gpu": 1.0,
+    "phase": TaskPhase.SEARCH,
+    "region": 1.0,
+    "targets": 0.0,
+    "person": 0.0,
+    "lost": 0.0,
+    "goodput": 50.0,
+    "x_m": 0.0,
+    "y_m": 0.0,
+    "vx_mps": 0.0,
+    "vy_mps": 0.0,
+}
 """Of a goodput: to each other drone. Places and velocities are those at first, and do not change."""
 _SHARES = (0.05, 0.2999, 0.3, 0.5999, 0.6, 0.9, 1.0)
 _FLAGS, _PLACES_M, _VELOCITIES_MPS = (0.0, 1.0), (0.0, -80.0, -25.0, 25.0, 80.0), (-10.0, -3.0, 3.0, 10.0)
@@ -91,10 +102,13 @@ def values_at(constants: Iterable[float]) -> Values:
     shares = (*_SHARES, *(x for c in known if 0 <= c <= 1 for x in (c - 1e-4, c, c + 1e-4) if 0 <= x <= 1))
     rates_mbps = (*_GOODPUT_MBPS, *(x for c in known if 0 < c <= 1e5 for x in (0.9 * c, c, 1.2 * c)))
     return {
-        **dict.fromkeys(_USUAL, _FLAGS), **dict.fromkeys(("soc", "cpu", "gpu"), shares), "goodput": rates_mbps,
-        "phase": tuple(map(float, TaskPhase)), **dict.fromkeys(("x_m", "y_m"), _PLACES_M),
+        **dict.fromkeys(_USUAL, _FLAGS),
+        **dict.fromkeys(("soc", "cpu", "gpu"), shares),
+        "goodput": rates_mbps,
+        "phase": tuple(map(float, TaskPhase)),
+        **dict.fromkeys(("x_m", "y_m"), _PLACES_M),
         **dict.fromkeys(("vx_mps", "vy_mps"), _VELOCITIES_MPS),
-    }  # fmt: skip
+    }
 
 
 def draw_course(number: int, still: Course, values: Values) -> Course:
