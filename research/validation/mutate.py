@@ -30,7 +30,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[2]
 QUICK = (
@@ -49,6 +49,8 @@ QUICK = (
 CACHES = {"lru_cache", "cache", "cached_property"}
 LOUD = ("BitOr", "BitAnd", "BitXor", "Shift")
 """Operators of whole numbers, which fail on the first float that they meet: a test that runs the line notices them."""
+STAGES = 3
+"""A change is tried with the tests of its own folder, of its room, and with all others."""
 LIMIT_S = 3600.0
 """A change after which the tests of one folder take so long is noticed: it hangs."""
 SEED = "57"
@@ -163,23 +165,23 @@ def drawn(texts: dict[str, str], sample: int, seed: str) -> Iterator[Change]:
 
 def stages(tree: Path, file: str) -> list[list[str]]:
     """The tests that a change of a file is tried with, one stage after the other: its folder's, its room's, all others."""
-    folders: list[str] = []
-    for parent in reversed(Path(file).parents[:-1]):
-        if (tree / "tests" / parent).is_dir():
-            folders.insert(0, f"tests/{parent.as_posix()}")
-    done: list[str] = []
-    found = []
-    for folder in [*folders, "tests"]:
-        found.append([folder, *(f"--ignore={one}" for one in done)])
-        done.append(folder)
-    return found
+    folder, room = Path(file).parent, Path(file).parts[0]
+    own = folder if (tree / "tests" / folder).is_dir() else Path(room)
+    inner = [f"--ignore=tests/{own.as_posix()}"]
+    return [
+        [f"tests/{own.as_posix()}"],
+        [f"tests/{room}", *inner] if own != Path(room) else [],
+        ["tests", *inner, f"--ignore=tests/{room}"],
+    ]
 
 
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 
 
 def noticed_by(tree: Path, tests: Sequence[str]) -> str | None:
-    """The first test that fails in a copy of the tree; None where all pass."""
+    """The first test that fails in a copy of the tree; None where all pass, or there are none."""
+    if not tests:
+        return None
     env = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-m", "pytest", *QUICK, *tests]
     process = subprocess.Popen(
@@ -197,13 +199,13 @@ def noticed_by(tree: Path, tests: Sequence[str]) -> str | None:
     return first[1] if first else text.strip().splitlines()[-1]
 
 
-def tried(tree: Path, change: Change) -> str | None:
-    """The test that notices a change, None if it survives. The file is as before afterwards, its time of change too."""
+def tried(tree: Path, change: Change, first: int, until: int) -> str | None:
+    """The test of some stages that notices a change, None if it survives. The file is as before afterwards, its time too."""
     path = tree / change.file
     before, stat = path.read_bytes(), path.stat()
     path.write_text(change.text, "utf-8")
     try:
-        return next((by for tests in stages(tree, change.file) if (by := noticed_by(tree, tests))), None)
+        return next((by for tests in stages(tree, change.file)[first:until] if (by := noticed_by(tree, tests))), None)
     finally:
         path.write_bytes(before)
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # compiled loops are kept by it
@@ -218,28 +220,34 @@ def copy(suite: Path, tree: Path) -> None:
         shutil.copytree(suite / "tests", tree / "tests", symlinks=True)
 
 
-def measure(suite: Path, log: Path, sample: int, seed: str, rooms: Sequence[str], workers: int) -> None:
-    """Try every drawn change that the log does not have yet, and write a line for each."""
-    known = {row["change"] for row in read(log)}
-    todo = []
+def measure(
+    suite: Path, log: Path, sample: int, seed: str, rooms: Sequence[str], workers: int, until: int = STAGES
+) -> None:
+    """Try every drawn change, and write a line for each; what the log has of it already is not tried again."""
+    known = {row["change"]: row for row in read(log)}
+    todo: list[tuple[str, str, Change, int]] = []
     for k, room in enumerate(ROOMS):
         texts = files(ROOT, room)
         count = sample // len(ROOMS) + (k < sample % len(ROOMS))
         for change in drawn(texts, count, f"{seed}/{room}") if room in rooms else ():
             where = change.where(texts[change.file])
-            if where not in known:
-                todo.append((room, where, change))
+            row = known.get(where)
+            first = 0 if row is None else row["stages"] if row["by"] is None else STAGES
+            if first < until:
+                todo.append((room, where, change, first))
     trees: list[Path] = []
     lock, own = threading.Lock(), threading.local()
 
-    def one(job: tuple[str, str, Change]) -> None:
-        room, where, change = job
+    def one(job: tuple[str, str, Change, int]) -> None:
+        room, where, change, first = job
         if not hasattr(own, "tree"):
             with lock:
                 own.tree = trees.pop()
-        by = tried(own.tree, change)
+        by = tried(own.tree, change, first, until)
         with lock, log.open("a", encoding="utf-8") as lines:
-            lines.write(json.dumps({"room": room, "change": where, "by": by}, ensure_ascii=False) + "\n")
+            lines.write(
+                json.dumps({"room": room, "change": where, "by": by, "stages": until}, ensure_ascii=False) + "\n"
+            )
             sys.stdout.write(f"{room}: {'SURVIVED' if by is None else by}  {where}\n")
             sys.stdout.flush()
 
@@ -252,12 +260,13 @@ def measure(suite: Path, log: Path, sample: int, seed: str, rooms: Sequence[str]
                 pass
 
 
-def read(log: Path) -> list[dict[str, str | None]]:
-    """The lines of a log; none if it is not there yet."""
-    return [json.loads(line) for line in log.read_text("utf-8").splitlines()] if log.exists() else []
+def read(log: Path) -> list[dict[str, Any]]:
+    """The last line of each change in a log; none if it is not there yet."""
+    rows = [json.loads(line) for line in log.read_text("utf-8").splitlines()] if log.exists() else []
+    return list({row["change"]: row for row in rows}.values())
 
 
-def table(logs: Sequence[list[dict[str, str | None]]]) -> list[str]:
+def table(logs: Sequence[list[dict[str, Any]]]) -> list[str]:
     """Survivors by room in each log, as Markdown."""
     rows = ["| room | changes |" + " survived |" * len(logs), "|---|---|" + "---|" * len(logs)]
     for room in (*ROOMS, "all"):
@@ -266,7 +275,7 @@ def table(logs: Sequence[list[dict[str, str | None]]]) -> list[str]:
     return rows
 
 
-def differing(old: list[dict[str, str | None]], new: list[dict[str, str | None]]) -> list[str]:
+def differing(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[str]:
     """A line for each change that only one of two logs noticed."""
     before = {row["change"]: row["by"] for row in old}
     lines = []
@@ -289,6 +298,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--log", type=Path, default=Path("runs/mutate.jsonl"), help="what was tried; a later call goes on"
     )
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="changes that are tried at once")
+    parser.add_argument(
+        "--stages", type=int, choices=(1, 2, 3), default=STAGES, help="1: the tests of its folder; 2: of its room too"
+    )
     parser.add_argument("--pairs", type=Path, nargs=2, metavar=("OLD", "NEW"), help="compare two logs, and run nothing")
     asked = parser.parse_args(arguments)
     if asked.pairs:
@@ -296,7 +308,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         lines = [*table([old, new]), *differing(old, new)]
     else:
         asked.log.parent.mkdir(parents=True, exist_ok=True)
-        measure(asked.suite, asked.log, asked.sample, asked.seed, asked.room or tuple(ROOMS), asked.workers)
+        measure(
+            asked.suite, asked.log, asked.sample, asked.seed, asked.room or tuple(ROOMS), asked.workers, asked.stages
+        )
         log = read(asked.log)
         lines = [*table([log]), *(f"survived in {row['room']}: {row['change']}" for row in log if row["by"] is None)]
     sys.stdout.write("\n".join(lines) + "\n")

@@ -67,6 +67,11 @@ def test_the_tests_of_the_nearest_folder_come_first() -> None:
         ["tests/radio", "--ignore=tests/radio/mac"],
         ["tests", "--ignore=tests/radio/mac", "--ignore=tests/radio"],
     ]
+    assert mutate.stages(mutate.ROOT, "radio/air.py") == [
+        ["tests/radio"],
+        [],
+        ["tests", "--ignore=tests/radio", "--ignore=tests/radio"],
+    ]
 
 
 def test_a_sample_is_drawn_of_changes_with_a_meaning() -> None:
