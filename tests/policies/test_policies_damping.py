@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from policies_examples import fleet_of
 
-from sortie.policies.contract import Descriptor, Directive, Disc, LinkState, Representation, TaskPhase
-from sortie.policies.damping import DampedLink, apply_hysteresis, damp, is_climb, is_switch
+from sortie.policies.contract import Descriptor, Directive, Disc, LinkState, Representation, Roster, TaskPhase
+from sortie.policies.damping import SAME_DISC_M, DampedLink, apply_hysteresis, damp, is_climb, is_switch
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS, probed_mbps, state_of
 
 FULL = Directive(0, 1, Representation.FEATURES, 1.0, None, 10.0, reason="full")
 HALF = FULL._replace(rate_hz=5.0, reason="half")
 BOXES = Directive(0, 1, Representation.DETECTIONS, 0.0, None, 2.0, reason="boxes")
 NOTHING = Directive(0, 1)
+LITTLE = FULL._replace(rho=0.02, rate_hz=2.0, reason="little")
+HERE, THERE, WIDE = Disc(0, 0, 32), Disc(5, 0, 32), Disc(5, 0, 64)
+CONFINED, TIRED = FULL._replace(roi=HERE), NOTHING._replace(duty_percent=20)
 DWELL_S = 1.0
 
 
@@ -36,17 +41,36 @@ def test_a_repeated_directive_changes_nothing_and_restarts_nothing() -> None:
     assert damp(waiting, FULL, 1.0, DWELL_S).enforced == FULL
 
 
-def test_reductions_pass_at_once_upgrades_wait() -> None:
-    assert run(FULL, [HALF]) == [HALF]
-    assert run(FULL, [BOXES]) == [BOXES]
-    assert run(FULL, [NOTHING]) == [NOTHING]
-    enforced = run(BOXES, [FULL] * 12)
-    assert enforced[:10] == [BOXES] * 10
-    assert enforced[10:] == [FULL] * 2
+COURSES: dict[str, tuple[Directive, list[Directive], list[Directive]]] = {
+    "less passes at once": (FULL, [HALF], [HALF]),
+    "a lower rung passes at once": (FULL, [BOXES], [BOXES]),
+    "nothing passes at once": (FULL, [NOTHING], [NOTHING]),
+    "more waits for the dwell": (BOXES, [FULL] * 12, [BOXES] * 10 + [FULL] * 2),
+    "a passing change does not switch": (BOXES, [FULL] * 9 + [BOXES] + [FULL] * 9, [BOXES] * 19),
+    "a disc confines at once": (FULL, [CONFINED], [CONFINED]),
+    "a disc moves freely": (CONFINED, [FULL._replace(roi=THERE)], [FULL._replace(roi=THERE)]),
+    "a disc widens late": (CONFINED, [FULL._replace(roi=WIDE)], [FULL._replace(roi=THERE)]),
+    "a disc is released late": (CONFINED, [FULL] * 11, [CONFINED] * 10 + [FULL]),
+    "one frame does not lift the grant": (
+        NOTHING,
+        [LITTLE] * 10 + [FULL] + [LITTLE] * 20,
+        [NOTHING] * 10 + [LITTLE] * 21,
+    ),
+    "a rise after a grant waits from there": (
+        BOXES,
+        [HALF] * 9 + [FULL] * 20,
+        [BOXES] * 10 + [HALF] * 10 + [FULL] * 9,
+    ),
+    "the duty falls at once at rest": (NOTHING, [TIRED], [TIRED]),
+    "the duty rises late at rest": (TIRED, [NOTHING] * 11, [TIRED] * 10 + [NOTHING]),
+    "the duty falls while the link waits": (NOTHING, [FULL._replace(duty_percent=20)], [TIRED]),
+}
+"""A link in force, what is proposed every 0.1 s, and what is then in force."""
 
 
-def test_a_passing_change_does_not_switch() -> None:
-    assert set(run(BOXES, [FULL] * 9 + [BOXES] + [FULL] * 9)) == {BOXES}
+def test_reductions_pass_at_once_and_upgrades_wait() -> None:
+    found = {name: run(start, asked) for name, (start, asked, _) in COURSES.items()}
+    assert {name: d for name, d in found.items() if d != COURSES[name][2]} == {}
 
 
 def test_a_mixed_change_is_lowered_where_it_is_lower() -> None:
@@ -56,22 +80,21 @@ def test_a_mixed_change_is_lowered_where_it_is_lower() -> None:
     assert last == asked
 
 
-def test_a_region_confines_at_once_moves_freely_and_widens_late() -> None:
-    here, there, wide = Disc(0, 0, 32), Disc(5, 0, 32), Disc(5, 0, 64)
-    confined = FULL._replace(roi=here)
-    assert run(FULL, [confined]) == [confined]
-    assert run(confined, [FULL._replace(roi=there)]) == [FULL._replace(roi=there)]
-    assert run(confined, [FULL._replace(roi=wide)])[0].roi == there
-    released = run(confined, [FULL] * 11)
-    assert [d.roi for d in released] == [here] * 10 + [None]
-
-
 def test_the_reason_in_force_is_the_one_that_decided() -> None:
     confined = BOXES._replace(roi=Disc(0, 0, 32))
-    asked = FULL._replace(roi=Disc(1, 0, 32))
-    (waiting,) = run(confined, [asked])
+    (waiting,) = run(confined, [FULL._replace(roi=Disc(1, 0, 32))])
     assert waiting.roi == Disc(1, 0, 32)
     assert waiting.reason == "boxes", "the disc moved, but full features are still waiting"
+    enforced = run(NOTHING, [LITTLE] * 10 + [FULL])
+    assert enforced[10].reason == "little", "the reason is of the request that is granted"
+
+
+def test_what_flickers_is_granted_at_its_least_and_holds_up_no_steady_part() -> None:
+    asked = [FULL._replace(rate_hz=(5.0, 10.0)[i // 3 % 2], rho=(0.5, 0.1)[i // 4 % 2]) for i in range(40)]
+    assert run(BOXES, asked)[10:] == [FULL._replace(rate_hz=5.0, rho=0.1)] * 30
+    start = FULL._replace(rho=0.1, rate_hz=2.0)  # the rate falls back at 0.6 s; ρ is asked for since 0.4 s
+    asked = [start._replace(rho=1.0 if i >= 4 else 0.1, rate_hz=10.0 if i < 6 else 2.0) for i in range(20)]
+    assert [d.rho for d in run(start, asked)] == [0.1] * 14 + [1.0] * 6
 
 
 directives = st.builds(
@@ -109,33 +132,8 @@ def test_upgrades_are_at_least_a_dwell_apart_from_their_asking(asked: list[Direc
     assert all(b - a >= dwell_s - 1e-6 for a, b in itertools.pairwise(upgrades))
 
 
-def test_one_frame_at_the_end_of_the_dwell_does_not_lift_the_grant() -> None:
-    little = FULL._replace(rho=0.02, rate_hz=2.0, reason="little")
-    enforced = run(NOTHING, [little] * 10 + [FULL] + [little] * 20)
-    assert enforced[:10] == [NOTHING] * 10
-    assert enforced[10:] == [little] * 21
-    assert enforced[10].reason == "little", "the reason is of the request that is granted"
-
-
-def test_what_flickers_is_granted_at_its_least() -> None:
-    asked = [FULL._replace(rate_hz=(5.0, 10.0)[i // 3 % 2], rho=(0.5, 0.1)[i // 4 % 2]) for i in range(40)]
-    assert run(BOXES, asked)[10:] == [FULL._replace(rate_hz=5.0, rho=0.1)] * 30
-
-
-def test_what_rises_after_a_grant_waits_a_dwell_from_there() -> None:
-    enforced = run(BOXES, [HALF] * 9 + [FULL] * 20)
-    assert [d.rate_hz for d in enforced] == [2.0] * 10 + [5.0] * 10 + [10.0] * 9
-
-
-def test_a_part_that_flickers_does_not_hold_up_a_steady_one() -> None:
-    """The rate falls back at 0.6 s; ρ has been asked for since 0.4 s and is granted a dwell after that."""
-    start = FULL._replace(rho=0.1, rate_hz=2.0)
-    asked = [start._replace(rho=1.0 if i >= 4 else 0.1, rate_hz=10.0 if i < 6 else 2.0) for i in range(20)]
-    assert [d.rho for d in run(start, asked)] == [0.1] * 14 + [1.0] * 6
-
-
 def least(asked: list[Directive]) -> Directive:
-    """The least of several directives in turn, in every part; a representation comes with its own ρ, and a lower one with its own disc."""
+    """The least of several directives in every part. A representation brings its own ρ, and a lower one its own disc."""
     rung = min(d.representation for d in asked)
     if rung == Representation.NONE:
         return NOTHING._replace(duty_percent=min(d.duty_percent for d in asked))
@@ -167,22 +165,6 @@ def by_hand(start: Directive, asked: list[Directive], dwell: int) -> list[Direct
     return enforced
 
 
-def asks_at_least(asked: Directive, granted: Directive) -> bool:
-    """Whether a directive asks for as much as another one in every part. ρ and disc are parts of a representation."""
-    if granted.representation == Representation.NONE:
-        return asked.duty_percent >= granted.duty_percent
-    if asked.representation == granted.representation:
-        wide = asked.roi is None or (granted.roi is not None and granted.roi.radius_m <= asked.roi.radius_m)
-        if not wide or asked.rho < granted.rho:
-            return False
-    return (
-        asked.representation >= granted.representation
-        and asked.rate_hz >= granted.rate_hz
-        and asked.fusion_weight >= granted.fusion_weight
-        and asked.duty_percent >= granted.duty_percent
-    )
-
-
 flowing = directives.map(
     lambda d: d._replace(deadline_s=0.1) if d.representation else NOTHING._replace(duty_percent=d.duty_percent)
 )
@@ -196,53 +178,15 @@ def without_place(d: Directive) -> Directive:
     return d if d.roi is None else d._replace(roi=Disc(0.0, 0.0, d.roi.radius_m))
 
 
-@given(histories, st.integers(0, 12))
-def test_damping_agrees_with_the_whole_history(asked: list[Directive], dwell: int) -> None:
-    state, enforced = DampedLink(NOTHING), []
+@given(histories, flowing, st.integers(0, 12))
+def test_damping_agrees_with_the_whole_history(before: list[Directive], steady: Directive, dwell: int) -> None:
+    """A steady request at the end is granted."""
+    state, enforced, asked = DampedLink(NOTHING), [], before + [steady] * (2 * dwell + 1)
     for i, directive in enumerate(asked):
         state = damp(state, directive, 0.1 * i, 0.1 * dwell)
         enforced.append(without_place(state.enforced))
     assert enforced == by_hand(NOTHING, [without_place(d) for d in asked], dwell)
-
-
-@given(histories, st.integers(1, 12))
-def test_no_more_is_granted_than_was_asked_for_throughout_the_dwell(asked: list[Directive], dwell: int) -> None:
-    state = DampedLink(NOTHING)
-    for i, directive in enumerate(asked):
-        after = damp(state, directive, 0.1 * i, 0.1 * dwell)
-        assert asks_at_least(directive, after.enforced), "more is in force than is asked for now"
-        if not asks_at_least(state.enforced, after.enforced):
-            assert i >= dwell, "an upgrade before the dwell is over"
-            assert all(asks_at_least(d, after.enforced) for d in asked[i - dwell : i + 1])
-        state = after
-
-
-@given(histories, flowing, st.integers(1, 12))
-def test_a_steady_request_is_granted_a_dwell_after_it_or_after_the_last_upgrade(
-    before: list[Directive], steady: Directive, dwell: int
-) -> None:
-    asked = before + [steady] * (2 * dwell + 1)
-    state, began = DampedLink(NOTHING), len(before)
-    for i, directive in enumerate(asked):
-        after = damp(state, directive, 0.1 * i, 0.1 * dwell)
-        if i >= len(before) and not asks_at_least(state.enforced, after.enforced):
-            began = i
-        state = after
-        if i >= began + dwell:
-            assert without_place(state.enforced) == without_place(steady)
-    settled = damp(DampedLink(NOTHING), steady, 0.0, 0.1 * dwell)
-    ticks = [settled := damp(settled, steady, 0.1 * i, 0.1 * dwell) for i in range(1, dwell + 1)]
-    assert ticks[-1].enforced == steady
-    if steady.representation:
-        assert not any(link.enforced.representation for link in ticks[:-1]), "from a link at rest after exactly a dwell"
-
-
-def test_a_lower_duty_cycle_passes_at_once_even_where_nothing_flows() -> None:
-    resting = NOTHING._replace(duty_percent=20)
-    assert run(NOTHING, [resting]) == [resting]
-    assert [d.duty_percent for d in run(resting, [NOTHING] * 11)] == [20] * 10 + [100]
-    (first,) = run(NOTHING, [FULL._replace(duty_percent=20)])
-    assert (first.representation, first.duty_percent) == (Representation.NONE, 20)
+    assert enforced[-1] == without_place(steady)
 
 
 def test_a_disc_that_hardly_moved_is_the_same_directive() -> None:
@@ -250,42 +194,108 @@ def test_a_disc_that_hardly_moved_is_the_same_directive() -> None:
     assert damp(state, FULL._replace(roi=Disc(1.0, 1.0, 32)), 0.0, DWELL_S) is state
     assert damp(state, FULL._replace(roi=Disc(1.2, 1.2, 32)), 0.0, DWELL_S).enforced.roi == Disc(1.2, 1.2, 32)
     assert damp(state, FULL._replace(roi=Disc(1.0, 1.0, 31)), 0.0, DWELL_S).enforced.roi == Disc(1.0, 1.0, 31)
+    a = FULL._replace(roi=Disc(0.0, 0.0, 32.0))
+    assert is_switch(a, a._replace(roi=Disc(SAME_DISC_M, 0.0, 32.0)))
+    assert not is_switch(a, a._replace(roi=Disc(0.99 * SAME_DISC_M, 0.0, 32.0)))
+
+
+def test_a_disc_in_force_follows_its_target_and_does_not_grow_before_its_dwell_time() -> None:
+    small = Directive(0, 1, Representation.FEATURES, 0.2, Disc(0, 0, 20), 5.0, reason="small")
+    link = damp(DampedLink(small), small._replace(roi=Disc(50, 10, 40), rho=0.9, rate_hz=10.0), 0.0, 1.0)
+    assert link.enforced.roi == Disc(50, 10, 20)
+    assert (link.enforced.rho, link.enforced.rate_hz) == (0.2, 5.0)
+    asked = small._replace(roi=Disc(60, 10, 40), rho=0.1, rate_hz=10.0)
+    link = damp(link, asked, 0.5, 1.0)
+    assert (link.enforced.roi, link.enforced.rho, link.enforced.rate_hz) == (Disc(60, 10, 20), 0.1, 5.0)
+    link = damp(link, asked, 1.5, 1.0)
+    assert (link.enforced.roi, link.enforced.rate_hz) == (Disc(60, 10, 40), 10.0)
+
+
+@pytest.mark.parametrize("waits", [3, 5])
+def test_an_upgrade_that_waited_begins_with_the_disc_of_the_moment(waits: int) -> None:
+    """A target drives on while its link waits: what is granted is aimed at where it is, and nothing waits any more."""
+    low = Directive(0, 1, Representation.FEATURES, 0.2, Disc(0.0, 0.0, 30.0), 2.0)
+    link = DampedLink(low)
+    for k in range(waits + 1):
+        disc = Disc(2.0 * k, 0.0, 30.0)
+        link = damp(link, low._replace(roi=disc, rate_hz=10.0, deadline_s=0.1 + 0.01 * k), 0.1 * k, 0.1 * waits)
+        assert link.enforced.roi == disc  # also while the rate waits
+        assert link.enforced.rate_hz == (10.0 if k == waits else 2.0)
+    assert link.enforced.deadline_s == pytest.approx(0.1 + 0.01 * waits)
+    assert link.proposals == ()
+
+
+USUAL = Directive(0, 1, Representation.FEATURES, 0.4, Disc(0, 0, 30), 5.0, 0.2, 0.5, 50, "usual")
+STEPS: list[tuple[str, Any, Any]] = [
+    ("representation", Representation.DETECTIONS, Representation.RAW),
+    ("rho", 0.1, 0.9),
+    ("roi", Disc(0, 0, 10), Disc(0, 0, 60)),
+    ("roi", Disc(0, 0, 10), None),
+    ("rate_hz", 2.0, 10.0),
+    ("fusion_weight", 0.25, 1.0),
+    ("duty_percent", 20, 100),
+]
+
+
+def test_each_field_alone_falls_at_once_and_rises_after_its_dwell_time() -> None:
+    for field, less, more in STEPS:
+        down = damp(DampedLink(USUAL), USUAL._replace(**{field: less}), 5.0, 1.0)
+        assert getattr(down.enforced, field) == less
+        up, asked = DampedLink(USUAL), USUAL._replace(**{field: more})
+        for now_s, wanted in ((5.0, getattr(USUAL, field)), (5.9, getattr(USUAL, field)), (6.0, more)):
+            up = damp(up, asked, now_s, 1.0)
+            assert getattr(up.enforced, field) == wanted
+
+
+def test_a_change_that_is_no_climb_reaches_the_gate_at_once_whatever_it_is_of() -> None:
+    """Every field alone and every two together; a deadline that grows asks for no more of the link."""
+    others = {field: less for field, less, _ in STEPS} | {"roi": Disc(60.0, 20.0, 30.0), "deadline_s": 0.4}
+    for fields in [*itertools.combinations(others, 1), *itertools.combinations(others, 2)]:
+        asked = USUAL._replace(**{name: others[name] for name in fields})
+        assert is_switch(USUAL, asked)
+        assert not is_climb(USUAL, asked)
+        assert damp(DampedLink(USUAL), asked, 0.0, DWELL_S).enforced == asked
+
+
+def test_what_is_a_climb() -> None:
+    sends = Directive(0, 1, Representation.FEATURES, 0.5, None, 5.0)
+    slow, fast = BOXES._replace(rate_hz=2.0), BOXES._replace(rate_hz=10.0)
+    climbs = {(slow, sends), (sends, sends._replace(fusion_weight=1.0, rate_hz=6.0)), (sends, fast)}
+    none = {(sends, slow), (sends, sends._replace(deadline_s=5.0)), (NOTHING, NOTHING._replace(rate_hz=3.0))}
+    assert {pair for pair in climbs | none if is_climb(*pair)} == climbs
+
+
+def test_the_cells_of_another_representation_bound_nothing() -> None:
+    """Raw images have no ρ: a policy that alternates them with features keeps its features meanwhile."""
+    features = FULL._replace(representation=Representation.FEATURES, rho=0.5)
+    raw = features._replace(representation=Representation.RAW, rho=0.0)
+    link = DampedLink(features)
+    for tick in range(100):
+        link = damp(link, (raw, features)[tick % 2], tick * 0.1, 1.0)
+        assert (link.enforced.representation, link.enforced.rho) == (Representation.FEATURES, 0.5)
 
 
 # --- the band on what is read ---------------------------------------------------------------------
 
-IN_A_DISC = FULL._replace(roi=Disc(10.0, 20.0, 30.0), fusion_weight=0.5, duty_percent=50, rho=0.5)
-OTHERS = {
-    "representation": Representation.DETECTIONS, "rho": 0.25, "roi": Disc(60.0, 20.0, 30.0), "rate_hz": 5.0,
-    "deadline_s": 0.4, "fusion_weight": 0.25, "duty_percent": 25,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("fields", [*itertools.combinations(OTHERS, 1), *itertools.combinations(OTHERS, 2)])
-def test_a_change_that_is_no_climb_reaches_the_gate_at_once_whatever_it_is_of(fields: tuple[str, ...]) -> None:
-    """Every field alone and every two together; a deadline that grows asks for no more of the link."""
-    asked = IN_A_DISC._replace(**{name: OTHERS[name] for name in fields})
-    assert is_switch(IN_A_DISC, asked)
-    assert not is_climb(IN_A_DISC, asked)
-    assert damp(DampedLink(IN_A_DISC), asked, 0.0, DWELL_S).enforced == asked
-
-
 BAND = 0.25
-HEARD = Descriptor(
-    0, 1, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 42.0, 0.5, 0.5, 0.5,
-    (10.0, 0.0), bytes(64), 0, TaskPhase.SEARCH, None,
-)  # fmt: skip
 FLICKERING = ("battery_soc", "cpu_headroom", "gpu_headroom")
+HEARD = fleet_of(3).descriptors[1]._replace(peer_goodput_mbps=(10.0, 0.0), **dict.fromkeys(FLICKERING, 0.5))
 
 
-def read(values: list[float], field: str = "goodput", band: float = BAND) -> list[float]:
-    """What a drone publishes of one quantity, value by value."""
+def published(values: list[float], field: str = "goodput", band: float = BAND) -> list[Descriptor]:
+    """What a drone publishes, value by value of one quantity."""
     known, seen = None, []
     for value in values:
         heard = HEARD._replace(**({"peer_goodput_mbps": (value, 0.0)} if field == "goodput" else {field: value}))
         known = heard if known is None else apply_hysteresis(known, heard, band)
-        seen.append(known.peer_goodput_mbps[0] if field == "goodput" else getattr(known, field))
+        seen.append(known)
     return seen
+
+
+def read(values: list[float], field: str = "goodput", band: float = BAND) -> list[float]:
+    """What a drone publishes of one quantity, value by value."""
+    seen = published(values, field, band)
+    return [d.peer_goodput_mbps[0] if field == "goodput" else getattr(d, field) for d in seen]
 
 
 @pytest.mark.parametrize("field", ["goodput", *FLICKERING])
@@ -293,6 +303,8 @@ def test_what_falls_is_read_at_once_and_what_rises_by_more_than_the_band(field: 
     assert read([0.8, 0.4, 0.5, 0.45], field) == pytest.approx([0.8, 0.4, 0.4, 0.4])
     assert read([0.4, 0.75, 0.6, 0.5], field) == pytest.approx([0.4, 0.6, 0.6, 0.5])
     assert read([0.4, 0.75], field, band=0.0) == [0.4, 0.75]
+    last = published([0.4, 0.75], field)[-1]
+    assert all(getattr(last, other) == 0.5 for other in FLICKERING if other != field)
 
 
 def test_a_link_that_hovers_about_a_threshold_crosses_it_once() -> None:
@@ -309,6 +321,19 @@ def test_all_else_is_read_as_heard_and_a_roster_that_grew_anew() -> None:
     assert apply_hysteresis(HEARD, more, BAND) == more._replace(battery_soc=pytest.approx(0.72))
 
 
+def test_a_goodput_keeps_its_band_when_members_come_and_go() -> None:
+    """Each peer's is held against its own last one, in whichever place of the list that stands."""
+    me = HEARD._replace(agent_id=2)
+    before = me._replace(peer_goodput_mbps=(10.0, 50.0, 90.0), roster=Roster(1, (0, 1, 2, 5)))
+    now = me._replace(peer_goodput_mbps=(11.0, 30.0, 100.0), roster=Roster(2, (0, 2, 5, 9)))  # to 0, 5 and 9
+    seen = apply_hysteresis(before, now, 0.2)
+    assert seen.goodput_to(0) == 10.0  # a rise within the band
+    assert seen.goodput_to(5) == 30.0  # a fall from 90
+    assert seen.goodput_to(9) == pytest.approx(100 / 1.2)  # new: nothing was published before
+    same = apply_hysteresis(before, before._replace(peer_goodput_mbps=(11.0, 55.0, 120.0)), 0.2)
+    assert same.peer_goodput_mbps == pytest.approx((10.0, 50.0, 100.0))
+
+
 @given(st.lists(st.floats(0, 300), min_size=1, max_size=60), st.floats(0, 3))
 @example([1e-3, 1.5e-3], 1.0)  # states of a link, no rates
 def test_the_band_is_the_play_operator(values: list[float], band: float) -> None:
@@ -317,27 +342,16 @@ def test_the_band_is_the_play_operator(values: list[float], band: float) -> None
     seen = read(values, band=band)
     for u, v in zip(values, seen, strict=True):
         assert u / (1 + band) - 1e-9 <= v <= u
+        assert (state_of(v) == LinkState.UNKNOWN) == (state_of(u) == LinkState.UNKNOWN)
     for (before, v), u in zip(itertools.pairwise(seen), values[1:], strict=True):
         if u > PROBED_MBPS and before <= u <= before * (1 + band) * (1 - 1e-12):
             assert v == before
     assert read([u for u in values for _ in range(3)], band=band)[::3] == seen
 
 
-def test_a_probed_link_is_read_as_heard_since_its_value_is_no_rate() -> None:
-    assert read([SILENT_MBPS, probed_mbps(0.6), probed_mbps(0.7)]) == [SILENT_MBPS, probed_mbps(0.6), probed_mbps(0.7)]
-
-
-@given(st.lists(st.sampled_from([0.0, SILENT_MBPS, 0.002, 4.0, 80.0]), min_size=1, max_size=20), st.floats(0, 3))
-def test_the_band_never_hides_that_a_link_was_measured(values: list[float], band: float) -> None:
-    for heard, seen in zip(values, read(values, band=band), strict=True):
-        assert (state_of(seen) == LinkState.UNKNOWN) == (state_of(heard) == LinkState.UNKNOWN)
-
-
-def test_the_cells_of_another_representation_bound_nothing() -> None:
-    """Raw images have no ρ: a policy that alternates them with features keeps its features meanwhile."""
-    features = FULL._replace(representation=Representation.FEATURES, rho=0.5)
-    raw = features._replace(representation=Representation.RAW, rho=0.0)
-    link = DampedLink(features)
-    for tick in range(100):
-        link = damp(link, (raw, features)[tick % 2], tick * 0.1, 1.0)
-        assert (link.enforced.representation, link.enforced.rho) == (Representation.FEATURES, 0.5)
+def test_a_link_that_was_only_probed_is_read_as_heard_since_its_value_is_no_rate() -> None:
+    heard = [SILENT_MBPS, probed_mbps(0.6), probed_mbps(0.7)]
+    assert read(heard) == heard
+    for values in itertools.product([0.0, SILENT_MBPS, 0.002, 4.0, 80.0], repeat=2):
+        states = [[state_of(v) == LinkState.UNKNOWN for v in seen] for seen in (values, read(list(values), band=2.0))]
+        assert states[0] == states[1]

@@ -1,13 +1,16 @@
-"""The compiled ranking of peers against the plain one: each overlap by itself, then `rank_by_overlap`."""
+"""Overlap of footprints, and the ranking of peers by it: the compiled one against each overlap by itself."""
 
 from __future__ import annotations
 
 import random
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from policies_examples import fleet_of
+from policies_examples import changed, fleet_of
 
+from sortie.policies.catalogue import adaptive
+from sortie.policies.contract import FleetView
 from sortie.policies.geometry import footprint_overlap, peers_by_overlap
 from sortie.scenarios.disc import rank_by_overlap
 
@@ -33,3 +36,25 @@ def test_peers_are_ranked_as_by_each_overlap_alone(drones: int, spread_m: float,
 
 def test_a_drone_that_is_not_in_the_view_ranks_nobody() -> None:
     assert peers_by_overlap(fleet_of(3), 7) == []
+
+
+def test_overlap_is_the_share_of_the_receiver_s_footprint() -> None:
+    """Of drones at different heights the two shares differ; each function takes the same one."""
+    low, high = (fleet_of(2).descriptors[i]._replace(position_m=(0.0, 0.0, 60.0)) for i in (0, 1))
+    low, high = low._replace(footprint_radius_m=20.0), high._replace(footprint_radius_m=40.0)
+    assert footprint_overlap(low, high) == 1.0
+    assert footprint_overlap(high, low) == 0.25
+    third = high._replace(agent_id=2, position_m=(5.0, 0.0, 60.0), footprint_radius_m=30.0)
+    view = FleetView(1, 0.1, {0: low, 1: high, 2: third}, {0: 0.0, 1: 0.0, 2: 0.0})
+    assert peers_by_overlap(view) == [2, 0]  # 0.56 of its footprint, and a quarter
+    assert peers_by_overlap(view, 0) == [1, 2]
+    seen = adaptive.features(view, 0.25)
+    assert seen[2] == pytest.approx((0.25 + footprint_overlap(high, third)) / 2)
+
+
+def test_drones_in_one_place_are_ranked_from_the_receiver_on() -> None:
+    """So that they do not all choose the same peers."""
+    here = changed(fleet_of(5), position_m=(0.0, 0.0, 60.0))
+    for receiver in range(5):
+        wanted = [(receiver + k) % 5 for k in (1, 2, 3, 4)]
+        assert peers_by_overlap(here, receiver) == peers_by_overlap(here._replace(ego=receiver)) == wanted

@@ -12,6 +12,8 @@ from sortie.policies.contract import Descriptor, Directive, Disc, FleetView, Rep
 from sortie.policies.observation import ROW, directives, observe
 from sortie.scenarios.link_state import PROBED_MBPS, SILENT_MBPS
 
+SEARCH, TRACK, LANDING = TaskPhase.SEARCH, TaskPhase.TRACK, TaskPhase.LANDING
+
 
 def test_a_row_tells_the_goodput_to_that_drone_and_not_from_it() -> None:
     view = fleet_of(3)
@@ -30,41 +32,32 @@ def view_of_four() -> FleetView:
     """Drone 1 has heard 0 and 3 of a fleet of four; no two of its numbers are the same."""
     north = (0.0, 0.0, 0.6, 0.8)
     grid = bytes([0b11_10_01_00] * 16) + bytes(48)  # of every four cells one poor, one well, one new
-    each = {
-        1: Descriptor(
-            7, 1, (100.0, -50.0, 60.0), north, (5.0, -2.0, 1.0), 42.0, 0.9, 0.8, 0.7, (20.0, PROBED_MBPS, SILENT_MBPS),
-            grid, 0, TaskPhase.TRACK, Disc(130.0, -90.0, 32.0), (4,),
-        ),
-        0: Descriptor(
-            8, 0, (90.0, -20.0, 75.0), north, (-3.0, 4.0, 0.5), 52.5, 0.6, 0.4, 0.3, (1.0, 2.0, 3.0), bytes(64), 0,
-            TaskPhase.SEARCH, None, (),
-        ),
-        3: Descriptor(
-            9, 3, (5000.0, -50.0, 60.0), north, (0.0, 0.0, 0.0), 35.0, 0.5, 0.2, 0.1, (4.0, 5.0, 6.0),
-            bytes([0b10]) + bytes(63), 0, TaskPhase.LANDING, Disc(100.0, 50.0, 10.0), (),
-        ),
-    }  # fmt: skip
+    links = (20.0, PROBED_MBPS, SILENT_MBPS), (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)
+    west = bytes([0b10]) + bytes(63)
+    at = (100.0, -50.0, 60.0), (90.0, -20.0, 75.0), (5000.0, -50.0, 60.0)
+    one = Descriptor(7, 1, at[0], north, (5.0, -2.0, 1.0), 42.0, 0.9, 0.8, 0.7, links[0], grid, 0, TRACK, None, (4,))
+    zero = Descriptor(8, 0, at[1], north, (-3.0, 4.0, 0.5), 52.5, 0.6, 0.4, 0.3, links[1], bytes(64), 0, SEARCH, None)
+    three = Descriptor(9, 3, at[2], north, (0.0, 0.0, 0.0), 35.0, 0.5, 0.2, 0.1, links[2], west, 0, LANDING, None)
+    regions = Disc(130.0, -90.0, 32.0), Disc(100.0, 50.0, 10.0)
+    each = {1: one._replace(region=regions[0]), 0: zero, 3: three._replace(region=regions[1])}
     return FleetView(1, 0.1, each, {1: 0.0, 0: 0.25, 3: 1.5})
 
 
 def test_every_number_of_an_observation_by_hand() -> None:
     """The ego first, then the others in the order that was asked for; who was not heard has zeros; places end at 1 km."""
     phases = {p: [float(p == q) for q in TaskPhase] for p in TaskPhase}
+    moves = {1: [0, 0, 0, 0.5, -0.2, 0.1], 0: [-0.1, 0.3, 0.15, -0.3, 0.4, 0.05], 3: [10.0, 0, 0, 0, 0, 0]}
+    states = {
+        1: [0.42, 0.9, 0.8, 0.7, 0.0, 0.0],
+        0: [0.525, 0.6, 0.4, 0.3, 0.2, 1.0],
+        3: [0.35, 0.5, 0.2, 0.1, SILENT_MBPS / 100, 1 / 3],
+    }
     wanted = {
-        1: [
-            1, 0.0, 0, 0, 0, 0.5, -0.2, 0.1, 0.42, 0.9, 0.8, 0.7, 0.0, 0.0, *phases[TaskPhase.TRACK],
-            1, 0.3, -0.4, 0.32, 32 / 256, 1,
-        ],
-        0: [
-            1, 0.25, -0.1, 0.3, 0.15, -0.3, 0.4, 0.05, 0.525, 0.6, 0.4, 0.3, 0.2, 1.0, *phases[TaskPhase.SEARCH],
-            0, 0, 0, 0, 0, 0,
-        ],
+        1: [1, 0.0, *moves[1], *states[1], *phases[TRACK], 1, 0.3, -0.4, 0.32, 32 / 256, 1],
+        0: [1, 0.25, *moves[0], *states[0], *phases[SEARCH], 0, 0, 0, 0, 0, 0],
         2: [0.0] * ROW,
-        3: [
-            1, 1.5, 10.0, 0, 0, 0, 0, 0, 0.35, 0.5, 0.2, 0.1, SILENT_MBPS / 100, 1 / 3, *phases[TaskPhase.LANDING],
-            1, 0, 1.0, 0.1, 1 / 256, 0,
-        ],
-    }  # fmt: skip
+        3: [1, 1.5, *moves[3], *states[3], *phases[LANDING], 1, 0, 1.0, 0.1, 1 / 256, 0],
+    }
     view = view_of_four()
     for others in ([0, 2, 3], [3, 0]):
         seen = observe(view, others)
