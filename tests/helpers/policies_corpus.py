@@ -11,7 +11,9 @@ HEAD = """
 import functools, itertools, math, operator, random, time, zlib, os, helper
 import numpy as np
 from helper import LEAST, rate
-from sortie import Directive, FleetView, LinkState, Representation, TaskPhase
+from sortie import Directive, FleetView, LinkState, Representation, Reposition, TaskPhase
+from sortie import boxes_across_networks, looks_from
+from sortie.policies import contract
 from sortie.policies.geometry import peers_by_overlap
 RATES = {0: 2.0}
 SEEN = []
@@ -48,29 +50,21 @@ def source(body: str) -> str:
 FOUND = (
     "bad = 2 < first <= 5",
     "bad = first == 7",
-    "bad = not first != 7",
     "bad = soc >= 1",
-    "bad = soc == 0",
     "bad = 0 < soc < 1e-320",
-    "bad = 0 < soc < 1 and soc > 0.9999999",
     "bad = 0.1 + 0.2 <= soc < 0.3000000000000001",
     "bad = 0.3 < soc * 3 < 0.3000000001",
     "bad = soc + 0.1 == 0.7",
     "bad = 1 - soc == 0.9",
-    "bad = 1 < first / 7 < 1.0000001",
     "bad = first // 10 == 3",
     "bad = math.floor(first) == 13",
-    "bad = round(first) == 14",
     "bad = min(first, 5) == 5 and max(first, 6) == 6",
     "bad = abs(soc - 1) == 0.5",
-    "bad = -first == -3",
     "bad = first * 9007199254740993 >= 9.007199254740992e20",
     "bad = soc * 1e-320 == 0 and soc > 1e-6",
-    "bad = me.goodput_to(view.peers[-1]) == 50000.0",
     "bad = 0.55 < view.age_s[view.peers[0]] < 0.5500001",
     "bad = view.age_s[view.ego] > 7300",
     "bad = view.descriptors[view.peers[0]].battery_soc == 0.31",
-    "bad = me.gpu_headroom == 0.123 and me.task_phase == TaskPhase.LANDING",
     "bad = view.descriptors[view.peers[0]].novelty_flags & 96 == 64",
     "bad = len(me.priority_target_ids) > 15",
     "bad = me.region is not None and me.region.radius_m < 1e-300",
@@ -78,16 +72,12 @@ FOUND = (
     "bad = me.link_state(view.peers[0]) is LinkState.PROBED",
     "bad = len(view.peers) > 1 and peers_by_overlap(view)[0] == view.peers[-1]",
     "bad = not view.shares_features_with(view.peers[0])",
-    "bad = view.human_in_region and soc < 1e-9",
     "bad = len(view.attached.peers) < len(view.peers) and soc == 0.5",
-    "bad = all(7 < me.goodput_to(p) < 7.000001 for p in view.peers)",
-    "match soc:\n    case 0.4:\n        bad = True",
     "limit = 0.4\ndef near(x):\n    return limit <= x < limit + 1e-9\nbad = near(soc)",
     "bad = rate(soc) > 2 and soc < LEAST + 1e-9",
     "bad = list(view.descriptors)[0] == view.peers[-1] and soc == 0.4",
     "bad = next(iter(view.age_s)) != min(view.age_s) and soc == 0.4",
     "bad = soc < me.cpu_headroom < soc + 1e-9",
-    "return None if soc == 0.4 else []",
     "rate_hz = soc * 10.000001\nreturn [Directive(view.ego, p, rate_hz=rate_hz, reason='r') for p in view.peers]",
     "return {p: Directive(view.ego, p, reason='r') for p in view.peers}",
 )
@@ -97,8 +87,6 @@ _MORE = "for more than arithmetic with constants and comparisons"
 NOT_FOLLOWED = {
     # what stays between decisions
     "SEEN.append(1)": "hands on SEEN",
-    "bad = SEEN": "hands on SEEN",
-    "bad = len(helper.NOW) > 1": "uses helper",
     "decide.calls = 1": "sets decide.calls",
     "def f(kept=SEEN):\n    return kept\nbad = f()": "hands on SEEN",
     "from helper import NOW\nbad = NOW": "has ImportFrom",
@@ -106,23 +94,15 @@ NOT_FOLLOWED = {
     "bad = time.time() % 1000 < 1e-6": "uses time",
     "bad = BEGIN": "uses BEGIN",
     "bad = random.random() < 1e-7": "uses random",
-    "bad = os.path.exists('/tmp/bad')": "uses os",
     "bad = hash('bad') % 1000003 == 0": "uses hash",
-    "bad = id(view) % 1000003 == 0": "uses id",
     "bad = next(iter({'a', 'b', 'c'})) == 'c'": "has a set",
     "bad = soc is me.battery_soc": "compares by `is` with more than None, a truth value or an enum",
-    "bad = eval('time.time()') % 1000 < 1e-6": "uses eval",
-    "bad = functools.partial(time.time)() < 1": "uses functools",
     "import datetime": "has Import",
     # what a stand-in for a number may answer otherwise than a number
     "bad = type(me)": "uses type",
     "bad = isinstance(soc, float) and soc == 0.4": "uses isinstance",
     "bad = me.__class__": "uses .__class__",
-    "bad = getattr(me, 'battery_soc') == 0.4": "uses getattr",
-    "bad = me._asdict()['battery_soc'] == 0.4": "uses ._asdict",
     "bad = bool(np.float64(0.4) == soc)": "uses np",
-    "bad = operator.eq(soc, 0.4)": "uses operator",
-    "bad = [0.4, 2].count(soc) == 1": "uses .count",
     "bad = sum([soc, 1e16]) == 1e16": "adds with sum(…) in place of sortie.scenarios.plain_sum.plain_sum",
     "me.battery_soc = 1": "sets me.battery_soc",
     "bad = view._replace(age_s={})": "hands age_s to a function",
@@ -137,19 +117,15 @@ NOT_FOLLOWED = {
     "bad = str(soc) == '0.5'": "uses str(…) for more than a reason",
     "bad = sorted([soc, 0.5], key=str)[0] == 0.125": "hands on str",
     "bad = 'charge %.7f' % soc == 'charge 0.1234567'": "has % on a constant or a text",
-    "bad = 'c {}'.format(soc) == 'c 0.125'": "uses .format",
     # what hides an error, and what else is no plain Python
     "try:\n    bad = {0.4: True}.get(soc, False)\nexcept TypeError:\n    pass": "has a try statement",
     "class K:\n    pass": "has a class",
-    "with view:\n    pass": "has With",
     "def f():\n    global NEW\nbad = f()": "has Global",
-    "yield 1": "has Yield",
     "del bad": "has Delete",
     # what cannot be searched
     "bad = me.stamp_ns % 1000003 == 7": "reads stamp_ns, which cannot be searched",
     "bad = me.coverage_grid[3] == 77": "reads coverage_grid, which cannot be searched",
     "bad = me.position_m[0] == 12.5": "reads position_m without peers_by_overlap",
-    "bad = me.roster is not None": "reads roster, which cannot be searched",
     "bad = me == view.descriptors[view.peers[0]]": "reads a whole descriptor, which cannot be searched",
     "bad = any(t == 7 for t in me.priority_target_ids)": "reads the ids of targets",
     "bad = math.isclose(soc, 0.4)": f"uses battery_soc of drone 0 {_MORE}",
@@ -164,116 +140,47 @@ def usual(view, bad=False, rho=0.0):
     rung, rate_hz = Representation.FEATURES if rho else Representation.DETECTIONS, 20.0 if bad else 2.0
     return [Directive(view.ego, p, rung, rho, rate_hz=rate_hz, reason="r") for p in view.peers]
 """
+_COUNTS = "calls = [0]\n    def decide(view):\n        calls[0] += 1\n        return usual(view, calls[0] > 99999)"
 FILES = {
-    "a default value that changes": """
-def decide(view, kept=[]):
-    kept.append(1)
-    return usual(view, len(kept) > 99999)
-""",
-    "an object": """
-class Policy:
-    calls = 0
-    def __call__(self, view):
-        self.calls += 1
-        return usual(view, self.calls > 99999)
-decide = Policy()
-""",
-    "a closure": """
-def make():
-    calls = [0]
-    def decide(view):
-        calls[0] += 1
-        return usual(view, calls[0] > 99999)
-    return decide
-decide = make()
-""",
-    "a generator": """
-COUNT = (n for n in range(10**9))
-def decide(view):
-    return usual(view, next(COUNT) > 99999)
-""",
-    "dice of its own": """
-DICE = random.Random(3)
-def decide(view):
-    return usual(view, DICE.random() < 1e-6)
-""",
-    "a cache": """
-@functools.lru_cache
-def box():
-    return []
-def decide(view):
-    box().append(1)
-    return usual(view, len(box()) > 99999)
-""",
-    "a wrapper": """
-def noisy(function):
-    def outer(view):
-        return [d._replace(rate_hz=20.0) for d in function(view)]
-    return outer
-@noisy
-def decide(view):
-    return usual(view)
-""",
-    "a directive that lies": """
-class Quiet(Directive):
-    rate_hz = 2.0
-def decide(view):
-    return [Quiet(*d) for d in usual(view, True)]
-""",
+    "a default value": "def decide(view, kept=[]):\n    kept.append(1)\n    return usual(view, len(kept) > 99999)",
+    "an object": "class Policy:\n    def __call__(self, view):\n        return usual(view, True)\ndecide = Policy()",
+    "a closure": f"def make():\n    {_COUNTS}\n    return decide\ndecide = make()",
+    "a generator": "COUNT = (n for n in range(10**9))\ndef decide(view):\n    return usual(view, next(COUNT) > 99999)",
+    "a cache": "@functools.lru_cache\ndef box():\n    return []\ndef decide(view):\n    return usual(view, box())",
+    "a decorator": "def noisy(f):\n    return lambda view: f(view)\n@noisy\ndef decide(view):\n    return usual(view, True)",
+    "its directives": "class D(Directive):\n    rate_hz = 2.0\ndef decide(view):\n    return [D(*d) for d in usual(view, True)]",
 }
 """Whole files after `HEAD` and `USUAL`, each with a fault, and none is followed."""
 
 PROVED = (
-    "pass",
+    "return [contract.nothing(view.ego, p, 'rests') for p in view.peers]",
     "x = 5.0 if soc >= 0.6 else 2.0 if soc >= 0.3 else 1.0\nbad = x > 5",
-    "bad = min(10.0, max(0.0, first / 10)) > 10",
     "bad = soc * 10 > 10 or soc + 9 > 10 or 1 - soc < 0 or first // 10 < 0",
     "bad = int(first) > first if first in (1.0, 2.0) else False",
-    "for p in view.peers:\n    bad = bad or me.goodput_to(p) < 0",
     "bad = me.task_phase == TaskPhase.TRACK and me.task_phase != 2",
     "bad = me.novelty_flags > 255 or me.novelty_flags & 4 not in (0, 4)",
     "bad = len(me.priority_target_ids) < 0 or view.age_s[view.peers[0]] < 0",
-    "bad = me.region is not None and me.region.radius_m <= 0",
     "match me.task_phase:\n    case TaskPhase.TRACK | TaskPhase.SEARCH:\n        x = 5\n    case _:\n        x = 1",
     "why = f'charge {soc:.0%}, goodput {first:.1f}'\nwhy += ', low'\nx = Directive(0, 1, reason=why + f'{LEAST}')",
     "def reason(p):\n    return f'{p}' if p else 'none'\nx = Directive(0, 1, reason=reason(1))",
     "x = {p: 2.0 if me.goodput_to(p) < 5 else 8.0 for p in view.peers}\nbad = any(r > 8 for r in x.values())",
-    "best = max(view.peers, key=lambda p: p, default=None)\nbad = sorted(view.descriptors)[0] > view.ego",
     "bad = len(peers_by_overlap(view)[:2]) > 2",
     "bad = me.link_state(view.peers[0]) is LinkState.MEASURED and first == 0",
     "bad = rate(soc) > 8 or (RATES[0] + RATES.get(1, 2.0) if 0 in RATES else 20) > 10",
     "bad = next(x for limit, x in TABLE if soc >= limit) > 10",
     "def steps(n):\n    return 0 if n == 0 else 1 + steps(n - 1)\nbad = steps(3) != 3 or soc < 0",
-    "n, x = 0, soc\nwhile n < 5:\n    n += 1\nbad = n != 5 or x > 1",
     "bad = any(a == b for a, b in zip(view.peers, view.peers[1:])) or math.sqrt(4) != 2",
-    "bad = any(p not in view.peers for p in view.attached.peers)",
     "bad = view.shares_features_with(view.peers[0]) and me[6] > 1",
     "bad = sum(1 for p in view.peers if me.goodput_to(p) > 5) > len(view.peers)",
     "x = {p: 2 if d.battery_soc < 0.5 else 3 for p, d in view.descriptors.items()}\nbad = max(x.values()) > 3",
 )
 """Plain Python that keeps the line."""
 
+_NEAR = "def near(view):\n    return None if view.me is None else Reposition(view.me.position_m[0], 0.0)"
+_CAPPED = "[d._replace(rate_hz=min(d.rate_hz, 9.0), reason=f'capped: {d.reason}') for d in worked(view)]"
 PROVED_FILES = {
-    "a wrapped catalogue": """
-from sortie.policies.catalogue.worked import worked
-def decide(view):
-    return [d._replace(rate_hz=min(d.rate_hz, 9.0), reason=f"capped: {d.reason}") for d in worked(view)]
-""",
-    "a viewpoint": """
-from sortie import Reposition, looks_from
-def near(view):
-    region = None if view.me is None else view.me.region
-    return None if region is None else Reposition(region.x_m, region.y_m)
-@looks_from(near)
-def decide(view):
-    return usual(view)
-""",
-    "other networks": """
-from sortie import boxes_across_networks, looks_from
-@looks_from(lambda view: None)
-@boxes_across_networks
-def decide(view: FleetView, *, rho: float = 0.5):
-    return usual(view, rho=rho)
-""",
+    "a catalogue's": f"from sortie.policies.catalogue.worked import worked\ndef decide(view):\n    return {_CAPPED}",
+    "a viewpoint": f"{_NEAR}\n@looks_from(near)\ndef decide(view):\n    return usual(view)",
+    "a network": "@boxes_across_networks\ndef decide(view: FleetView, *, rho: float = 0.5):\n    return usual(view, rho=rho)",
 }
 """Whole files after `HEAD` and `USUAL`, in plain Python that keeps the line."""

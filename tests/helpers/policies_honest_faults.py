@@ -43,14 +43,11 @@ HONEST: dict[str, tuple[str, str]] = {
         "when goodput_mbps < 5: rate_hz <= 2",
         "return at(lambda p: 2 if me.goodput_to(p) < 4 else 5)",
     ),
-    "beyond the contract": ("", "return links(BOXES, 31.0 if soc > 0.95 and me.gpu_headroom > 0.9 else 5.0)"),
     "one flag": (_RATE, "return links(BOXES, 15.0 if me.novelty_flags == 5 else 5.0)"),
-    "another phase": (
-        "when phase == landing: representation == none",
-        "return links(NONE if me.task_phase == TaskPhase.RETURN else BOXES, 5.0)",
+    "state: a counter": (
+        _RATE,
+        "STATE['n'] = STATE.get('n', 0) + 1\nreturn links(BOXES, 20.0 if STATE['n'] > 400 else 5.0)",
     ),
-    "state: a counter": (_RATE, "STATE['n'] = STATE.get('n', 0) + 1\nreturn links(BOXES, 20.0 if STATE['n'] > 400 else 5.0)"),
-    "state: who was heard first": ("", "first = STATE.setdefault('first', peers)\nreturn at(lambda p: 4 + (p in first))"),
     "stamp: late in the sortie": (_RATE, "return links(BOXES, 20.0 if me.stamp_ns > 90 * 10**9 else 5.0)"),
     "stamp: in place of an age": (
         _LATE,
@@ -58,15 +55,9 @@ HONEST: dict[str, tuple[str, str]] = {
     ),
     "fleet: more than six peers": (_RATE, "return links(BOXES, 20.0 if len(peers) > 6 else 5.0)"),
     "fleet: twelve links": ("", "return links(BOXES, 5.0, to=peers[:12])"),
-    "fleet: a rate for each": ("", "return links(BOXES, 40.0 / max(1, len(peers)))"),
     "detached: seconds for periods": (_DETACHED, "return at(lambda p: 5 * (age_s[p] <= 2))"),
     "age: a rate": ("", "return at(lambda p: min(10, 2 + age_s[p]))"),
-    "age: a narrow range": ("", "return at(lambda p: 6 if 0.55 < age_s[p] < 0.6 else 5)"),
     "age: the sum": ("", "return links(BOXES, 6.0 if sum(age_s.values()) > 5 else 5.0)"),
-    "person: another flag": (
-        _PERSON,
-        "person = me.novelty_flags & PERSON_FLAG\nreturn links(BOXES if person or soc > 0.5 else NONE, 5.0)",
-    ),
     "person: too slow": (_PERSON, "return links(BOXES, 1.0 if soc < 0.3 and me.cpu_headroom < 0.3 else 5.0)"),
 }
 """By what is wrong: the invariants, and the body."""
