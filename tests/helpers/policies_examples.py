@@ -47,11 +47,6 @@ def by_peer(directives: Sequence[Directive]) -> dict[int, Directive]:
     return {d.destination: d for d in directives}
 
 
-def planted(name: str) -> Policy:
-    """A policy of `policies_planted.py`, loaded as a user's file is."""
-    return resolve(f"{Path(__file__).with_name('policies_planted.py')}:{name}")
-
-
 def written(folder: Path, text: str, params: Mapping[str, object] | None = None) -> Policy:
     """The function `decide` of a text, loaded as a user's file is."""
     path = folder / "policy.py"

@@ -137,7 +137,11 @@ def test_an_answer_of_the_same_objects_has_nothing_new(make: Callable[..., Any])
 
 def test_what_a_whole_check_refuses_or_what_is_not_plainly_the_same_links_goes_to_a_whole_check() -> None:
     slow = FIRST._replace(rate_hz=2.0)
-    twice: list[Sequence[Any]] = [[FIRST, FIRST, *REST], [FIRST, slow, *REST], [slow, FIRST._replace(rate_hz=5.0), *REST]]
+    twice: list[Sequence[Any]] = [
+        [FIRST, FIRST, *REST],
+        [FIRST, slow, *REST],
+        [slow, FIRST._replace(rate_hz=5.0), *REST],
+    ]
     other = {"destination": VIEW.ego}, {"destination": 99}, {"destination": [1]}, {"source": 99}, {"rho": 1.5}
     fields = [[FIRST, SECOND._replace(**change), *REST] for change in (*other, {"rate_hz": NAN})]
     for answer in (*twice, *fields, [FIRST, tuple(SECOND), *REST], [FIRST, None, *REST], iter(ANSWER), None):

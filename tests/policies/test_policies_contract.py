@@ -12,12 +12,14 @@ from policies_examples import aged, changed, fleet_of, without
 
 from sortie.perception import budget
 from sortie.perception.geometry import CELLS, CHANNELS
+from sortie.policies.catalogue.coverage_cells import well_cells
 from sortie.policies.contract import (
     FEATURE_CELL_BYTES,
     FEATURE_CELLS,
     FEATURE_MAP_MEGABITS,
     OTHER_NETWORK,
     PERSON_FLAG,
+    Coverage,
     Directive,
     Disc,
     FleetView,
@@ -25,6 +27,8 @@ from sortie.policies.contract import (
     Roster,
     TaskPhase,
     boxes_across_networks,
+    nothing,
+    nothing_to_all,
 )
 from sortie.policies.staleness import LinkHealth, health
 from sortie.policies.verification.invariants.language import WORDS, Scope
@@ -170,3 +174,16 @@ def test_where_all_have_one_network_a_policy_s_answer_is_handed_on_as_it_is() ->
 
     assert policy(fleet_of(3), rho=0.25) is answer
     assert {d.rho for d in answer} == {0.25}
+
+
+def test_equal_arguments_of_other_types_leave_nothing_behind() -> None:
+    """What one decision asked for must not change what the next one gets."""
+    for other in (901.0, TaskPhase.TRACK):
+        same = int(other)
+        assert type(nothing(other, 7, "r").source) is type(other)  # type: ignore[arg-type]
+        assert type(nothing(same, 7, "r").source) is int
+        assert type(nothing_to_all(same, (other,), "r")[0].destination) is type(other)
+        assert type(nothing_to_all(same, (same,), "r")[0].destination) is int
+    assert type(min(well_cells(bytes([255]), 3.0, 4, Coverage.POOR))[0]) is float  # type: ignore[arg-type]
+    assert type(min(well_cells(bytes([255]), 3, 4, Coverage.POOR))[0]) is int
+    assert nothing(901, 7, "r") is nothing(901, 7, "r")

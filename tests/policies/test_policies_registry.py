@@ -45,7 +45,9 @@ def refusal(name: str, params: dict[str, object] | None = None) -> str:
 
 def test_a_parameter_out_of_bounds_is_named_before_anything_flies() -> None:
     found = {(name, key): refusal(name, {key: value}) for name, key, value, _ in OUT_OF_BOUNDS}
-    wanted = {(name, key): f"{name}: {key} is {value!r}, must be {allowed}" for name, key, value, allowed in OUT_OF_BOUNDS}
+    wanted = {
+        (name, key): f"{name}: {key} is {value!r}, must be {allowed}" for name, key, value, allowed in OUT_OF_BOUNDS
+    }
     assert found == wanted
     assert resolve("best-2", {"received_budget": np.float32(0.5), "k": np.int64(3)})(fleet_of(5))
 

@@ -92,7 +92,9 @@ def changes_its_input(view: FleetView) -> Reposition | None:
         (lambda view: place_of(view, view.descriptors[view.ego].battery_soc), "its viewpoint raises KeyError"),
     ],
 )
-def test_the_kit_finds_what_a_viewpoint_does_wrong(look: Callable[[FleetView], Reposition | None], complaint: str) -> None:
+def test_the_kit_finds_what_a_viewpoint_does_wrong(
+    look: Callable[[FleetView], Reposition | None], complaint: str
+) -> None:
     @looks_from(look)
     def decide(view: FleetView) -> list[Directive]:
         return everyone(view)

@@ -178,7 +178,11 @@ def test_of_equal_drones_the_next_after_the_receiver_serves_it() -> None:
     view = changed(one_place(4), coverage_grid=bytes(64))
     assert [serving(view, receiver) for receiver in range(4)] == [[1], [2], [3], [0]]
     appointed = {
-        receiver: [i for i in range(4) if i != receiver and by_peer(POLICIES["who2com-style"](view._replace(ego=i)))[receiver].rate_hz]
+        receiver: [
+            i
+            for i in range(4)
+            if i != receiver and by_peer(POLICIES["who2com-style"](view._replace(ego=i)))[receiver].rate_hz
+        ]
         for receiver in range(4)
     }
     assert appointed == {receiver: [(receiver + 1) % 4] for receiver in range(4)}

@@ -11,5 +11,8 @@ from sortie.policies.verification.kit.views import to_json
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_a_policy_keeps_the_contract(name: str) -> None:
-    shown = {c.name: (c.what, c.counterexample and to_json(c.counterexample)) for c in failing(conform(POLICIES[name], count=100))}
+    shown = {
+        c.name: (c.what, c.counterexample and to_json(c.counterexample))
+        for c in failing(conform(POLICIES[name], count=100))
+    }
     assert shown == {}

@@ -49,7 +49,8 @@ def test_what_no_proof_follows_is_named_with_its_line_and_never_proved(tmp_path:
 
 def test_state_in_whatever_a_policy_is_made_of_is_not_followed(tmp_path: Path) -> None:
     texts = {name: corpus.HEAD + corpus.USUAL + text for name, text in corpus.FILES.items()}
-    assert {name: outcomes(verify(tmp_path, text)) for name, text in texts.items()} == dict.fromkeys(texts, {"tried"})
+    found = {name: outcomes(verify(tmp_path, text)) for name, text in texts.items()}
+    assert {name: said for name, said in found.items() if said != {"tried"}} == {}
 
 
 def test_correct_policies_in_plain_python_are_proved(tmp_path: Path) -> None:

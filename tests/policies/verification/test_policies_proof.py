@@ -99,8 +99,7 @@ FAULTS = {
         ["refuted", "proved", "refuted"],
         "directive 0→1: rate_hz is '10', must be in [0, 30], a number",
     ),
-    "tired = 0.12 < me.battery_soc < 0.12001\n"
-    "return [d._replace(reason=5) if tired else d for d in everyone(view)]": (
+    "tired = 0.12 < me.battery_soc < 0.12001\nreturn [d._replace(reason=5) if tired else d for d in everyone(view)]": (
         "rate_hz <= 10",
         ["refuted", "proved", "proved"],
         "directive 0→1: reason is 5, must be text",
@@ -169,7 +168,9 @@ def test_a_proof_says_what_it_covers_and_drawn_views_try_the_rest() -> None:
 
 def test_without_the_solver_the_verdict_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     best = "best = max(view.peers, key=me.goodput_to, default=None)\n"
-    policy = decides(tmp_path, f"{best}return [d._replace(rate_hz=5.0 * (d.destination == best)) for d in everyone(view)]")
+    policy = decides(
+        tmp_path, f"{best}return [d._replace(rate_hz=5.0 * (d.destination == best)) for d in everyone(view)]"
+    )
     monkeypatch.setitem(sys.modules, "z3", None)
     verdict = quick(policy, drones=3)[0]
     assert verdict.outcome == "tried"

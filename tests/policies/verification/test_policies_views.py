@@ -95,7 +95,12 @@ def test_fleets_are_as_large_as_the_constants_of_a_policy() -> None:
 
 
 def test_a_view_survives_json_exactly() -> None:
-    own = {"roster": Roster(6, (0, 1, 2)), "priority_target_ids": (4, 5), "codebook": "0" * 14, "feature_space": "other"}
+    own = {
+        "roster": Roster(6, (0, 1, 2)),
+        "priority_target_ids": (4, 5),
+        "codebook": "0" * 14,
+        "feature_space": "other",
+    }
     numbers = {"stamp_ns": 123, "orientation_xyzw": (0.1, 0.2, 0.3, 0.4), "region": Disc(1.5, -2.5, 3.5)}
     one = fleet_of(3).descriptors[1]._replace(coverage_grid=bytes(range(64)), **own, **numbers)
     precise = FleetView(2, 0.1234567890123, {**fleet_of(3).descriptors, 1: one}, {0: 0.1, 1: 0.2, 2: 0.3}, 7.000000001)
