@@ -1,4 +1,4 @@
-"""Tables of users: however spreadsheets and programs write them, they are read, or refused with the row and the column."""
+"""Tables and traces of users: however programs write them, they are read, or refused with the row and the column."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from places import ROOT
 
-from sortie.scenarios.reading.campaign import load_campaign
-from sortie.scenarios.reading.nodes import ScenarioError
+from sortie.scenarios.reading.load import load
+from sortie.scenarios.shipped import TRACES, located
 from sortie.scenarios.tables import TableError, read_numbers
+from sortie.scenarios.traces import TraceError, check_increasing, read_columns
 
 WRITTEN = {
     "plain": b"t_s,x_m\n0,1.5\n1,-2\n",
@@ -29,42 +31,48 @@ WRITTEN = {
 }
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".TSV", ""])
-@pytest.mark.parametrize("text", WRITTEN.values(), ids=WRITTEN)
-def test_all_ways_to_write_a_table_are_one_table(text: bytes, suffix: str, tmp_path: Path) -> None:
-    path = tmp_path / f"a{suffix}"
-    path.write_bytes(text)
-    columns, _ = read_numbers(path, ["t_s", "x_m", "y_m"])
-    assert {name: values.tolist() for name, values in columns.items()} == {"t_s": [0.0, 1.0], "x_m": [1.5, -2.0]}
+def test_all_ways_to_write_a_table_are_one_table(tmp_path: Path) -> None:
+    wrong = {}
+    for name, suffix in [*((name, ".csv") for name in WRITTEN), ("semicolons", ".TSV"), ("tabs", "")]:
+        path = tmp_path / f"a{suffix}"
+        path.write_bytes(WRITTEN[name])
+        columns, _ = read_numbers(path, ["t_s", "x_m", "y_m"])
+        found = {column: values.tolist() for column, values in columns.items()}
+        if found != {"t_s": [0.0, 1.0], "x_m": [1.5, -2.0]}:
+            wrong[name] = found
+    assert wrong == {}
 
 
-@pytest.mark.parametrize("cell", ["", " ", "NaN", "nan", "NA", "N/A", "null", '""'])
-def test_empty_cells_hold_no_number(cell: str, tmp_path: Path) -> None:
+def test_empty_cells_hold_no_number(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    path.write_text(f"t_s,x_m\n0,{cell}\n1,2\n")
-    np.testing.assert_array_equal(read_numbers(path, ["x_m"])[0]["x_m"], [np.nan, 2.0])
+    for cell in ("", " ", "NaN", "nan", "NA", "N/A", "null", '""'):
+        path.write_text(f"t_s,x_m\n0,{cell}\n1,2\n")
+        np.testing.assert_array_equal(read_numbers(path, ["x_m"])[0]["x_m"], [np.nan, 2.0])
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("t_s,x_m\n0,1\n\n1,abc\n", "x_m in row 2 is 'abc', must be a number"),
-        ('t_s,x_m\n0,1\n1,"1,5"\n', "x_m in row 2 is '1,5', must be a number"),
-        ("t_s;x_m\n0;1,5\n1;2.5\n", "x_m in row 1 is '1,5', and the column has points too: must be one of them"),
-        ("t_s;x_m\n0;1\n1;1.000,5\n", "x_m in row 2 is '1.000,5', and the column has points too: must be one of them"),
-        ("t_s,x_m\n0,1\n1,2,\n", "row 2 has 3 cells, must have 2, as the names"),
-        ("t_s,x_m\n0\n", "row 1 has 1 cells, must have 2, as the names"),
-        ("t_s,x_m, X_M\n0,1,2\n", "2 columns x_m, must be one at most"),
-        ("t_s,x_m\n0,true\n", "x_m in row 1 is 'true', must be a number"),
-        ("t_s,x_m\n0,2026-01-01\n", "x_m in row 1 is '2026-01-01', must be a number"),
-    ],
-)
-def test_what_is_no_table_of_numbers_names_row_and_column(text: str, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text(text)
-    with pytest.raises(TableError) as error:
-        read_numbers(path, ["x_m"])
-    assert str(error.value) == f"{path}: {message}"
+BROKEN = {
+    b"t_s,x_m\n0,1\n\n1,abc\n": "x_m in row 2 is 'abc', must be a number",
+    b't_s,x_m\n0,1\n1,"1,5"\n': "x_m in row 2 is '1,5', must be a number",
+    b"t_s;x_m\n0;1,5\n1;2.5\n": "x_m in row 1 is '1,5', and the column has points too: must be one of them",
+    b"t_s;x_m\n0;1\n1;1.000,5\n": "x_m in row 2 is '1.000,5', and the column has points too: must be one of them",
+    b"t_s,x_m\n0,1\n1,2,\n": "row 2 has 3 cells, must have 2, as the names",
+    b"t_s,x_m\n0\n": "row 1 has 1 cells, must have 2, as the names",
+    b"t_s,x_m, X_M\n0,1,2\n": "2 columns x_m, must be one at most",
+    b"t_s,x_m\n0,true\n": "x_m in row 1 is 'true', must be a number",
+    b"t_s,x_m\n0,2026-01-01\n": "x_m in row 1 is '2026-01-01', must be a number",
+    b"t_s,x_m\n0,1\n1,\xb2,3\n": "is not a .csv table: ",
+}
+
+
+def test_what_is_no_table_of_numbers_names_row_and_column(tmp_path: Path) -> None:
+    path, wrong = tmp_path / "a.csv", {}
+    for text, message in BROKEN.items():
+        path.write_bytes(text)
+        with pytest.raises(TableError) as error:
+            read_numbers(path, ["x_m"])
+        if not str(error.value).startswith(f"{path}: {message}"):
+            wrong[text] = str(error.value)
+    assert wrong == {}
 
 
 def test_parquet_has_the_same_names(tmp_path: Path) -> None:
@@ -80,21 +88,59 @@ def test_parquet_has_the_same_names(tmp_path: Path) -> None:
         read_numbers(path, ["at"])
 
 
-def test_a_campaign_s_table_is_read_alike(tmp_path: Path) -> None:
-    """Its column may hold words too; a value that the scenario refuses is named with its row."""
-    (tmp_path / "base.yaml").write_text("name: base\n")
-    (tmp_path / "v.csv").write_bytes(b"\xef\xbb\xbfPower; word\r\n10;a,b\r\n\r\n12,5;c\r\n")
-    vary = "{radio.tx_power_dbm: {kind: column, file: v.csv, column: power}, "
-    vary += "description: {kind: column, file: v.csv, column: Word}}"
-    (tmp_path / "c.yaml").write_text(f"campaign: c\nbase: base.yaml\nmetrics: [bytes.data_sent]\nvary: {vary}\n")
-    assert load_campaign(tmp_path / "c.yaml").columns == {"radio.tx_power_dbm": (10, 12.5), "description": ("a,b", "c")}
-    (tmp_path / "v.csv").write_text("power,word\n10,a\nmuch,b\n")
-    with pytest.raises(ScenarioError, match=r"radio.tx_power_dbm: much, must be a number \(v.csv: power in row 2\)$"):
-        load_campaign(tmp_path / "c.yaml")
+# --- traces ---------------------------------------------------------------------------------------
 
 
-def test_a_row_of_another_width_that_is_no_utf8_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "v.csv"
-    path.write_bytes(b"t_s,x_m\n0,1\n1,\xb2,3\n")
-    with pytest.raises(TableError, match=r"v\.csv: is not a \.csv table: .*Row #2: Expected 2 columns, got 3"):
-        read_numbers(path, ["t_s"])
+def test_a_trace_in_another_encoding_or_with_a_column_twice_is_one_line(tmp_path: Path) -> None:
+    path, bounds = tmp_path / "trace.csv", {"t_s": (0.0, 1.0), "x_m": (0.0, 1.0)}
+    latin, twice = "t_s,höhe_m\n0,1\n".encode("latin-1"), b"t_s,x_m,x_m,note,note\n0,1,2,3,4\n"
+    texts = {
+        latin: "names of columns are in another encoding, must be UTF-8",
+        twice: "2 columns x_m, must be one at most",
+    }
+    texts |= {"t_s,x_m\n0,1\n".encode(encoding): "" for encoding in ("utf-16", "utf-16-le", "utf-32", "cp500")}
+    for text, message in texts.items():
+        path.write_bytes(text)
+        with pytest.raises(TraceError) as caught:
+            read_columns(path, bounds)
+        assert str(caught.value).startswith(f"{path}: {message}")
+        assert len(str(caught.value).splitlines()) == 1
+    path.write_bytes(twice)
+    assert list(read_columns(path, {"t_s": (0.0, 1.0)})) == ["t_s"]
+
+
+def test_a_cell_that_must_be_there_is_not_empty_and_time_never_stands(tmp_path: Path) -> None:
+    path, bounds = tmp_path / "a.csv", {"t_s": (0, 9), "x": (0, 9)}
+    path.write_text("t_s,x\n0,1\n,2\n")
+    with pytest.raises(TraceError, match="t_s in row 2 is nan"):
+        read_columns(path, bounds)
+    path.write_text("t_s,x\n0,1\n1,\n")
+    assert np.isnan(read_columns(path, bounds)["x"][1])
+    rows = np.array([0, 2, 3])
+    check_increasing(path, np.array([0.0, 0.0, 1.0, 2.0]), rows, "drone 1")
+    for at in ([0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 2.0, 1.0]):
+        with pytest.raises(TraceError, match="t_s in row 4 of drone 1 is 1, must increase"):
+            check_increasing(path, np.array(at), rows, "drone 1")
+
+
+def test_an_error_is_one_line_whatever_a_file_holds() -> None:
+    assert str(TraceError("a\nb\u2028c\td\udcff")) == "a\\nb\\u2028c\\td\\udcff"
+    assert str(TraceError("ρ " * 5000)) == "ρ " * 999 + "ρ…"
+
+
+def test_a_shipped_trace_is_found_by_its_name_and_one_s_own_stands_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = Path("paper_120s/links.csv")
+    monkeypatch.chdir(tmp_path)
+    assert located(name) == TRACES / name
+    assert located(name).samefile(ROOT / "scenarios/library/traces" / name)
+    name.parent.mkdir()
+    assert located(name) == TRACES / name  # a folder is no trace
+    name.write_text("t_s\n0\n")
+    assert located(name) == name
+    (tmp_path / "a.yaml").write_text(f"name: a\nfleet: {{trace: {'a' * 400}}}\n")  # it ended in OSError
+    assert load(tmp_path / "a.yaml").fleet.trace == "a" * 400
+    for missing in (Path("a" * 400), TRACES / "nowhere.csv"):
+        with pytest.raises(TraceError, match="no such file"):
+            read_columns(missing, {})
