@@ -10,13 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sortie.scenarios.control_variates import (
-    Controlled,
-    Plan,
-    controlled_mean,
-    plan_units,
-    widened,
-)
+from sortie.scenarios.control_variates import Controlled, Plan, controlled_mean, plan_units, widened
 from sortie.scenarios.intervals import Estimate, mean_interval
 
 NUMBERS = st.floats(-100, 100).map(lambda v: round(v, 3))
@@ -53,8 +47,10 @@ def test_a_perfect_control_variate_gives_the_mean_of_all_units() -> None:
     assert (found.correlation, found.explained) == (pytest.approx(1), pytest.approx(1))
 
 
-@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=5, max_size=12), st.lists(NUMBERS, min_size=2, max_size=20),
-       NUMBERS, st.floats(0.1, 10))  # fmt: skip
+PAIRS = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=5, max_size=12)
+
+
+@given(PAIRS, st.lists(NUMBERS, min_size=2, max_size=20), NUMBERS, st.floats(0.1, 10))
 def test_units_and_offsets_of_the_cheap_measurement_do_not_matter(
     pairs: list[tuple[float, float]], more: list[float], offset: float, factor: float
 ) -> None:
@@ -70,38 +66,30 @@ def test_units_and_offsets_of_the_cheap_measurement_do_not_matter(
     assert controlled_mean(y[order], x[order], more[::-1]).estimate.mean == pytest.approx(one.estimate.mean, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("y", "x", "more"),
-    [
-        ([1.0, 2.0, 4.0], [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]),
-        ([1.0, 2.0, 4.0, 3.0], [2.0, 2.0, 2.0, 2.0], [1.0, 2.0, 3.0]),
-        ([1.0, 2.0, 4.0, 3.0], [1.0, 2.0, 3.0, 5.0], [1.0]),
-        ([1.0, 2.0, 4.0, 3.0, math.nan], [1.0, 2.0, 3.0, math.nan, 4.0], [1.0, 2.0]),
-    ],
-    ids=["three pairs", "a constant", "one further unit", "three pairs without NaN"],
-)
-def test_without_a_usable_control_variate_the_interval_is_students(
-    y: list[float], x: list[float], more: list[float]
-) -> None:
-    found = controlled_mean(y, x, more)
-    kept = [a for a, b in zip(y, x, strict=True) if not math.isnan(a + b)]
-    assert found.estimate == mean_interval(kept)
-    assert found.coefficient == 0
+UNUSABLE: dict[str, tuple[list[float], list[float], list[float]]] = {
+    "three pairs": ([1.0, 2.0, 4.0], [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]),
+    "a constant": ([1.0, 2.0, 4.0, 3.0], [2.0, 2.0, 2.0, 2.0], [1.0, 2.0, 3.0]),
+    "one further unit": ([1.0, 2.0, 4.0, 3.0], [1.0, 2.0, 3.0, 5.0], [1.0]),
+    "three pairs without NaN": ([1.0, 2.0, 4.0, 3.0, math.nan], [1.0, 2.0, 3.0, math.nan, 4.0], [1.0, 2.0]),
+}
 
 
-def test_the_expensive_measurement_alone_is_the_plain_mean() -> None:
-    y, x = drawn(10, 0.9)
-    assert controlled_mean(y, x, drawn(50, 0.9, 1)[1], control=False).estimate == mean_interval(y)
-
-
-def test_further_units_without_a_value_are_left_out() -> None:
-    (y, x), more = drawn(8, 0.8), drawn(20, 0.8, 1)[1]
-    assert controlled_mean(y, x, np.insert(more, [0, 7, 20], math.nan)) == controlled_mean(y, x, more)
-
-
-def test_measurements_of_other_units_are_refused() -> None:
+def test_without_a_usable_control_variate_the_interval_is_students() -> None:
+    for name, (y, x, more) in UNUSABLE.items():
+        found = controlled_mean(y, x, more)
+        kept = [a for a, b in zip(y, x, strict=True) if not math.isnan(a + b)]
+        assert (found.estimate, found.coefficient) == (mean_interval(kept), 0), name
     with pytest.raises(ValueError, match="2 expensive and 3 cheap measurements, must be of the same units"):
         controlled_mean([1.0, 2.0], [1.0, 2.0, 3.0], [])
+
+
+def test_the_expensive_measurement_alone_is_the_plain_mean_and_further_units_without_a_value_are_left_out() -> None:
+    (y, x), more = drawn(10, 0.9), drawn(50, 0.9, 1)[1]
+    plain, used = (controlled_mean(y, x, more, control=control) for control in (False, True))
+    assert (plain.estimate, plain.coefficient) == (mean_interval(y), 0.0)
+    assert used.coefficient > 0.5
+    assert plain.correlation == used.correlation
+    assert controlled_mean(y, x, np.insert(more, [0, 7, 20], math.nan)) == used
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.9])
@@ -143,9 +131,19 @@ def test_a_useless_cheap_measurement_is_not_planned(explained: float) -> None:
     assert off[1] <= 0.5 < off[0]
 
 
-def test_the_quantity_that_needs_most_decides() -> None:
-    hard, easy = quantity(4.0, 0.3), quantity(0.1, 0.9)
-    assert plan_units([easy, hard], 0.2, 30.0, 1.0) == plan_units([hard], 0.2, 30.0, 1.0)
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_the_quantity_that_needs_most_decides_a_plan(order: tuple[int, int]) -> None:
+    """With and without a cheap measurement, before and after units were measured, whichever stands first."""
+    of = (quantity(1.0, 0.9), quantity(9.0, 0.5))
+    pilot, hard = [of[i] for i in order], [of[1]]
+    alone = plan_units(hard, 0.5, 100.0, 1.0, control=False)
+    assert plan_units(pilot, 0.5, 100.0, 1.0, control=False) == alone
+    assert plan_units(pilot, 0.5, 100.0, 1.0).expensive == plan_units(hard, 0.5, 100.0, 1.0).expensive
+    measured = plan_units(pilot, 0.5, 100.0, 1.0).expensive + 10
+    more = plan_units(pilot, 0.5, 100.0, 1.0, measured=measured)
+    assert more.expensive == measured
+    assert more.cheap == max(plan_units([q], 0.5, 100.0, 1.0, measured=measured).cheap for q in of) > 0
+    assert plan_units(pilot, 0.5, 100.0, 1.0, measured=10_000, control=False).expensive == 10_000
 
 
 def test_units_that_are_measured_already_are_not_planned_away() -> None:

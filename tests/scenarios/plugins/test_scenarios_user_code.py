@@ -11,10 +11,12 @@ from policies_examples import fleet_of
 
 from sortie.policies.contract import PolicyError
 from sortie.policies.registry import describe_error, resolve
-from sortie.scenarios.plugins.user_code import imported_files
+from sortie.scenarios.plugins.reference import code_files
+from sortie.scenarios.plugins.user_code import imported_files, imported_packages, load
 
 START = "from sortie.policies.contract import Directive, nothing\n"
 DECIDE = "\ndef decide(view):\n    return [nothing(view.ego, p, {}) for p in view.peers]\n"
+INSIDE = "\ndef decide(view):\n    {}\n    return [nothing(view.ego, p, why()) for p in view.peers]\n"
 
 
 def write(folder: Path, files: dict[str, str]) -> Path:
@@ -25,73 +27,70 @@ def write(folder: Path, files: dict[str, str]) -> Path:
     return folder
 
 
-def reason(folder: Path, file: str = "mine.py") -> str:
-    return resolve(f"{folder / file}:decide")(fleet_of(2))[0].reason
+def reason(folder: Path) -> str:
+    return resolve(f"{folder / 'mine.py'}:decide")(fleet_of(2))[0].reason
 
 
-def names(folder: Path, file: str = "mine.py") -> list[str]:
-    return [path.relative_to(folder.resolve()).as_posix() for path in imported_files(folder / file)]
+def names(folder: Path) -> list[str]:
+    return [path.relative_to(folder.resolve()).as_posix() for path in imported_files(folder / "mine.py")]
 
 
-FORMS = {
-    "a module": ("import helper" + DECIDE.format("helper.WHY"), {"helper.py": "WHY = 'beside'"}),
-    "a name": ("from helper import WHY" + DECIDE.format("WHY"), {"helper.py": "WHY = 'beside'"}),
-    "all names": ("from helper import *" + DECIDE.format("WHY"), {"helper.py": "WHY = 'beside'"}),
-    "relative": ("from . import helper" + DECIDE.format("helper.WHY"), {"helper.py": "WHY = 'beside'"}),
-    "a relative name": ("from .helper import WHY" + DECIDE.format("WHY"), {"helper.py": "WHY = 'beside'"}),
-    "a helper's helper": (
-        "import helper" + DECIDE.format("helper.WHY"),
-        {"helper.py": "from second import WHY", "second.py": "WHY = 'beside'"},
-    ),
-    "a package": (
-        "import kit.deep.texts as t" + DECIDE.format("t.WHY"),
-        {"kit/__init__.py": "", "kit/deep/__init__.py": "", "kit/deep/texts.py": "WHY = 'beside'"},
-    ),
-    "a package's submodule": (
-        "from kit import texts" + DECIDE.format("texts.WHY"),
-        {"kit/__init__.py": "", "kit/texts.py": "from ..kit.more import WHY", "kit/more.py": "WHY = 'beside'"},
-    ),
-    "a package by its first name": (
-        "import kit.texts" + DECIDE.format("kit.texts.WHY"),
-        {"kit/__init__.py": "", "kit/texts.py": "from . import more\nWHY = more.WHY", "kit/more.py": "WHY = 'beside'"},
-    ),
-    "a folder": ("import kit.texts" + DECIDE.format("kit.texts.WHY"), {"kit/texts.py": "WHY = 'beside'"}),
-    "named like a room": ("import sim, policies.texts" + DECIDE.format("sim.WHY"), {
-        "sim.py": "WHY = 'beside'", "policies/__init__.py": "", "policies/texts.py": "",
-    }),
-    "in a circle": (
-        "import helper" + DECIDE.format("helper.why()"),
-        {"helper.py": "import mine, second\ndef why(): return second.why()",
-         "second.py": "import helper\ndef why(): return 'beside' if helper.mine.decide else ''"},
-    ),
-    "of a dataclass": (
-        "from helper import Why" + DECIDE.format("Why('beside').text"),
-        {"helper.py": "from __future__ import annotations\nfrom dataclasses import dataclass\n"
-                      "@dataclass\nclass Why:\n    text: str\n"},
-    ),
-}  # fmt: skip
-INSIDE = "\ndef decide(view):\n    {}\n    return [nothing(view.ego, p, why()) for p in view.peers]\n"
-FORMS |= {
-    "inside the function": (INSIDE.format("from helper import why"), {"helper.py": "def why(): return 'beside'"}),
-    "relative, inside the function": (
-        INSIDE.format("from .helper import why"),
-        {"helper.py": "def why():\n    import second\n    return second.WHY", "second.py": "WHY = 'beside'"},
-    ),
+BESIDE = "WHY = 'beside'"
+CLASS = "from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\nclass Why:\n    text: str\n"
+CIRCLE = "import helper\ndef why(): return 'beside' if helper.mine.decide else ''"
+KIT = {"kit/__init__.py": ""}
+FORMS: dict[str, dict[str, str]] = {
+    "import helper" + DECIDE.format("helper.WHY"): {"helper.py": BESIDE},
+    "from helper import WHY" + DECIDE.format("WHY"): {"helper.py": BESIDE},
+    "from helper import *" + DECIDE.format("WHY"): {"helper.py": BESIDE},
+    "from . import helper" + DECIDE.format("helper.WHY"): {"helper.py": BESIDE},
+    "from .helper import WHY" + DECIDE.format("WHY"): {"helper.py": BESIDE},
+    "import helper\n" + DECIDE.format("helper.WHY"): {"helper.py": "from second import WHY", "second.py": BESIDE},
+    "import kit.deep.texts as t" + DECIDE.format("t.WHY"): {
+        **KIT,
+        "kit/deep/__init__.py": "",
+        "kit/deep/texts.py": BESIDE,
+    },
+    "from kit import texts" + DECIDE.format("texts.WHY"): {
+        **KIT,
+        "kit/texts.py": "from ..kit.more import WHY",
+        "kit/more.py": BESIDE,
+    },
+    "import kit.texts" + DECIDE.format("kit.texts.WHY"): {
+        **KIT,
+        "kit/texts.py": "from . import more\nWHY = more.WHY",
+        "kit/more.py": BESIDE,
+    },
+    "import kit.texts\n" + DECIDE.format("kit.texts.WHY"): {"kit/texts.py": BESIDE},  # a folder
+    "import sim, policies.texts" + DECIDE.format("sim.WHY"): {  # named like rooms
+        "sim.py": BESIDE,
+        "policies/__init__.py": "",
+        "policies/texts.py": "",
+    },
+    "import helper" + DECIDE.format("helper.why()"): {
+        "helper.py": "import mine, second\ndef why(): return second.why()",
+        "second.py": CIRCLE,
+    },
+    "from helper import Why" + DECIDE.format("Why('beside').text"): {"helper.py": CLASS},
+    INSIDE.format("from helper import why"): {"helper.py": "def why(): return 'beside'"},
+    INSIDE.format("from .helper import why"): {
+        "helper.py": "def why():\n    import second\n    return second.WHY",
+        "second.py": BESIDE,
+    },
 }
+"""The policy's text, and the files beside it."""
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_a_policy_imports_what_is_beside_it(form: str, tmp_path: Path) -> None:
-    source, files = FORMS[form]
-    write(tmp_path, {"mine.py": START + source, **files})
-    before, path = set(sys.modules), list(sys.path)
-    policy = resolve(f"{tmp_path}/mine.py:decide")
-    assert policy(fleet_of(2))[0].reason == "beside"
-    assert sys.path == path
-    left = {name for name in set(sys.modules) - before if not name.startswith(("sortie.", "sortie_user_"))}
-    assert not left & {"mine", "helper", "second", "kit", "sim", "policies"}
-    assert names(tmp_path) == sorted(["mine.py", *files])
-    assert not list(tmp_path.rglob("__pycache__"))
+def test_a_policy_imports_what_is_beside_it(tmp_path: Path) -> None:
+    for k, (source, files) in enumerate(FORMS.items()):
+        folder = write(tmp_path / f"form{k}", {"mine.py": START + source, **files})
+        before, path = set(sys.modules), list(sys.path)
+        assert reason(folder) == "beside", source
+        assert sys.path == path
+        left = {name for name in set(sys.modules) - before if not name.startswith(("sortie.", "sortie_user_"))}
+        assert not left & {"mine", "helper", "second", "kit", "sim", "policies"}
+        assert names(folder) == sorted(["mine.py", *files])
+        assert not list(folder.rglob("__pycache__"))
 
 
 @pytest.mark.parametrize("form", ["import helper", "from . import helper", "import helper as other; helper = other"])
@@ -117,37 +116,21 @@ def test_each_resolving_reads_the_files_anew(tmp_path: Path) -> None:
 
 def test_python_and_sortie_come_first(tmp_path: Path) -> None:
     source = START + "import math\nimport numpy" + DECIDE.format("f'{math.pi:.2f} {numpy.ones(1)[0]:g}'")
-    write(tmp_path, {
-        "mine.py": source, "math.py": "pi = 4", "sortie/__init__.py": "raise RuntimeError", "numpy/data.txt": "",
-    })  # fmt: skip
+    others = {"math.py": "pi = 4", "sortie/__init__.py": "raise RuntimeError", "numpy/data.txt": ""}
+    write(tmp_path, {"mine.py": source, **others})
     assert reason(tmp_path) == "3.14 1"
     assert names(tmp_path) == ["mine.py"]
 
 
 def test_what_was_loaded_counts_but_for_installed_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A library of the user's own on the path does, and what only a function will import beside the file."""
-    write(
-        tmp_path / "lib",
-        {
-            "shop/__init__.py": "from .tools import a\n",
-            "shop/tools/__init__.py": "",
-            "shop/tools/a.py": "import cart",
-            "cart.py": "",
-            "unused.py": "",
-        },
-    )
+    shop = {"__init__.py": "from .tools import a\n", "tools/__init__.py": "", "tools/a.py": "import cart"}
+    write(tmp_path / "lib/shop", shop)
+    write(tmp_path / "lib", {"cart.py": "", "unused.py": ""})
     write(tmp_path / "venv/site-packages", {"bought.py": ""})
     source = START + "import shop, bought, numpy, json" + INSIDE.format("from late import why")
-    write(
-        tmp_path / "own",
-        {
-            "mine.py": source,
-            "late.py": "import later\ndef why(): return ''",
-            "later.py": "",
-            "cart.py": "",
-            "spare.py": "",
-        },
-    )
+    write(tmp_path / "own", {"mine.py": source, "late.py": "import later\ndef why(): return ''", "later.py": ""})
+    write(tmp_path / "own", {"cart.py": "", "spare.py": ""})
     for folder in ("lib", "venv/site-packages"):
         monkeypatch.syspath_prepend(tmp_path / folder)
     importlib.invalidate_caches()
@@ -157,26 +140,33 @@ def test_what_was_loaded_counts_but_for_installed_packages(tmp_path: Path, monke
     assert found == [*(f"lib/{name}" for name in loaded), "own/late.py", "own/later.py", "own/mine.py"]
 
 
-@pytest.mark.parametrize(
-    ("form", "missing"),
-    [("import absent", "absent"), ("from . import absent", "absent"), ("from helper import absent", "absent")],
-)
-def test_a_missing_module_is_named(form: str, missing: str, tmp_path: Path) -> None:
-    write(tmp_path, {"mine.py": form, "helper.py": ""})
-    with pytest.raises(
-        PolicyError, match=rf"does not load: (ModuleNotFound|Import)Error: .*{missing}.* \(mine\.py, line 1\)"
-    ):
-        resolve(f"{tmp_path}/mine.py:decide")
-
-
-def test_a_helpers_error_names_its_line(tmp_path: Path) -> None:
-    write(
-        tmp_path,
-        {
-            "mine.py": START + "import helper" + DECIDE.format("helper.why()"),
-            "helper.py": "def why():\n    return 1 / 0",
-        },
+def test_files_are_those_beside_the_file_and_packages_those_that_are_installed(tmp_path: Path) -> None:
+    """A module beside a file hides the installed package of its name."""
+    inner = {"pack/inner/__init__.py": "from .. import two\n", "pack/inner/deep.py": "from ..three import x\n"}
+    plain = dict.fromkeys(
+        ("pack/__init__.py", "pack/one.py", "pack/two.py", "pack/four.py", "sortie.py", "json.py"), ""
     )
+    own = "from pack import one\nfrom pack.inner import deep\nimport sortie\nimport numpy\nimport json\n"
+    write(tmp_path, {"own.py": own, "pack/three.py": "x = 1\n", **plain, **inner, "numpy/nothing.txt": ""})
+    found = [path.relative_to(tmp_path.resolve()).as_posix() for path in code_files(tmp_path / "own.py")]
+    pack = ["__init__.py", "inner/__init__.py", "inner/deep.py", "one.py", "three.py", "two.py"]
+    assert found == ["own.py", *(f"pack/{name}" for name in pack)]
+    path = write(tmp_path / "b", {"p.py": "import numpy\nimport yaml\n"}) / "p.py"
+    load(path)
+    assert imported_packages(path) == {"numpy", "PyYAML"}
+    write(tmp_path / "b", {"yaml.py": ""})
+    load(path)
+    assert imported_packages(path) == {"numpy"}
+
+
+def test_a_missing_module_and_a_helpers_error_are_named_with_their_line(tmp_path: Path) -> None:
+    for form in ("import absent", "from . import absent", "from helper import absent"):
+        write(tmp_path, {"mine.py": form, "helper.py": ""})
+        words = r"does not load: (ModuleNotFound|Import)Error: .*absent.* \(mine\.py, line 1\)"
+        with pytest.raises(PolicyError, match=words):
+            resolve(f"{tmp_path}/mine.py:decide")
+    source = START + "import helper" + DECIDE.format("helper.why()")
+    write(tmp_path, {"mine.py": source, "helper.py": "def why():\n    return 1 / 0"})
     with pytest.raises(ZeroDivisionError) as caught:
         reason(tmp_path)
     assert describe_error(caught.value).endswith("(helper.py, line 2)")
