@@ -6,7 +6,6 @@ known from how it is made. A correct one keeps the line on every view.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from string import Template
 
 from hypothesis import strategies as st
@@ -53,31 +52,22 @@ POINTS = (
     "bad = np.float64($k) == $x",
 )
 """Each is true somewhere, and nowhere but within 7 of the whole number k, or of k and all that differ by 1024."""
-COUNTS = (
-    "len(view.peers)",
-    "len(view.descriptors) - 1",
-    "sum(1 for p in view.peers)",
-    "max(view.descriptors)",
-    "len(me.peer_goodput_mbps)",
-    "view.full_sharing_maps",
+LARGE_FAULTS = (
+    ("bad = len(view.peers) >= 11", LINE),
+    ("bad = sum(1 for p in view.peers) // 40 >= 1", LINE),
+    ("bad = view.full_sharing_maps in range(25, 250)", LINE),
+    ("bad = view.ego == 90", LINE),
+    ("bad = list(range(len(me.peer_goodput_mbps)))[18:] != []", LINE),
+    ("try:\n    list(range(len(view.peers)))[16]\n    bad = True\nexcept IndexError:\n    pass", LINE),
+    ("bad = False", "count_links(representation > none) <= 13"),
+    ("bad = False", "sum_links(rate_hz) <= 30"),
+    ("bad = False", "when peers >= 60: every_link(representation >= features)"),
+    ("bad = len(view.peers) > 3000", LINE),
+    ("bad = any(p > 4000 for p in view.peers)", LINE),
+    ("bad = len(view.peers) == 777", LINE),
+    ("bad = me.roster is not None and len(me.roster.members) < 60 < len(view.peers)", LINE),
 )
-SIZES = (
-    "bad = $x >= $n",
-    "bad = $x // $n >= 1",
-    "bad = list(range($x))[$n - 1:] != []",
-    "try:\n    list(range($x))[$n - 1]\n    bad = True\nexcept IndexError:\n    pass",
-    "def depth(k):\n    return 0 if k <= 0 else 1 + depth(k - 1)\nbad = depth($x) >= $n",
-    "bad = $x in range($n, 10 * $n)",
-)
-SIZE_LINES = (
-    "count_links(representation > none) <= $n",
-    "sum_links(rate_hz) <= 2 * $n",
-    "when peers >= $n: every_link(representation >= features)",
-    "when peers > $n: any_link(rate_hz > 5)",
-)
-"""What small fleets keep whatever they send, and fleets of more than n peers break."""
-FEW = (4, 5, 6, 7, 8, 10, 11, 13, 15, 17, 19, 25, 40, 60, 90)
-MANY = (210, 333, 777, 1500, 2400, 3000, 4100, 4900)
+"""Faults of fleets that are larger than those that are searched by default, up to the largest: a body and its line."""
 
 
 def _filled(text: str, **values: object) -> str:
@@ -112,15 +102,3 @@ def unreached(draw: st.DrawFn) -> str:
     top = 1 if x in SHARES else 2**32 if "age" in x else 100000
     a, b = draw(st.sampled_from([(top, top + 5), (top + 1, top + 2), (-5, -1), (-2, -0.5)]))
     return _filled(draw(st.sampled_from(BETWEEN)), x=x, a=a, b=b)
-
-
-@st.composite
-def sizes(draw: st.DrawFn, drones: Sequence[int] = FEW) -> tuple[str, str]:
-    """A fault that needs more drones than are searched by default: the policy and its line."""
-    n = draw(st.sampled_from(drones))
-    kind = draw(st.integers(0, 9))
-    if kind < 2:
-        return source("bad = False"), Template(draw(st.sampled_from(SIZE_LINES))).substitute(n=n)
-    if kind == 2:
-        return source(f"bad = view.ego == {n}"), LINE
-    return _filled(draw(st.sampled_from(SIZES)), x=draw(st.sampled_from(COUNTS)), n=n), LINE

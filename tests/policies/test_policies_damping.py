@@ -73,13 +73,6 @@ def test_reductions_pass_at_once_and_upgrades_wait() -> None:
     assert {name: d for name, d in found.items() if d != COURSES[name][2]} == {}
 
 
-def test_a_mixed_change_is_lowered_where_it_is_lower() -> None:
-    asked = FULL._replace(rate_hz=2.0)
-    first, *_, last = run(FULL._replace(rho=0.1), [asked] * 11)
-    assert (first.rho, first.rate_hz) == (0.1, 2.0)
-    assert last == asked
-
-
 def test_the_reason_in_force_is_the_one_that_decided() -> None:
     confined = BOXES._replace(roi=Disc(0, 0, 32))
     (waiting,) = run(confined, [FULL._replace(roi=Disc(1, 0, 32))])
@@ -87,14 +80,6 @@ def test_the_reason_in_force_is_the_one_that_decided() -> None:
     assert waiting.reason == "boxes", "the disc moved, but full features are still waiting"
     enforced = run(NOTHING, [LITTLE] * 10 + [FULL])
     assert enforced[10].reason == "little", "the reason is of the request that is granted"
-
-
-def test_what_flickers_is_granted_at_its_least_and_holds_up_no_steady_part() -> None:
-    asked = [FULL._replace(rate_hz=(5.0, 10.0)[i // 3 % 2], rho=(0.5, 0.1)[i // 4 % 2]) for i in range(40)]
-    assert run(BOXES, asked)[10:] == [FULL._replace(rate_hz=5.0, rho=0.1)] * 30
-    start = FULL._replace(rho=0.1, rate_hz=2.0)  # the rate falls back at 0.6 s; ρ is asked for since 0.4 s
-    asked = [start._replace(rho=1.0 if i >= 4 else 0.1, rate_hz=10.0 if i < 6 else 2.0) for i in range(20)]
-    assert [d.rho for d in run(start, asked)] == [0.1] * 14 + [1.0] * 6
 
 
 directives = st.builds(
@@ -108,28 +93,6 @@ directives = st.builds(
     fusion_weight=st.sampled_from([0.5, 1.0]),
     duty_percent=st.sampled_from([50, 100]),
 )
-
-
-def above(a: Directive, b: Directive) -> bool:
-    """Whether a is somewhere above b on the ladder."""
-    return a.representation > b.representation or (
-        a.representation == b.representation != Representation.NONE and (a.rate_hz > b.rate_hz or a.rho > b.rho)
-    )
-
-
-@given(st.lists(directives, min_size=1, max_size=60), st.floats(0.05, 3.0))
-def test_upgrades_are_at_least_a_dwell_apart_from_their_asking(asked: list[Directive], dwell_s: float) -> None:
-    """Average dwell time: no more than 1 + t / dwell upgrades in t seconds; never above what is asked now."""
-    state, upgrades = DampedLink(NOTHING), []
-    for i, directive in enumerate(asked):
-        now_s = i * 0.1
-        after = damp(state, directive, now_s, dwell_s)
-        assert not above(after.enforced, directive), "more is enforced than the policy asks for"
-        if above(after.enforced, state.enforced):
-            upgrades.append(now_s)
-        state = after
-    assert len(upgrades) <= 1 + 0.1 * len(asked) / dwell_s
-    assert all(b - a >= dwell_s - 1e-6 for a, b in itertools.pairwise(upgrades))
 
 
 def least(asked: list[Directive]) -> Directive:
@@ -199,18 +162,6 @@ def test_a_disc_that_hardly_moved_is_the_same_directive() -> None:
     assert not is_switch(a, a._replace(roi=Disc(0.99 * SAME_DISC_M, 0.0, 32.0)))
 
 
-def test_a_disc_in_force_follows_its_target_and_does_not_grow_before_its_dwell_time() -> None:
-    small = Directive(0, 1, Representation.FEATURES, 0.2, Disc(0, 0, 20), 5.0, reason="small")
-    link = damp(DampedLink(small), small._replace(roi=Disc(50, 10, 40), rho=0.9, rate_hz=10.0), 0.0, 1.0)
-    assert link.enforced.roi == Disc(50, 10, 20)
-    assert (link.enforced.rho, link.enforced.rate_hz) == (0.2, 5.0)
-    asked = small._replace(roi=Disc(60, 10, 40), rho=0.1, rate_hz=10.0)
-    link = damp(link, asked, 0.5, 1.0)
-    assert (link.enforced.roi, link.enforced.rho, link.enforced.rate_hz) == (Disc(60, 10, 20), 0.1, 5.0)
-    link = damp(link, asked, 1.5, 1.0)
-    assert (link.enforced.roi, link.enforced.rate_hz) == (Disc(60, 10, 40), 10.0)
-
-
 @pytest.mark.parametrize("waits", [3, 5])
 def test_an_upgrade_that_waited_begins_with_the_disc_of_the_moment(waits: int) -> None:
     """A target drives on while its link waits: what is granted is aimed at where it is, and nothing waits any more."""
@@ -255,14 +206,6 @@ def test_a_change_that_is_no_climb_reaches_the_gate_at_once_whatever_it_is_of() 
         assert is_switch(USUAL, asked)
         assert not is_climb(USUAL, asked)
         assert damp(DampedLink(USUAL), asked, 0.0, DWELL_S).enforced == asked
-
-
-def test_what_is_a_climb() -> None:
-    sends = Directive(0, 1, Representation.FEATURES, 0.5, None, 5.0)
-    slow, fast = BOXES._replace(rate_hz=2.0), BOXES._replace(rate_hz=10.0)
-    climbs = {(slow, sends), (sends, sends._replace(fusion_weight=1.0, rate_hz=6.0)), (sends, fast)}
-    none = {(sends, slow), (sends, sends._replace(deadline_s=5.0)), (NOTHING, NOTHING._replace(rate_hz=3.0))}
-    assert {pair for pair in climbs | none if is_climb(*pair)} == climbs
 
 
 def test_the_cells_of_another_representation_bound_nothing() -> None:

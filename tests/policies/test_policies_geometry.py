@@ -7,7 +7,7 @@ import random
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from policies_examples import changed, fleet_of
+from policies_examples import fleet_of
 
 from sortie.policies.catalogue import adaptive
 from sortie.policies.contract import FleetView
@@ -50,11 +50,3 @@ def test_overlap_is_the_share_of_the_receiver_s_footprint() -> None:
     assert peers_by_overlap(view, 0) == [1, 2]
     seen = adaptive.features(view, 0.25)
     assert seen[2] == pytest.approx((0.25 + footprint_overlap(high, third)) / 2)
-
-
-def test_drones_in_one_place_are_ranked_from_the_receiver_on() -> None:
-    """So that they do not all choose the same peers."""
-    here = changed(fleet_of(5), position_m=(0.0, 0.0, 60.0))
-    for receiver in range(5):
-        wanted = [(receiver + k) % 5 for k in (1, 2, 3, 4)]
-        assert peers_by_overlap(here, receiver) == peers_by_overlap(here._replace(ego=receiver)) == wanted

@@ -40,13 +40,6 @@ def test_it_is_what_leaving_each_unit_out_by_hand_gives() -> None:
     assert found.variance == pytest.approx(y.var(ddof=1), rel=1e-12)
 
 
-def test_a_perfect_control_variate_gives_the_mean_of_all_units() -> None:
-    x, more = drawn(8, 1.0)[1], np.random.default_rng(3).normal(size=24)
-    found = controlled_mean(5 + 2 * x, x, more)
-    assert found.estimate.mean == pytest.approx(5 + 2 * np.concatenate([x, more]).mean(), rel=1e-12)
-    assert (found.correlation, found.explained) == (pytest.approx(1), pytest.approx(1))
-
-
 PAIRS = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=5, max_size=12)
 
 

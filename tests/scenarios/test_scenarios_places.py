@@ -48,9 +48,6 @@ def test_peers_go_by_tenths_of_overlap_and_then_round_by_id() -> None:
         assert rank_by_overlap(ego, dict.fromkeys(peers, 0.5)) == sorted(peers, key=lambda p: (p - ego) % AGENT_IDS)
 
 
-# --- formations -----------------------------------------------------------------------------------
-
-
 def test_slots_by_hand() -> None:
     for shape, expected in BY_HAND.items():
         np.testing.assert_allclose(slots(shape, len(expected), 20.0), expected, atol=1e-12, err_msg=shape)

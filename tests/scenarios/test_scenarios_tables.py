@@ -88,9 +88,6 @@ def test_parquet_has_the_same_names(tmp_path: Path) -> None:
         read_numbers(path, ["at"])
 
 
-# --- traces ---------------------------------------------------------------------------------------
-
-
 def test_a_trace_in_another_encoding_or_with_a_column_twice_is_one_line(tmp_path: Path) -> None:
     path, bounds = tmp_path / "trace.csv", {"t_s": (0.0, 1.0), "x_m": (0.0, 1.0)}
     latin, twice = "t_s,höhe_m\n0,1\n".encode("latin-1"), b"t_s,x_m,x_m,note,note\n0,1,2,3,4\n"

@@ -56,9 +56,6 @@ def test_the_sender_chooses_its_receivers() -> None:
     assert {tuple(receivers("random-2-receivers", salt=s)) for s in range(40)} == PAIRS
 
 
-# --- budgets --------------------------------------------------------------------------------------
-
-
 def test_every_receiver_gets_the_budget_to_the_cell_and_no_link_more_than_a_map() -> None:
     """Matched bytes over all senders together, also where the budget cannot be shared evenly, of 1 cell and of all."""
     view, cells_of_all = fleet_of(5), 4 * FEATURE_CELLS
@@ -103,9 +100,6 @@ def test_more_senders_than_there_are_leave_nothing_of_the_budget_over() -> None:
     for policy, (drones, k) in product(BY_RECEIVER[1:], ((2, 1), (2, 2), (2, 5), (3, 3), (5, 4), (5, 7))):
         found = received_cells(policy, fleet_of(drones), k=k, received_budget=0.4)
         assert found == dict.fromkeys(range(drones), math.floor(0.4 * (drones - 1) * FEATURE_CELLS))
-
-
-# --- senders that agree ---------------------------------------------------------------------------
 
 
 def test_k_senders_serve_each_receiver_and_all_agree_who() -> None:

@@ -41,15 +41,6 @@ def test_detached_peers_get_nothing_and_change_nothing_but_their_own_links() -> 
     assert tested > 30
 
 
-def test_a_peer_is_detached_after_the_limit_of_the_view() -> None:
-    view = changed(fleet_of(4), coverage_grid=SEES_ALL)._replace(detached_after_periods=20.0)
-    for name, policy in POLICIES.items():
-        at, beyond = (view._replace(age_s={0: 0.0, 1: age_s, 2: 0.0, 3: 0.0}) for age_s in (2.0, 2.001))
-        assert by_peer(policy(beyond))[1].representation == NONE, name
-        assert [d.destination for d in policy(at)] == [1, 2, 3], name
-    assert by_peer(POLICIES["all-4"](view._replace(age_s={0: 0.0, 1: 2.0, 2: 0.0, 3: 0.0})))[1].rho == 1.0
-
-
 def test_a_lost_drone_gives_its_place_to_the_next_best_after_the_scenarios_limit() -> None:
     """With the leader of a cross lost, four drones are left, each of which serves two others."""
     limits = set[float]()

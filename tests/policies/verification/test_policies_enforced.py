@@ -99,13 +99,3 @@ def test_breaks_of_two_lines_last_by_themselves() -> None:
         found += [(k, v.line[7:10], v.peer) for v in judge(rules, VIEW, steps, acting, (), past)]
     # the first line: peer 1 broken from 0 to 0.5 s, peer 2 from 0.2 to 0.6 s; the second: to 0.4 s and to 0.6 s
     assert found == [(3, "0.2", 1), (4, "0.2", 1), (5, "0.2", 1), (5, "0.2", 2), (6, "0.2", 2)]
-
-
-def test_two_lines_that_count_changes_each_reach_back_as_far_as_they_say() -> None:
-    for text in ("climbs_in(1) <= 1\nclimbs_in(0.2) <= 0", "climbs_in(0.2) <= 0\nclimbs_in(1) <= 1"):
-        past = Past(parse(text), 5.0)
-        for k, rate_hz in enumerate([2.0, 5.0, 5.0, 5.0, 5.0]):
-            past.note(0.1 * k, [link(1, rate_hz=rate_hz), link(2, rate_hz=5.0)])
-        assert [past.count("climbs_in", peer, 1.0) for peer in (1, 2, 3)] == [2, 1, 0]
-        assert [past.count("climbs_in", peer, 0.2) for peer in (1, 2, 3)] == [0, 0, 0]
-        assert past.count("climbs_in", 1, "dwell") == 2

@@ -7,15 +7,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from policies_corpus import HELPER, LINE
+from policies_corpus import HELPER, LINE, source
 from policies_examples import written
-from policies_faults import MANY, sizes, slivers, unreached, whole_faults
+from policies_faults import LARGE_FAULTS, slivers, unreached, whole_faults
 from policies_honest_faults import HONEST, LARGEST_SHOWN, honest_source
 
 from sortie.policies.verification.invariants.language import parse
 from sortie.policies.verification.kit.conformance import conform, failing
-from sortie.policies.verification.kit.single_view import check_property, property_of
-from sortie.policies.verification.kit.views import LARGEST, draw_view
 from sortie.policies.verification.proof.proof import ProofVerdict, prove
 from sortie.policies.verification.subject import own_invariants
 
@@ -65,22 +63,9 @@ def test_an_honest_fault_is_refuted_by_a_small_view(folder: Path, names: list[st
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
-@given(of=sizes())
-def test_faults_of_large_fleets_are_found_by_drawn_views(folder: Path, of: tuple[str, str]) -> None:
-    text, line = of
-    assert "refuted" in [v.outcome for v in verdicts(folder, text, line, views=300)], f"{line}\n{text}"
-
-
-@pytest.mark.slow
-@settings(max_examples=10)
-@given(of=sizes(MANY))
-def test_faults_beyond_200_drones_are_found_by_drawn_views(folder: Path, of: tuple[str, str]) -> None:
-    """Of generated ones, those that show where 5,000 drones all hear each other."""
-    text, line = of
-    everyone = draw_view(8, 0, LARGEST, 1.0).frozen
-    if check_property(property_of(parse(line)[0]), written(folder, text), everyone) is not None:
-        assert verdicts(folder, text, line, views=20)[-1].outcome == "refuted", f"{line}\n{text}"
+def test_faults_of_large_fleets_are_found_by_drawn_views(folder: Path) -> None:
+    found = {of: verdicts(folder, source(of[0]), of[1], views=300) for of in LARGE_FAULTS}
+    assert {of for of, said in found.items() if "refuted" not in [v.outcome for v in said]} == set()
 
 
 def test_a_fault_of_one_drone_among_many_is_found(folder: Path) -> None:

@@ -241,13 +241,6 @@ def test_a_policy_that_always_raises_holds_no_rule() -> None:
     assert checks[1].what == "0 of 5 views could be checked: see returns directives, bounds kept"
 
 
-def test_views_of_the_users_choice() -> None:
-    checks = {c.name: c for c in conform(lambda v: boxes(v, rate_hz=31.0), [FIVE._replace(ego=4)])}
-    assert checks["bounds kept"].counterexample is not None
-    assert len(checks["bounds kept"].counterexample.descriptors) == 2
-    assert checks["gives reasons"].what == "1 views: each directive has a reason"
-
-
 # --- what is older, and what counts as a rise -----------------------------------------------------
 
 VIEW = fleet_of(3)._replace(period_s=0.2, age_s={0: 0.0, 1: 0.5, 2: 1.5})

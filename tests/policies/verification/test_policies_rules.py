@@ -54,9 +54,6 @@ def test_the_cost_of_a_decision_grows_no_faster_than_the_fleet() -> None:
         assert 0 < calls_of_a_decision(name, 100) <= 4.2 * calls_of_a_decision(name, 25) + 10, name
 
 
-# --- bounded size and rate ------------------------------------------------------------------------
-
-
 @given(st.integers(0, 400), st.integers(0, 600))
 def test_no_descriptor_is_larger_than_a_kilobyte(peers: int, targets: int) -> None:
     crowded = MINE._replace(peer_goodput_mbps=(1.0,) * peers, priority_target_ids=(1,) * targets)
@@ -70,9 +67,6 @@ def test_no_descriptor_is_larger_than_a_kilobyte(peers: int, targets: int) -> No
 def test_descriptors_come_at_most_ten_times_a_second() -> None:
     with pytest.raises(ScenarioError, match="rate_hz"):
         loads("name: fast\ncontext: {rate_hz: 10.1}")
-
-
-# --- best effort; age only reduces ----------------------------------------------------------------
 
 
 @given(st.integers(0, 10**6), st.data())
@@ -93,9 +87,6 @@ def test_age_never_raises_what_the_plane_enforces(number: int, data: st.DataObje
         assert raised_part(*(enforced(name, v) for v in (view, older, others))) is None, name
 
 
-# --- context only ---------------------------------------------------------------------------------
-
-
 def test_a_payload_does_not_fit_into_any_field_of_a_descriptor_nor_beside_them() -> None:
     payloads = (FEATURE_CELLS, FEATURE_CELLS.tobytes(), FEATURE_CELLS.tolist())
     for field, payload in product(Descriptor._fields, payloads):
@@ -108,8 +99,6 @@ def test_a_payload_does_not_fit_into_any_field_of_a_descriptor_nor_beside_them()
     received = encode_descriptor(MINE)
     assert isinstance(open_datagram(received + FEATURE_CELLS.tobytes(), None), Dropped), "nor behind it on the wire"
 
-
-# --- policies read only descriptors ---------------------------------------------------------------
 
 PLAIN = (int, float, str, bytes, type(None), Enum)
 
@@ -134,9 +123,6 @@ def test_a_view_holds_descriptors_and_ages_and_nothing_else_can_be_reached_from_
     assert any(isinstance(p, Gate) for p in parts(leaky)), "the search of parts is not blind"
 
 
-# --- damping and idempotence ----------------------------------------------------------------------
-
-
 def test_repeating_a_directive_restarts_no_timer_anywhere() -> None:
     """The bug that the paper names: a repeated directive restarted the publisher's timer, which then never fired."""
     gate, sent = Gate(), 0
@@ -154,8 +140,6 @@ def test_repeating_a_directive_restarts_no_timer_anywhere() -> None:
     assert raised_s == pytest.approx(3.0), "asked for at 2 s, repeated ten times, made at 3 s"
     assert sent == 6 + 35, "2 Hz for 3 s, then 5 Hz for 7 s"
 
-
-# --- authentication -------------------------------------------------------------------------------
 
 KEYS = {1: bytes(32)}
 SPOILT: dict[str, tuple[Callable[[bytes], bytes], str]] = {

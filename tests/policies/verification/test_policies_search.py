@@ -67,15 +67,6 @@ def test_a_threshold_cuts_at_the_very_float() -> None:
     assert cells(lambda n: 2 <= n < 4, 0, 5) == [(0, 1, False), (2, 3, True), (4, 5, False)]
 
 
-def test_a_range_of_one_number_counts_with_its_steps() -> None:
-    def run(path: Path) -> Any:
-        x, y = path.number("x", 0.0, 1.0), path.number("y", 0.0, 4.0)
-        return y < x + 1 if x == 0.5 else None
-
-    ends = {found: path.bounds("y", -1.0) for path, found in explore(run)}
-    assert ends == {True: (0.0, math.nextafter(1.5, 0)), False: (1.5, 4.0), None: (0.0, 4.0)}
-
-
 def test_what_no_float_can_hold_or_no_range_can_answer_is_refused_and_no_check_hides_it() -> None:
     steps = (lambda x: x * 1e308, lambda x: x * -1e308, lambda x: x - 1e308 - 1e308, lambda x: 1 / x)
     for act in (*steps, math.sqrt, hash, lambda x: int(x * 1e6), lambda x: x % 2, lambda x: x**2):
@@ -219,16 +210,6 @@ def test_a_run_that_ranks_the_peers_of_several_drones_is_replayed_with_all_its_o
     assert asked[::2] == asked[1::2]
     assert len(set(map(str, asked))) == count
     assert peers_by_overlap(fleet_of(3), 0) == peers_by_overlap(fleet_of(3).frozen, 0)
-
-
-def test_raised_ages_begin_at_the_lowest_of_the_cell() -> None:
-    ranges = fleet(Path([1]))
-    assert not ranges.view().age_s[1] < 0.35
-    assert ranges.raised_example() is None
-    assert ranges.example().age_s[1] > 0.35
-    assert ranges.older_view().age_s[1] >= 0.35
-    assert ranges.example().age_s[1] == 0.35
-    assert ranges.raised_example() == {0: 0.0, 1: 0.35, 2: 0.0}
 
 
 # --- several inputs -------------------------------------------------------------------------------

@@ -120,9 +120,6 @@ def test_overrides_of_a_map_are_the_same_as_texts() -> None:
     assert as_texts(["duration_s=3"]) == ["duration_s=3"]
 
 
-# --- sets of conditions ---------------------------------------------------------------------------
-
-
 def test_the_base_of_a_set_of_conditions_lies_beside_its_file(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     path.write_text("base: mine.yaml\nconditions: [{name: a, budget: 0.1}]\n")
