@@ -21,6 +21,8 @@ def scenario(text: str) -> Scenario:
 MAKE = "fleet: {makes: [{name: m, drones: [1], %s}]}"
 LEG = "groups: [{drones: [1], legs: [{to_m: [9, 9], altitude_m: 390}]}]"
 OLD = "makes: [{name: old, drones: [1], battery: {life_cycles: 40}}]"
+CYCLES = f"fleet: {{{OLD}, overrides: [{{drone: %s, cycles: %s}}]}}"
+OFFSET = f"fleet: {{{LEG}, makes: [{{name: high, drones: [1], altitude_offset_m: %s}}]}}"
 STATION = "fleet: {ground: [{drone: 1, mains: %s}]}\nevents: [{kind: %s, drone: 1, at_s: 1%s}]"
 RESERVE = "fleet: {ground: [{drone: 1}]}\nmission: {groups: [{drones: [0, 1, 2], phases: [{}], reserve: [%s]}]}"
 GROUP = "mission: {%s groups: [{drones: [1, 2], phases: [{}], reserve: [%s]}]}"
@@ -33,6 +35,16 @@ EXPECT = "expect: [{metric: policy, equals: %s, tolerance: 0.1}]"
 DECIDED = "expect_decisions: [{drone: 0, from_s: 3, until_s: %s}]"
 LAND = "fleet: {groups: [{drones: [1], legs: [%s]}]}"
 LEFT_OUT = "must be left out where"
+FAULT = STATION % ("%s", "battery_fault", ", lost_fraction: 0.5")
+AGES = "context: {degraded_after_periods: %s, detached_after_periods: %s}"
+CAMERA = DETECTORS % ("%s", "%s", "camera: {width_px: 320}")
+FUSION = "perception: {detector: %s, fusion: 'own.py:F'}"
+EVENT = "events: [{%s, at_s: 2, until_s: %s}]"
+EVENTS = (
+    "kind: gnss_loss",
+    "kind: jam, position_m: [0, 0, 9]",
+    *(f"kind: {k}, drone: 1" for k in ("link_drop", "spoof", "lie")),
+)
 
 BOUNDS: list[tuple[str, str, str | None]] = [
     # parameters that belong to no model
@@ -47,37 +59,21 @@ BOUNDS: list[tuple[str, str, str | None]] = [
     ("perception: {fusion_params: {temperature: 2}}", f"{LEFT_OUT} fusion is disconet", None),
     (MAKE % "policy_params: {rho: 1}", "fleet.makes.0.policy_params", MAKE % "policy: worked, policy_params: {rho: 1}"),
     # drones, stations and groups
-    (
-        f"fleet: {{{OLD}, overrides: [{{drone: 1, cycles: 81}}]}}",
-        "fleet.overrides.0.cycles: 81, must be at most twice",
-        f"fleet: {{{OLD}, overrides: [{{drone: 1, cycles: 80}}, {{drone: 0, cycles: 600}}]}}",
-    ),
-    (f"fleet: {{{OLD}, overrides: [{{drone: 0, cycles: 601}}]}}", "fleet.overrides.0.cycles: 601", None),
-    (
-        f"fleet: {{{LEG}, makes: [{{name: high, drones: [1], altitude_offset_m: 11}}]}}",
-        "fleet.makes.0.altitude_offset_m: 11",
-        f"fleet: {{{LEG}, makes: [{{name: high, drones: [1], altitude_offset_m: 10}}]}}",
-    ),
+    (CYCLES % (1, 81), "fleet.overrides.0.cycles: 81, must be at most twice", CYCLES % (1, 80)),
+    (CYCLES % (0, 601), "fleet.overrides.0.cycles: 601", CYCLES % (0, 600)),
+    (OFFSET % 11, "fleet.makes.0.altitude_offset_m: 11", OFFSET % 10),
     ("fleet: {groups: [{drones: [1]}, {drones: [2, 1]}]}", "1, must be named once", None),
     ("fleet: {groups: [{drones: [1]}], ground: [{drone: 1}]}", "1, must be named once", None),
     ("fleet: {ground: [{drone: 1}, {drone: 1}]}", "1, must be named once", None),
     ("fleet: {groups: [{drones: [1, 1]}]}", "1, must be named once", "fleet: {groups: [{drones: [1]}, {drones: [2]}]}"),
     (STATION % ("true", "drone_leaves", ""), "events.0.drone: 1, must be a drone that flies", None),
     (STATION % ("false", "drone_leaves", ""), "events.0.drone: 1, must be a drone that flies", None),
-    (
-        STATION % ("true", "battery_fault", ", lost_fraction: 0.5"),
-        "on mains power",
-        STATION % ("false", "battery_fault", ", lost_fraction: 0.5"),
-    ),
+    (FAULT % "true", "on mains power", FAULT % "false"),
     (GROUP % ("", "2, 1"), "mission.groups.0.reserve: [2, 1], must be some of the group's drones", GROUP % ("", "2")),
     (RESERVE % 2, "mission.groups.0.drones.1: 1", RESERVE % ""),
     (GROUP % ("", "2, 2"), "named once", None),
     (GROUP % ("", "3"), "one of the group's drones", None),
-    (
-        GROUP % ("handover_soc: 0.5,", ""),
-        f"mission.handover_soc: 0.5, {LEFT_OUT} no group has a reserve",
-        GROUP % ("handover_soc: 0.5,", "2"),
-    ),
+    (GROUP % ("handover_soc: 1,", ""), f"1, {LEFT_OUT} no group has a reserve", GROUP % ("handover_soc: 0.5,", "2")),
     # every drone that is named is one of the fleet, every instant within the flight
     ("events: [{kind: link_drop, drone: 0, peer: 5, at_s: 1}]", "events.0.peer: 5", None),
     ("expect_decisions: [{drone: 0, peer: 6, from_s: 1, until_s: 2}]", "expect_decisions.0.peer: 6", None),
@@ -85,22 +81,14 @@ BOUNDS: list[tuple[str, str, str | None]] = [
     (ON_GO % (1, 5), "policy.commands.0.drones.1: 5", ON_GO % (1, 4)),
     ("mission: {groups: [{drones: [0, 9], phases: [{}]}]}", "mission.groups.0.drones.1: 9", None),
     (TARGETS % "", "below 1, the number of targets", TARGETS % "more_targets: [{waypoints_m: [[2, 2]]}],"),
-    (
-        "policy: {replays: [{at_s: 9, drone: 1, view: '{}'}]}",
-        "policy.replays.0.at_s: 9, must be below duration_s",
-        None,
-    ),
+    ("policy: {replays: [{at_s: 9, drone: 1, view: '{}'}]}", "replays.0.at_s: 9, must be below duration_s", None),
     (ON_GO % (9, 4), "policy.commands.0.at_s: 9, must be below duration_s = 9", None),
     ("policy: {changes: [{at_s: 9, name: worked}]}", "policy.changes.0.at_s: 9, must be below duration_s = 9", None),
     ("events: [{kind: drone_lost, drone: 1, at_s: 9}]", "events.0.at_s: 9, must be below duration_s = 9", None),
     *((PHASES % at_s, ", must be above 2", PHASES % 2.001) for at_s in ("2", "2.0", "1.5")),
     # bounds may meet and may not cross
-    ("context: {degraded_after_periods: 3, detached_after_periods: 3}", "context.detached_after_periods: 3", None),
-    (
-        "context: {degraded_after_periods: 4, detached_after_periods: 3}",
-        "context.detached_after_periods: 3",
-        "context: {degraded_after_periods: 3, detached_after_periods: 4}",
-    ),
+    (AGES % (3, 3), "context.detached_after_periods: 3", AGES % (3, 4)),
+    (AGES % (4, 3), "context.detached_after_periods: 3", None),
     ("expect: [{metric: a, at_least: 0.5, at_most: 0.4}]", "0.4", "expect: [{metric: a, at_least: 0.5, at_most: 0.5}]"),
     (DECIDED % 2.9, "until_s: 2.9", DECIDED % 3),
     (WINDOW % 30, "must be at least cw_min = 31", WINDOW % 31),
@@ -108,28 +96,15 @@ BOUNDS: list[tuple[str, str, str | None]] = [
     (EXPECT % "true", f"expect.0.tolerance: 0.1, {LEFT_OUT} equals is True", None),
     (LAND % "{action: land}, {to_m: [2, 2]}", "legs.0.action", LAND % "{to_m: [1, 1]}, {action: land}"),
     # detectors, networks and fusions
-    (
-        DETECTORS % ("surrogate", "none", "weights: w"),
-        "makes.0.weights",
-        DETECTORS % ("surrogate", "torch", "weights: w"),
-    ),
-    (
-        DETECTORS % ("torch", "surrogate", "camera: {width_px: 320}"),
-        "fleet.makes.0.camera.width_px: 320, must be 160",
-        DETECTORS % ("surrogate", "torch", "camera: {width_px: 320}"),
-    ),
+    (DETECTORS % ("surrogate", "none", "weights: w"), ".weights", DETECTORS % ("surrogate", "torch", "weights: w")),
+    (CAMERA % ("torch", "surrogate"), ".camera.width_px: 320, must be 160", CAMERA % ("surrogate", "torch")),
     (
         "fleet: {makes: [{name: none, drones: [1], detector: torch}]}\nperception: {detector: surrogate}",
         "fleet.makes.0.feature_space: 'none', must be another name than that of drones without a network",
         None,
     ),
-    *(
-        (f"perception: {{detector: {wrong}, fusion: 'own.py:F'}}", "built in where detector is", right)
-        for wrong, right in (
-            ("surrogate", "perception: {detector: torch, fusion: 'own.py:F'}"),
-            ("recorded, recording: a.npz", "perception: {detector: none, fusion: 'own.py:F'}"),
-        )
-    ),
+    (FUSION % "surrogate", "built in where detector is", FUSION % "torch"),
+    (FUSION % "recorded, recording: a.npz", "built in where detector is", FUSION % "none"),
     ("policy: {shield: true, invariants: ' '}", "shield", "policy: {shield: true, invariants: 'rate_hz <= 5'}"),
     # presets and keys of long ago
     ("context: {form: papers}", "context.form: 'papers', must be paper, grid_8", "context: {form: paper}"),
@@ -138,16 +113,7 @@ BOUNDS: list[tuple[str, str, str | None]] = [
     ("context: {grid_cells: 8}", "context.grid_cells: unknown key, it belongs in context.form", None),
     ("fleet: {battery: {polarisation_mohm: 5}}", "unknown key, did you mean polarisation?", None),
     # events end after they begin
-    *(
-        (f"events: [{{{event}, at_s: 2, until_s: 2}}]", "events.0.until_s: 2, must be above at_s = 2", right)
-        for event, right in (
-            ("kind: link_drop, drone: 1", "events: [{kind: link_drop, drone: 1, at_s: 2, until_s: 2.001}]"),
-            ("kind: jam, position_m: [0, 0, 9]", "events: [{kind: gnss_loss, at_s: 2, until_s: 2.001}]"),
-            ("kind: gnss_loss", "events: [{kind: spoof, drone: 1, at_s: 2, until_s: 2.001}]"),
-            ("kind: spoof, drone: 1", "events: [{kind: lie, drone: 1, at_s: 2, until_s: 2.001}]"),
-            ("kind: lie, drone: 1", "events: [{kind: jam, position_m: [0, 0, 9], at_s: 2, until_s: 2.001}]"),
-        )
-    ),
+    *((EVENT % (e, 2), "events.0.until_s: 2, must be above at_s = 2", EVENT % (e, 2.001)) for e in EVENTS),
 ]
 """What is refused, in which words, and its neighbour that is accepted."""
 

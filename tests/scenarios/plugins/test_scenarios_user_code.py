@@ -38,51 +38,38 @@ def names(folder: Path) -> list[str]:
 BESIDE = "WHY = 'beside'"
 CLASS = "from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\nclass Why:\n    text: str\n"
 CIRCLE = "import helper\ndef why(): return 'beside' if helper.mine.decide else ''"
-KIT = {"kit/__init__.py": ""}
-FORMS: dict[str, dict[str, str]] = {
-    "import helper" + DECIDE.format("helper.WHY"): {"helper.py": BESIDE},
-    "from helper import WHY" + DECIDE.format("WHY"): {"helper.py": BESIDE},
-    "from helper import *" + DECIDE.format("WHY"): {"helper.py": BESIDE},
-    "from . import helper" + DECIDE.format("helper.WHY"): {"helper.py": BESIDE},
-    "from .helper import WHY" + DECIDE.format("WHY"): {"helper.py": BESIDE},
-    "import helper\n" + DECIDE.format("helper.WHY"): {"helper.py": "from second import WHY", "second.py": BESIDE},
-    "import kit.deep.texts as t" + DECIDE.format("t.WHY"): {
-        **KIT,
-        "kit/deep/__init__.py": "",
-        "kit/deep/texts.py": BESIDE,
-    },
-    "from kit import texts" + DECIDE.format("texts.WHY"): {
-        **KIT,
-        "kit/texts.py": "from ..kit.more import WHY",
-        "kit/more.py": BESIDE,
-    },
-    "import kit.texts" + DECIDE.format("kit.texts.WHY"): {
-        **KIT,
-        "kit/texts.py": "from . import more\nWHY = more.WHY",
-        "kit/more.py": BESIDE,
-    },
-    "import kit.texts\n" + DECIDE.format("kit.texts.WHY"): {"kit/texts.py": BESIDE},  # a folder
-    "import sim, policies.texts" + DECIDE.format("sim.WHY"): {  # named like rooms
-        "sim.py": BESIDE,
-        "policies/__init__.py": "",
-        "policies/texts.py": "",
-    },
-    "import helper" + DECIDE.format("helper.why()"): {
-        "helper.py": "import mine, second\ndef why(): return second.why()",
-        "second.py": CIRCLE,
-    },
-    "from helper import Why" + DECIDE.format("Why('beside').text"): {"helper.py": CLASS},
-    INSIDE.format("from helper import why"): {"helper.py": "def why(): return 'beside'"},
-    INSIDE.format("from .helper import why"): {
-        "helper.py": "def why():\n    import second\n    return second.WHY",
-        "second.py": BESIDE,
-    },
-}
+LATE, TO_MORE = "def why():\n    import second\n    return second.WHY", "from . import more\nWHY = more.WHY"
+IMPORTS: list[tuple[str, str, dict[str, str]]] = [
+    ("import helper", "helper.WHY", {"helper.py": BESIDE}),
+    ("from helper import WHY", "WHY", {"helper.py": BESIDE}),
+    ("from helper import *", "WHY", {"helper.py": BESIDE}),
+    ("from . import helper", "helper.WHY", {"helper.py": BESIDE}),
+    ("from .helper import WHY", "WHY", {"helper.py": BESIDE}),
+    ("import helper", "helper.WHY", {"helper.py": "from second import WHY", "second.py": BESIDE}),
+    (
+        "import kit.deep.t",
+        "kit.deep.t.WHY",
+        {"kit/__init__.py": "", "kit/deep/__init__.py": "", "kit/deep/t.py": BESIDE},
+    ),
+    ("from kit import t", "t.WHY", {"kit/__init__.py": "", "kit/t.py": "from ..kit.m import WHY", "kit/m.py": BESIDE}),
+    ("import kit.t", "kit.t.WHY", {"kit/__init__.py": "", "kit/t.py": TO_MORE, "kit/more.py": BESIDE}),
+    ("import kit.t", "kit.t.WHY", {"kit/t.py": BESIDE}),  # a folder
+    ("import sim, policies.t", "sim.WHY", {"sim.py": BESIDE, "policies/__init__.py": "", "policies/t.py": ""}),  # rooms
+    (
+        "import helper",
+        "helper.why()",
+        {"helper.py": "import mine, second\nwhy = lambda: second.why()", "second.py": CIRCLE},
+    ),
+    ("from helper import Why", "Why('beside').text", {"helper.py": CLASS}),
+]
+FORMS = [(head + DECIDE.format(why), files) for head, why, files in IMPORTS]
+FORMS.append((INSIDE.format("from helper import why"), {"helper.py": "def why(): return 'beside'"}))
+FORMS.append((INSIDE.format("from .helper import why"), {"helper.py": LATE, "second.py": BESIDE}))
 """The policy's text, and the files beside it."""
 
 
 def test_a_policy_imports_what_is_beside_it(tmp_path: Path) -> None:
-    for k, (source, files) in enumerate(FORMS.items()):
+    for k, (source, files) in enumerate(FORMS):
         folder = write(tmp_path / f"form{k}", {"mine.py": START + source, **files})
         before, path = set(sys.modules), list(sys.path)
         assert reason(folder) == "beside", source
