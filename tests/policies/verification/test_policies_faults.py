@@ -1,15 +1,12 @@
-"""Generated policies: a planted fault is never proved, a correct policy is never refuted, and people's faults are shown."""
+"""Policies with the faults that people make, and with faults of large fleets: views alone show them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from policies_corpus import HELPER, LINE, source
 from policies_examples import written
-from policies_faults import LARGE_FAULTS, slivers, unreached, whole_faults
 from policies_honest_faults import HONEST, LARGEST_SHOWN, honest_source
 
 from sortie.policies.verification.invariants.language import parse
@@ -22,6 +19,23 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:Bitwise inversion:DeprecationWarning"),  # from Python 3.12 on
 ]
 
+LARGE_FAULTS = (
+    ("bad = len(view.peers) >= 11", LINE),
+    ("bad = sum(1 for p in view.peers) // 40 >= 1", LINE),
+    ("bad = view.full_sharing_maps in range(25, 250)", LINE),
+    ("bad = view.ego == 90", LINE),
+    ("bad = list(range(len(me.peer_goodput_mbps)))[18:] != []", LINE),
+    ("try:\n    list(range(len(view.peers)))[16]\n    bad = True\nexcept IndexError:\n    pass", LINE),
+    ("bad = False", "count_links(representation > none) <= 13"),
+    ("bad = False", "sum_links(rate_hz) <= 30"),
+    ("bad = False", "when peers >= 60: every_link(representation >= features)"),
+    ("bad = len(view.peers) > 3000", LINE),
+    ("bad = any(p > 4000 for p in view.peers)", LINE),
+    ("bad = len(view.peers) == 777", LINE),
+    ("bad = me.roster is not None and len(me.roster.members) < 60 < len(view.peers)", LINE),
+)
+"""Faults of fleets that are larger than those that are searched by default, up to the largest: a body and its line."""
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -32,18 +46,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def verdicts(folder: Path, text: str, line: str = LINE, views: int = 0) -> list[ProofVerdict]:
     return prove(written(folder, text), parse(line), max_drones=2, cells=100_000, views=views)
-
-
-@settings(max_examples=100)
-@given(text=st.one_of(whole_faults(), slivers()))
-def test_a_generated_fault_is_refuted_or_the_policy_is_not_followed(folder: Path, text: str) -> None:
-    assert verdicts(folder, text)[-1].outcome in ("refuted", "tried"), text
-
-
-@settings(max_examples=60)
-@given(text=unreached())
-def test_a_generated_correct_policy_is_not_refuted(folder: Path, text: str) -> None:
-    assert "refuted" not in [v.outcome for v in verdicts(folder, text)], text
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import random
-import time
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -164,27 +163,14 @@ def test_a_sound_policy_passes_with_every_rule_named_once() -> None:
         assert [c.name for c in checks] == [*RULES, "time per decision"]
 
 
-def test_a_slow_policy_is_unusual(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is told as a warning: no verdict depends on the machine's speed."""
-
-    def dawdles(view: FleetView) -> list[Directive]:
-        end_ns = time.thread_time_ns() + 300_000
-        while len(view.descriptors) == 20 and time.thread_time_ns() < end_ns:
-            pass
-        return boxes(view)
-
-    monkeypatch.setattr(conformance, "DECISION_LIMIT_S", 0.0002)
-    check = verdicts(dawdles)["time per decision"]
-    assert (check.verdict, check.holds) == ("unusual", True)
-    assert "at 20 drones, more than 0.2 ms" in check.what
-
-
 @pytest.mark.parametrize(("least_ms", "verdict"), [(2, "holds"), (11, "unusual")])
 def test_a_busy_machine_makes_no_policy_slow(least_ms: int, verdict: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Other programs take the processor's caches, so that most decisions take ten times as long as the policy needs."""
     now_ns = itertools.accumulate(itertools.cycle([10, 10, 1]), lambda t, factor: t + factor * least_ms * 1_000_000)
     monkeypatch.setattr(conformance, "time", SimpleNamespace(thread_time_ns=now_ns.__next__))
-    assert conformance._decides_in_time(share).verdict == verdict
+    check = conformance._decides_in_time(share)
+    assert (check.verdict, check.holds) == (verdict, True), "a warning: no verdict depends on the machine's speed"
+    assert verdict == "holds" or "more than 10 ms" in check.what
 
 
 def test_a_policy_that_reads_the_time_is_unusual_and_fails_no_rule() -> None:
