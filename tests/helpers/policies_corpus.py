@@ -82,7 +82,7 @@ FOUND = (
     "x = first\nwhile x > 5:\n    bad = x <= 7\n    break",
     "if (x := soc) > 0.4:\n    bad = x <= 0.4000001",
     "bad = (0.4, 9) < (soc, 0) and [soc] <= [0.4000001] and soc != 0.4",
-    "def climb(x, cs):\n    return 0 if not cs or x <= cs[0] else 1 + climb(x, cs[1:])\nbad = climb(first, [5, 7]) == 1",
+    "def up(x, c):\n    return 0 if not c or x <= c[0] else 1 + up(x, c[1:])\nbad = up(first, [5, 7]) == 1",
     "bad = 'lmh'[(first > 5) + (first > 7)] == 'm'",
     "bad = max([(soc > 0.4, 'a'), (soc > 0.4000001, 'b')])[1] == 'a' and soc > 0.4",
     "match soc:\n    case x if 0.4 < x <= 0.4000001:\n        bad = True",
@@ -160,8 +160,8 @@ FILES = {
     "a closure": f"def make():\n    {_COUNTS}\n    return decide\ndecide = make()",
     "a generator": "COUNT = (n for n in range(10**9))\ndef decide(view):\n    return usual(view, next(COUNT) > 99999)",
     "a cache": "@functools.lru_cache\ndef box():\n    return []\ndef decide(view):\n    return usual(view, box())",
-    "a decorator": "def noisy(f):\n    return lambda view: f(view)\n@noisy\ndef decide(view):\n    return usual(view, True)",
-    "its directives": "class D(Directive):\n    rate_hz = 2.0\ndef decide(view):\n    return [D(*d) for d in usual(view, True)]",
+    "a decorator": "def loud(f):\n    return lambda v: f(v)\n@loud\ndef decide(view):\n    return usual(view, True)",
+    "a class": "class D(Directive):\n    rho = 0.0\ndef decide(view):\n    return [D(*d) for d in usual(view, True)]",
 }
 """Whole files after `HEAD` and `USUAL`, each with a fault, and none is followed."""
 
@@ -195,6 +195,6 @@ _CAPPED = "[d._replace(rate_hz=min(d.rate_hz, 9.0), reason=f'capped: {d.reason}'
 PROVED_FILES = {
     "a catalogue's": f"from sortie.policies.catalogue.worked import worked\ndef decide(view):\n    return {_CAPPED}",
     "a viewpoint": f"{_NEAR}\n@looks_from(near)\ndef decide(view):\n    return usual(view)",
-    "a network": "@boxes_across_networks\ndef decide(view: FleetView, *, rho: float = 0.5):\n    return usual(view, rho=rho)",
+    "a network": "@boxes_across_networks\ndef decide(view: FleetView, *, rho=0.5):\n    return usual(view, rho=rho)",
 }
 """Whole files after `HEAD` and `USUAL`, in plain Python that keeps the line."""

@@ -1,7 +1,7 @@
 """Faulty policies as people write them by mistake: the invariants that each promises, and the body of its `decide`.
 
-The body may use `view`, its `me`, `peers` and `soc`, the function `links(representation, rate_hz, **fields)`, which makes
-a directive for each peer, and the dictionary `STATE`, which stays between decisions.
+The body may use `view`, its `me`, `peers`, `soc` and `age_s`, and the functions `links(representation, rate_hz, …)` and
+`at(rate_of)`, which make a directive for each peer. The dictionary `STATE` stays between decisions.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The checks of what a policy or a viewpoint returns: each field, each type, each link; a repeated answer as strictly."""
+"""The checks of what a policy or a viewpoint returns: each field, type and link; a repeated answer as strictly."""
 
 from __future__ import annotations
 

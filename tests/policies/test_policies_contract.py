@@ -1,4 +1,4 @@
-"""The contract's types: their numbers, what a view and a roster say of a fleet, and when two directives are the same."""
+"""The contract's types: numbers, what a view and a roster say of a fleet, and when two directives are the same."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ directives = st.builds(
 
 
 def least(asked: list[Directive]) -> Directive:
-    """The least of several directives in every part. A representation brings its own ρ, and a lower one its own disc."""
+    """The least of several directives in every part. A representation brings its own ρ, a lower one its disc."""
     rung = min(d.representation for d in asked)
     if rung == Representation.NONE:
         return NOTHING._replace(duty_percent=min(d.duty_percent for d in asked))

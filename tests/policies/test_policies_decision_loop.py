@@ -24,7 +24,7 @@ def let_pass(view: FleetView, now_s: float, links: Sequence[Steps]) -> list[Dire
 
 @pytest.mark.parametrize("number", range(2))
 def test_a_link_that_is_left_out_would_not_have_changed(number: int) -> None:
-    """The loop steps only links that may change. Compared with staleness and damping of every link at every decision."""
+    """The loop steps only links that may change. Compared with staleness and damping of every link each time."""
     course = draw_course(number, Course(3, 60, 0.1, 0.1, 10.0, {}), values_at([0.3, 5.0]))
     plain, guarded, changes = DecisionLoop(0, RULES), DecisionLoop(0, RULES, let_pass), 0
     states = {peer: DampedLink(nothing(0, peer, "")) for peer in (1, 2)}

@@ -44,7 +44,7 @@ def view_of_four() -> FleetView:
 
 
 def test_every_number_of_an_observation_by_hand() -> None:
-    """The ego first, then the others in the order that was asked for; who was not heard has zeros; places end at 1 km."""
+    """The ego first, then the others in the order asked for; who was not heard has zeros; places end at 1 km."""
     phases = {p: [float(p == q) for q in TaskPhase] for p in TaskPhase}
     moves = {1: [0, 0, 0, 0.5, -0.2, 0.1], 0: [-0.1, 0.3, 0.15, -0.3, 0.4, 0.05], 3: [10.0, 0, 0, 0, 0, 0]}
     states = {

@@ -1,4 +1,4 @@
-"""From a policy's name to its function: parameters and their bounds, budgets, viewpoints, and what a wrong name says."""
+"""From a policy's name to its function: parameters and bounds, budgets, viewpoints, and what a wrong name says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small parts that all rooms share: states of a link, draws, sums, digests of code, pages, shipped files and temporary ones."""
+"""Small parts that all rooms share: links, draws, sums, digests, pages, shipped files and temporary ones."""
 
 from __future__ import annotations
 

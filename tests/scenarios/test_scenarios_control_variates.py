@@ -142,6 +142,7 @@ def test_the_quantity_that_needs_most_decides_a_plan(order: tuple[int, int]) -> 
 def test_units_that_are_measured_already_are_not_planned_away() -> None:
     one = quantity(1.0, 0.8)
     free = plan_units([one], 0.5, 20.0, 1.0)
+    assert plan_units([one], 0.5, 20.0, 1.0, measured=free.expensive) == free
     more = plan_units([one], 0.5, 20.0, 1.0, measured=free.expensive + 3)
     assert more.expensive == free.expensive + 3
     assert more.cheap < free.cheap

@@ -1,4 +1,4 @@
-"""Intervals of means: Student's, in their range, and how often they cover; differences of pairs; every metric has its range."""
+"""Intervals of means: Student's, in their range, and how often they cover; differences; every metric's range."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_equal_values_are_their_own_interval_and_impossible_ones_are_refused() -
     ids=["differences", "rates", "rates near both ends", "bytes"],
 )
 def test_eight_units_cover_as_promised(draw: object, within: Range, true: float) -> None:
-    """93 to 98 %, within which Student's interval of eight stays for these; a percentile bootstrap covers about 90 %."""
+    """93 to 98 %, within which Student's interval of eight stays here; a percentile bootstrap covers about 90 %."""
     rng = np.random.default_rng(0)
     found = [mean_interval(draw(rng), within) for _ in range(4000)]  # type: ignore[operator]
     assert 0.93 < np.mean([e.low <= true <= e.high for e in found]) < 0.98

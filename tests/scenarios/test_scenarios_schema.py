@@ -1,4 +1,4 @@
-"""The schema of scenarios: what one section says against another, at both sides of each bound, and what follows from it."""
+"""The schema of scenarios: what one section says against another, at both sides of each bound."""
 
 from __future__ import annotations
 
@@ -221,7 +221,8 @@ def test_a_make_s_network_and_codebook_are_its_own_or_the_fleet_s() -> None:
 
 
 def test_makes_stations_and_overrides_by_hand() -> None:
-    makes = "makes: [{name: b, drones: [0, 1], altitude_offset_m: 20}, {name: s, drones: [3], detector: none, compute_delay_s: 0}]"
+    blind = "{name: s, drones: [3], detector: none, compute_delay_s: 0}"
+    makes = f"makes: [{{name: b, drones: [0, 1], altitude_offset_m: 20}}, {blind}]"
     stations = "ground: [{drone: 1, position_m: [0, 0, 7]}, {drone: 2, camera: true}]"
     made = scenario(f"fleet: {{drones: 4, {makes}, {stations}}}\nperception: {{compute_delay_s: 0.05}}")
     assert made.fleet.altitudes_m[:2] == (80.0, 7.0), "a station stands where it stands"
@@ -276,7 +277,8 @@ def test_a_preset_s_name_stands_for_its_values_and_single_ones_stay_settable() -
     changed = loads("name: a\n", overrides=overrides)
     assert changed.context.form == small.model_copy(update={"number_bits": 12})
     assert changed.fleet.airframe == Airframe(payload_kg=0.3)
-    text = "name: a\nfleet: {makes: [{name: m, drones: [1], airframe: {mass_kg: 5}}, {name: k, drones: [2], airframe: solo}]}"
+    heavy = "{name: m, drones: [1], airframe: {mass_kg: 5}}"
+    text = f"name: a\nfleet: {{makes: [{heavy}, {{name: k, drones: [2], airframe: solo}}]}}"
     _, make = loads(text, overrides=["fleet.makes.1.airframe.payload_kg=0.3"]).fleet.makes
     assert make.airframe == Airframe.model_validate({**Airframe.presets["solo"], "payload_kg": 0.3})
 

@@ -75,7 +75,7 @@ def test_every_sender_spends_its_whole_budget_up_to_a_map_a_link() -> None:
 
 @pytest.mark.parametrize("heard", [1, 2, 4])
 def test_a_budget_is_of_the_fleet_whoever_was_heard(heard: int) -> None:
-    """In a fleet of five, of which some are unknown: links that there are get what they would get, up to a whole map."""
+    """In a fleet of five with some unknown: links that there are get what they would get, up to a whole map."""
     view = without(fleet_of(5), *range(heard + 1, 5))
     assert view.full_sharing_maps == 4
     for d in baselines.everyone(view, received_budget=0.1):

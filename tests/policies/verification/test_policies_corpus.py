@@ -1,4 +1,4 @@
-"""No wrong proof: a planted fault is found or the policy is not followed, and correct policies in plain Python are proved."""
+"""No wrong proof: a planted fault is found or not followed, and correct policies in plain Python are proved."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Courses of views: signals become views, each number is another course, and shrinking leaves what the failure needs."""
+"""Courses of views: signals become views, each number is another course, shrinking leaves what a failure needs."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from policies_examples import aged, changed, fleet_of, without
+from policies_examples import aged, fleet_of, without
 
 from sortie.policies.contract import (
     Directive,
@@ -230,7 +230,6 @@ def test_ages_are_raised_one_by_one_and_all_together_beyond_both_thresholds() ->
 def test_without_the_detached_all_else_is_as_it_was() -> None:
     assert without_detached(VIEW, aged(VIEW, {1: 5.0, 2: 1.9})) == without(VIEW, 1)
     assert without_detached(VIEW, VIEW) is VIEW
-    assert changed(VIEW, 1, battery_soc=0.5).descriptors[1].battery_soc == 0.5
 
 
 def link(peer: int, rung: Representation, rho: float = 0.0, rate_hz: float = 2.0) -> Directive:

@@ -94,7 +94,7 @@ FAULTS: list[tuple[str, str, str, list[str], str]] = [
         "reason is 5, must be text",
     ),
 ]
-"""What a policy computes, what it changes, a line, the verdicts on contract, age and line, and words of the first fault."""
+"""What a policy computes and changes, a line, the verdicts on contract, age and line, and words of the first fault."""
 
 
 def test_faults_of_the_contract_of_age_and_of_a_line_are_told_apart(tmp_path: Path) -> None:

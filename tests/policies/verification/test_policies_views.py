@@ -177,7 +177,12 @@ def test_drones_of_the_largest_fleet_have_rosters_as_in_flight() -> None:
         assert min(sizes) < 8 < max(sizes) <= LISTED_MEMBERS
         assert any(len(view.descriptors.keys() & set(roster.members)) > 30 for roster in rosters)
     tried = list[int]()
-    small = shrink(everyone, lambda view: tried.append(1) or 4321 in view.descriptors)  # type: ignore[func-returns-value]
+
+    def has_4321(view: FleetView) -> bool:
+        tried.append(1)
+        return 4321 in view.descriptors
+
+    small = shrink(everyone, has_4321)
     assert set(small.descriptors) == {everyone.ego, 4321}
     assert len(tried) < 300
     assert small.descriptors[4321].roster == everyone.descriptors[4321].roster, "else it would not be listed"
