@@ -19,6 +19,19 @@ def still(positions_m: NDArray[np.float64], frames: int = 20_000) -> NDArray[np.
     return np.broadcast_to(positions_m, (frames, *positions_m.shape))
 
 
+def tilting(frames: int, n: int) -> NDArray[np.float64]:
+    """[frames, n, 3]: every drone's own axis, another in every frame."""
+    k, i = np.arange(frames)[:, None], np.arange(n)
+    tilt, turn = 0.2 + 0.5 * np.sin(0.05 * k + i) ** 2, 0.11 * k + 2.0 * i
+    return np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=-1)
+
+
+def moving(frames: int, n: int) -> NDArray[np.float64]:
+    """[frames, n, 3]: a row that spreads, at several heights."""
+    k, i = np.arange(frames)[:, None], np.arange(n)
+    return np.stack([i * 30.0 + 0.03 * k * i, 5.0 * np.sin(0.02 * k + i), 40.0 + 7.0 * i + 0.0 * k], axis=-1)
+
+
 def fades_db(settings: AirSettings, n: int, frames: int, seed: int = 1, per_frame: int = 1) -> np.ndarray:
     """[frames, n, n]: the fades of group frames that stations send one after another, sender by receiver; NaN to itself.
 

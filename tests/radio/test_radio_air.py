@@ -1,148 +1,81 @@
-"""The air as a whole: fates, repairs, goodput as measured, conservation, determinism."""
+"""The air as a whole: fates of samples, accounts, descriptors, silenced drones, conservation, determinism."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
 from math import isnan
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import simpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from radio_examples import CROSS_M, still
+from radio_examples import CROSS_M
+from radio_flights import Hover, trace
+from wrong_rows import wrong_rows
 
-from sortie.radio import Air, Status, Transmission
-from sortie.radio.goodput import Goodput
+from sortie.radio import Air, Status
+from sortie.radio.counters import CAUSES, Counters
+from sortie.radio.mac.broadcasts import Broadcasts
 from sortie.radio.rates import STANDARDS
-from sortie.radio.settings import AirSettings
-from sortie.scenarios.link_state import SILENT_MBPS, LinkState, state_of
+from sortie.radio.settings import AirSettings, BurstSettings
+from sortie.scenarios.link_state import SILENT_MBPS
 
+CALM = AirSettings(shadowing_sigma_db=0.0)
 DEFAULT = AirSettings()
-STILL = AirSettings(shadowing_sigma_db=0.0)
 
 
-class Flight:
-    """A fleet that hovers in a cross; `tick` is called in every frame after the links have moved on."""
-
-    def __init__(
-        self, config: AirSettings = DEFAULT, n: int = 5, *, seed: int = 1, replication: int = 0, spread: float = 0.8
-    ) -> None:
-        self.env = simpy.Environment()
-        self.n = n
-        self.air = Air(
-            self.env, config, still(CROSS_M[:n]), seed=seed, replication=replication, frame_s=0.1, publish_spread=spread
-        )
-        self.rows: list[Transmission] = []
-        self.heard: list[tuple[float, int, tuple[int, ...]]] = []
-        self.extra = np.zeros((n, n))
-
-    def send(
-        self,
-        sender: int,
-        receiver: int,
-        payload: int,
-        *,
-        kind: str = "f",
-        reliable: bool = False,
-        deadline_s: float = 0.1,
-    ) -> int:
-        return self.air.send(
-            sender, receiver, payload, kind=kind, reliable=reliable, deadline_s=deadline_s, on_done=self.rows.append
-        )
-
-    def publish(self, sender: int) -> None:
-        self.air.broadcast(sender, 208, lambda ids: self.heard.append((self.env.now, sender, tuple(ids))))
-
-    def fly(self, duration_s: float, tick: Callable[[float], object] = lambda t: None) -> Flight:
-        def frames() -> simpy.events.ProcessGenerator:
-            for k in range(round(duration_s * 10)):
-                if k:
-                    yield self.env.timeout(k / 10 - self.env.now)
-                self.air.advance(self.extra)
-                tick(k / 10)
-
-        self.env.process(frames())
-        self.env.run(until=duration_s)
-        return self
-
-    def everyone(
-        self, payload: int, *, peers: int = 4, deadline_s: float = 0.1, reliable: bool = False
-    ) -> Callable[[float], None]:
-        def tick(_: float) -> None:
-            for i in range(self.n):
-                for j in range(1, peers + 1):
-                    self.send(i, (i + j) % self.n, payload, deadline_s=deadline_s, reliable=reliable)
-
-        return tick
+def everyone(f: Hover, payload: int, *, peers: int = 4, deadline_s: float = 0.1) -> None:
+    """Each drone sends a payload to so many others."""
+    for i in range(f.n):
+        for j in range(1, peers + 1):
+            f.send(i, (i + j) % f.n, payload, deadline_s=deadline_s)
 
 
-def test_full_sharing_does_not_fit_one_channel() -> None:
-    f = Flight()
-    f.fly(5.0, f.everyone(655_360, deadline_s=0.09))
+def test_full_sharing_does_not_fit_one_channel_and_two_percent_of_the_cells_do() -> None:
+    f = Hover(DEFAULT, n=5)
+    f.fly(5.0, lambda _: everyone(f, 655_360, deadline_s=0.09))
     fates = Counter((r.status, r.reason) for r in f.rows)
     assert f.air.utilisation > 0.8  # backoffs, and idle between a deadline and the next frame
-    assert fates[Status.EXPIRED, "deadline_queued"] > 100
-    assert fates[Status.EXPIRED, "deadline_in_service"] > 100
+    assert min(fates[Status.EXPIRED, f"deadline_{where}"] for where in ("queued", "in_service")) > 100
     assert f.air.counters.data_delivered_bytes < 0.5 * f.air.counters.data_sent_bytes
-    f = Flight()
-    f.fly(5.0, f.everyone(655_360, deadline_s=10.0))
-    assert f.air.utilisation > 0.9  # the rest are backoffs
-    assert Counter(r.reason for r in f.rows)["replaced"] > 100
-
-
-def test_two_percent_of_the_cells_fit_without_a_miss() -> None:
-    f = Flight()
-    f.fly(5.0, f.everyone(13_120))
-    assert {r.status for r in f.rows} == {Status.DELIVERED}
-    assert len(f.rows) == 5 * 4 * 50
-    assert f.air.utilisation < 0.2
+    late = Hover(DEFAULT, n=5)
+    late.fly(5.0, lambda _: everyone(late, 655_360, deadline_s=10.0))
+    assert late.air.utilisation > 0.9  # the rest are backoffs
+    assert Counter(r.reason for r in late.rows)["replaced"] > 100
+    few = Hover(DEFAULT, n=5)
+    few.fly(5.0, lambda _: everyone(few, 13_120))
+    assert Counter(r.status for r in few.rows) == {Status.DELIVERED: 5 * 4 * 50}
+    assert few.air.utilisation < 0.2
 
 
 def test_the_row_of_one_sample() -> None:
-    f = Flight(AirSettings(shadowing_sigma_db=0.0, tx_power_dbm=30.0))
-    f.fly(0.2, lambda t: t == 0 and f.send(0, 1, 2000, kind="features"))
+    f = Hover(replace(CALM, tx_power_dbm=30.0)).fly(0.1)
+    begin_s = f.env.now
+    f.send(0, 1, 2000, kind="features", deadline_s=0.1)
+    f.env.run(until=0.2)
     (row,) = f.rows
-    assert (row.number, row.sender, row.receiver, row.kind, row.payload_bytes) == (0, 0, 1, "features", 2000)
-    assert (row.status, row.reason, row.fragments, row.fragments_lost, row.repairs) == (Status.DELIVERED, "", 2, 0, 0)
-    assert row.wire_bytes == 2000 + 2 * 150
-    assert row.mcs == 11
-    assert row.t_sent_s == row.t_start_s == 0.0
     ppdu_s = 44e-6 + 13.6e-6 * 3
+    wanted = dict(
+        number=0, sender=0, receiver=1, kind="features", payload_bytes=2000, status=Status.DELIVERED, reason=""
+    )
+    wanted |= dict(
+        fragments=2, fragments_lost=0, repairs=0, wire_bytes=2000 + 2 * 150, mcs=11, deadline_s=begin_s + 0.1
+    )
+    wanted |= dict(t_sent_s=begin_s, t_start_s=begin_s, hops=1, arrived_bytes=2000, missing=())
+    assert {name: getattr(row, name) for name in wanted} == wanted
     assert row.airtime_s == pytest.approx(ppdu_s + 16e-6 + 32e-6)  # with its block ack
-    assert ppdu_s <= row.t_done_s <= ppdu_s + 9e-6  # at once on an idle medium, at the next slot
-    assert row.deadline_s == 0.1
-
-
-def test_a_lossy_link_loses_best_effort_samples_and_repairs_reliable_ones() -> None:
-    edge = AirSettings(shadowing_sigma_db=0.0, rician_k_db=3.0, retry_limit=0)  # every failed frame is a lost fragment
-    fates = {}
-    for reliable in (False, True):
-        f = Flight(edge, 2)
-        f.fly(20.0, lambda t, f=f, r=reliable: f.send(0, 1, 30_000, reliable=r))
-        fates[reliable] = f.rows
-    assert all(r.status in (Status.DELIVERED, Status.LOST) for r in fates[False])
-    lost = [r for r in fates[False] if r.status is Status.LOST]
-    assert len(lost) > 10
-    assert {r.reason for r in lost} == {"fragment_lost"}
-    assert all(r.fragments_lost > 0 and r.t_done_s - r.t_sent_s < 0.01 for r in lost)
-    repaired = [r for r in fates[True] if r.repairs]
-    assert len(repaired) > 10
-    for r in repaired:
-        assert r.status is Status.DELIVERED
-        assert r.t_done_s - r.t_sent_s > 0.025 * r.repairs  # heartbeat + NACK delay, each round
-        once = max(x.wire_bytes for x in fates[True] if not x.repairs)
-        assert once < r.wire_bytes <= once + r.fragments_lost * 1494 + r.repairs * 300  # what was lost, no more
-    f = Flight(edge, 2)
-    f.fly(20.0, lambda t: f.send(0, 1, 30_000, reliable=True, deadline_s=0.02))
-    assert {(r.status, r.reason) for r in f.rows if r.fragments_lost} == {(Status.EXPIRED, "deadline_in_service")}
+    assert ppdu_s <= row.t_done_s - begin_s <= ppdu_s + 9e-6  # at once on an idle medium, at the next slot
 
 
 def test_a_dead_link_costs_a_few_tries_and_says_so() -> None:
-    f = Flight(STILL, 3)
-    f.extra[0, 1] = 90.0
-    f.fly(1.0, lambda t: (f.send(0, 1, 50_000), f.send(0, 2, 50_000)))
+    f = Hover(CALM, n=3)
+    f.extra = np.array([[0.0, 90.0, 0.0], [0.0] * 3, [0.0] * 3])
+    f.fly(1.0, lambda _: (f.send(0, 1, 50_000), f.send(0, 2, 50_000)))
     fates = Counter((r.receiver, r.status, r.reason) for r in f.rows)
     assert fates == {(1, Status.LOST, "no_link"): 10, (2, Status.DELIVERED, ""): 10}
     assert all(r.airtime_s < 10e-3 and r.mcs == -1 and r.wire_bytes == 0 for r in f.rows if r.receiver == 1)
@@ -151,48 +84,17 @@ def test_a_dead_link_costs_a_few_tries_and_says_so() -> None:
 
 
 def test_a_newer_sample_replaces_the_older_of_its_kind_only() -> None:
-    f = Flight(STILL, 2)
-
-    def tick(t: float) -> None:
-        if t == 0:
-            for kind in ("features", "detections", "features"):
-                f.send(0, 1, 600_000, kind=kind)
-
-    f.fly(0.1, tick)
+    f = Hover(CALM).fly(0.1)
+    for kind in ("features", "detections", "features"):
+        f.send(0, 1, 600_000, kind=kind)
+    f.env.run(until=0.2)
     assert [(r.number, r.reason) for r in f.rows] == [(0, "replaced"), (1, ""), (2, "")]
     assert isnan(f.rows[0].t_start_s) or f.rows[0].airtime_s == 0.0
 
 
-def test_a_silenced_drone_neither_sends_nor_hears() -> None:
-    f = Flight(STILL)
-
-    def tick(t: float) -> None:
-        for i in range(5):
-            f.publish(i)
-        if t == 0.5:
-            f.send(2, 1, 600_000)
-            f.send(1, 2, 600_000)
-            f.air.silence(2)
-            f.send(2, 1, 600_000)
-            f.send(1, 3, 1000)
-
-    f.fly(1.0, tick)
-    late = [(sender, ids) for t, sender, ids in f.heard if t > 0.5]
-    assert all(sender != 2 and 2 not in ids for sender, ids in late)
-    assert any(ids for _, ids in late)
-    assert any(2 in ids for t, _, ids in f.heard if t < 0.5)
-    fates = {r.number: (r.status, r.reason) for r in f.rows}
-    assert fates == {
-        0: (Status.LOST, "sender_gone"),
-        1: (Status.LOST, "receiver_gone"),
-        2: (Status.LOST, "sender_gone"),
-        3: (Status.DELIVERED, ""),
-    }
-
-
 def test_what_a_silenced_drone_had_put_on_the_air_is_counted() -> None:
-    def wire_bytes(end: Callable[[Flight], object]) -> int:
-        f = Flight(STILL, 2)
+    def wire_bytes(end: Callable[[Hover], object]) -> int:
+        f = Hover(CALM)
         f.air.advance()
         f.send(0, 1, 600_000)
         f.env.timeout(0.01).callbacks.append(lambda _: end(f))
@@ -205,23 +107,22 @@ def test_what_a_silenced_drone_had_put_on_the_air_is_counted() -> None:
     assert silenced == wire_bytes(lambda f: f.send(0, 1, 1)) > 100_000  # as one that is replaced then
 
 
-@pytest.mark.parametrize("end", [lambda air: None, lambda air: air.silence(0)], ids=["it flies on", "it is lost"])
-def test_a_descriptor_on_the_air_counts_as_heard_and_missed_whatever_becomes_of_its_sender(
-    end: Callable[[Air], None],
-) -> None:
-    f = Flight(STILL, 3, spread=0.0)
-    f.extra[0, 2] = 200.0
-    f.air.advance(f.extra)
-    f.publish(0)
-    f.env.timeout(2e-4).callbacks.append(lambda _: end(f.air))
-    f.env.run(until=0.01)
-    assert [(sender, ids) for _, sender, ids in f.heard] == [(0, (1,))]
-    assert (f.air.counters.receptions, f.air.counters.missed) == (1, 1)
-    assert f.air.counters.lost_to["weak_signal"] == 1
+def test_a_descriptor_on_the_air_counts_as_heard_and_missed_whatever_becomes_of_its_sender() -> None:
+    def check(end: Callable[[Air], None]) -> None:
+        f = Hover(CALM, n=3, spread=0.0)
+        f.air.advance(np.array([[0.0, 0.0, 200.0], [0.0] * 3, [0.0] * 3]))
+        f.publish(0)
+        f.env.timeout(2e-4).callbacks.append(lambda _: end(f.air))
+        f.env.run(until=0.01)
+        assert [(sender, ids) for _, sender, ids in f.heard] == [(0, (1,))]
+        assert (f.air.counters.receptions, f.air.counters.missed) == (1, 1)
+        assert f.air.counters.lost_to["weak_signal"] == 1
+
+    assert wrong_rows([lambda air: None, lambda air: air.silence(0)], check) == {}
 
 
 def test_what_is_in_flight_at_the_end_is_told() -> None:
-    f = Flight(STILL, 2)
+    f = Hover(CALM)
     f.air.advance()
     f.send(0, 1, 2_000_000)
     f.send(0, 1, 1000, kind="d")
@@ -235,73 +136,141 @@ def test_what_is_in_flight_at_the_end_is_told() -> None:
     assert f.air.data_in_flight_bytes == 2_001_000
 
 
-# --- goodput as measured -----------------------------------------------------------------------------
+@pytest.mark.parametrize("hops", [1, 3])
+def test_a_silenced_drone_has_no_link_sends_nothing_and_is_reached_by_nothing(hops: int) -> None:
+    flight = Hover(AirSettings(shadowing_sigma_db=0.0, relay_max_hops=hops), n=4)
+    numbers: dict[int, tuple[int, int]] = {}
+
+    def tick(k: int) -> None:
+        if k == 3:
+            for j in (0, 2):
+                numbers[flight.send(1, j, 200_000, deadline_s=5.0)] = (1, j)  # has to be dropped
+            flight.publish(1)  # its frame waits for its moment
+            flight.air.silence(1)
+        if k >= 3:
+            mbps = flight.air.link_mbps()
+            assert not mbps[1].any()
+            assert not mbps[:, 1].any()
+            assert (mbps[np.ix_([0, 2, 3], [0, 2, 3])][~np.eye(3, dtype=bool)] > 0).all()
+        for i in (0, 2, 3):
+            flight.publish(i)
+            numbers[flight.send(i, 1, 3000)] = (i, 1)
+            numbers[flight.send(i, (2, 0, 0, 2)[i], 3000)] = (i, (2, 0, 0, 2)[i])
+
+    flight.fly(1.0, tick)
+    from_gone = [r for r in flight.rows if r.sender == 1]
+    assert [r.reason for r in from_gone] == ["sender_gone"] * 2
+    gone_s = 0.3
+    assert {r.reason for r in flight.rows if r.receiver == 1 and r.t_sent_s > gone_s} == {"receiver_gone"}
+    for t_s, sender, heard in flight.heard:
+        if t_s > gone_s + 1e-3:
+            assert sender != 1
+            assert 1 not in heard
+    others = [r for r in flight.rows if 1 not in (r.sender, r.receiver)]
+    assert sum(r.status == "delivered" for r in others) > 0.9 * len(others)
+    assert flight.air.airtime_s[1] < 1e-3 * 5
 
 
-def test_goodput_of_a_large_sample_is_its_bits_over_its_time() -> None:
-    f = Flight(STILL, 2)
-    f.fly(0.1, lambda t: f.send(0, 1, 64 * 1344 * 5))
-    (row,) = f.rows
-    mbps = row.payload_bytes * 8e-6 / (row.t_done_s - row.t_start_s)
-    assert (
-        0.95 * mbps < f.air.goodput_mbps(0)[0] <= mbps
-    )  # never above what backoffs leave; its first exchange had none
-    assert f.air.goodput_mbps(1) == (0.0,)  # nothing sent, nothing known
+def test_a_silenced_drone_answers_nobody(tmp_path: Path) -> None:
+    """Also not who asks what has arrived of frames that were sent before."""
+    settings = AirSettings(shadowing_sigma_db=0.0, trace=trace(tmp_path, "0,0,1,,0.9,"))
+    asked = 0
+    for seed in range(12):
+        flight = Hover(settings, n=2, seed=seed)
+        flight.air.advance()
+        flight.send(0, 1, 2500, deadline_s=0.09)
+        flight.env.run(until=0.002)
+        flight.air.silence(1)
+        before_s = flight.air.airtime_s[1]
+        flight.env.run(until=0.09)
+        assert flight.air.airtime_s[1] == before_s, seed
+        asked += [row.reason for row in flight.rows] == ["receiver_gone"]
+    assert asked > 6
 
 
-@pytest.mark.parametrize("payload", [50_000, 163_840, 655_360])
-def test_a_drop_of_30_db_shows_within_one_frame(payload: int) -> None:
-    f = Flight()
-    read: dict[float, tuple[float, ...]] = {}
-
-    def tick(t: float) -> None:
-        read[round(t, 1)] = f.air.goodput_mbps(2)
-        if t >= 1.9:
-            f.extra[2, :] = f.extra[:, 2] = 30.0  # in force from 2.0
-        send = f.everyone(payload, deadline_s=0.065)
-        f.env.timeout(0.03).callbacks.append(lambda _: send(t))
-
-    f.fly(3.0, tick)
-    assert max(read[2.0]) > 20
-    assert max(read[2.1]) < 5
-
-
-def test_small_samples_show_that_a_link_has_recovered() -> None:
-    f = Flight(STILL, 3)
-    read: dict[float, float] = {}
-
-    def tick(t: float) -> None:
-        t = round(t, 1)
-        read[t] = f.air.goodput_mbps(0)[0]
-        f.extra[0, 1] = 60.0 if 0.9 <= t < 1.9 else 0.0  # in force from 1.0 to 2.0
-        if t * 2 == int(t * 2):
-            f.send(0, 1, 150, kind="detections")
-
-    f.fly(4.0, tick)
-    assert read[0.9] > 100
-    assert read[1.9] == SILENT_MBPS
-    assert read[2.6] > 5
+@pytest.mark.parametrize("hops", [1, 2])
+def test_the_row_of_a_sample_that_was_never_served_has_the_snr_of_its_link_at_its_sending(hops: int) -> None:
+    """Of this frame and not of the one before, which its sender knows; of the first hop."""
+    flight = Hover(AirSettings(shadowing_sigma_db=0.0, relay_max_hops=hops), CROSS_M[[0, 1, 3]])
+    flight.air.advance()
+    flight.extra = np.array([[0.0, 7.0, 0.0], [0.0] * 3, [0.0] * 3])
+    flight.air.advance(flight.extra)
+    snr_db = flight.air.snr_db
+    flight.send(0, 2, 2_000_000, kind="long", deadline_s=0.05)
+    flight.send(0, 1, 1000, kind="waits", deadline_s=0.02)
+    flight.env.run(until=0.06)
+    (waited,) = [r for r in flight.rows if r.kind == "waits"]
+    assert (waited.reason, waited.mcs) == ("deadline_queued", -1)
+    assert waited.snr_db == pytest.approx(snr_db[0, 1])
+    assert snr_db[0, 1] == pytest.approx(snr_db[1, 0] - 7.0)
 
 
-def test_a_sample_held_up_by_its_own_queue_lowers_the_reading() -> None:
-    f = Flight(STILL, 3)
+@pytest.mark.parametrize("by_trace", [False, True])
+def test_a_payload_goes_at_the_rate_of_the_frame_before_and_is_lost_to_the_present_one(
+    by_trace: bool, tmp_path: Path
+) -> None:
+    """A link that fades from one frame to the next, for four frames: its sender learns it a frame late, both times."""
+    weak = set(range(5, 9))
+    rows = [f"{0.1 * k:.1f},0,1,{8 if k in weak else 40},," for k in range(20)]
+    config = AirSettings(trace=trace(tmp_path, *rows)) if by_trace else CALM
+    flight = Hover(config, np.array([[0.0, 0.0, 60.0], [20.0, 0.0, 60.0]]))
+    planned: list[Any] = []
 
-    def tick(t: float) -> None:
-        t = round(t, 1)
-        if t == 0:
-            f.send(0, 1, 100_000)
-            f.send(0, 2, 100_000)
-        if t == 0.1:
-            assert min(f.air.goodput_mbps(0)) > 100
-            f.extra[0, 1] = 33.0
-        if t == 0.2:
-            f.send(0, 1, 3_000_000)
-            f.send(0, 2, 100_000)
-        if t == 0.3:
-            assert max(f.air.goodput_mbps(0)) < 5
+    def tick(k: int) -> None:
+        flight.send(0, 1, 3000)
+        planned.append(flight.air.link_mbps()[0, 1])
 
-    f.fly(0.4, tick)
-    assert {r.reason for r in f.rows[2:]} <= {"deadline_queued", "deadline_in_service"}
+    for k in range(12):
+        flight.extra = None
+        if not by_trace and k in weak:
+            flight.extra = np.full((2, 2), 38.0)
+        flight.air.advance(flight.extra)
+        tick(k)
+        flight.env.run(until=0.1 * (k + 1))
+    mcs, snr_db = ({round(10 * r.t_sent_s): getattr(r, name) for r in flight.rows} for name in ("mcs", "snr_db"))
+    fast = mcs[0]
+    assert {k for k in range(12) if mcs[k] < fast} == {k for k in range(12) if planned[k] < planned[0]} == {6, 7, 8, 9}
+    assert {k for k in range(12) if snr_db[k] < 20} == weak
+
+
+def test_accounts_do_not_depend_on_what_was_asked_before() -> None:
+    """Half-way through a transmission: each figure asked first, and after the others."""
+
+    def asked(*names: str) -> dict[str, Any]:
+        flight = Hover(CALM, n=2)
+        flight.air.advance()
+        flight.send(0, 1, 200_000, deadline_s=0.5)
+        flight.env.run(until=0.0213)
+        return {name: getattr(flight.air, name) for name in names}
+
+    together = asked("airtime_s", "utilisation")
+    assert asked("utilisation", "airtime_s") == together
+    assert asked("utilisation")["utilisation"] == together["utilisation"]
+
+
+def test_a_link_too_weak_to_be_detected_is_none_for_routes_and_for_payloads() -> None:
+    """Though its rate would still be one."""
+    at = np.array([[0.0, 0.0, 60.0], [60.0, 0.0, 60.0], [400.0, 0.0, 60.0]])
+    heard, deaf = (AirSettings(shadowing_sigma_db=0.0, preamble_detection_dbm=dbm) for dbm in (-95.0, -70.0))
+    for config, there in ((heard, True), (deaf, False)):
+        flight = Hover(config, at)
+        flight.fly(0.3, lambda k, flight=flight: flight.send(0, 2, 500))
+        mbps = flight.air.link_mbps()
+        assert mbps[0, 1] > 0
+        assert (mbps[0, 2] > 0) == there
+        assert all((r.reason == "no_link") != there for r in flight.rows)
+
+
+def test_a_sample_was_given_the_channel_in_all_its_passes(tmp_path: Path) -> None:
+    """Repairs included: what its sender has transmitted, it was given at least, and no more than passed meanwhile."""
+    settings = AirSettings(retry_limit=0, trace=trace(tmp_path, "0,0,1,,0.5,", "0,1,0,,0,"))
+    flight = Hover(settings)
+    flight.air.advance()
+    flight.send(0, 1, 40_000, reliable=True, deadline_s=2.0)
+    flight.env.run(until=2.0)
+    (row,) = flight.rows
+    assert row.repairs > 1
+    assert flight.air.airtime_s[0] <= row.airtime_s < row.t_done_s - row.t_start_s
 
 
 traffic = st.lists(
@@ -320,45 +289,60 @@ traffic = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(
-    traffic,
-    st.integers(0, 99),
-    st.sampled_from([0, 7]),
-    st.sampled_from([0.0, 10.0, 25.0]),
-    st.none() | st.integers(0, 19),
+    samples=traffic,
+    seed=st.integers(0, 99),
+    retry_limit=st.sampled_from([0, 7]),
+    loss_db=st.sampled_from([0.0, 10.0, 25.0]),
+    bad=st.sampled_from([0.0, 0.5]),
+    piece_bytes=st.none() | st.just(1336),
+    hops=st.integers(1, 3),
+    silenced_at=st.none() | st.integers(0, 19),
 )
-def test_bytes_are_conserved_and_goodput_stays_below_the_phy_rate(
-    samples: list, seed: int, retry_limit: int, loss_db: float, silenced_at: int | None
+def test_bytes_are_conserved_whatever_is_flown_and_goodput_stays_below_the_phy_rate(
+    samples: list[Any],
+    seed: int,
+    retry_limit: int,
+    loss_db: float,
+    bad: float,
+    piece_bytes: int | None,
+    hops: int,
+    silenced_at: int | None,
 ) -> None:
-    f = Flight(AirSettings(retry_limit=retry_limit, tx_power_dbm=15.0), 4, seed=seed)
+    bursts = BurstSettings(good_to_bad=0.3, loss_bad=bad, step_s=0.1) if bad else BurstSettings()
+    config = AirSettings(retry_limit=retry_limit, tx_power_dbm=15.0, relay_max_hops=hops, bursts=bursts)
+    f = Hover(config, n=4, seed=seed)
+    f.extra = np.zeros((4, 4))
     f.extra[1, :] = loss_db
 
-    def tick(t: float) -> None:
-        k = round(t * 10)
+    def tick(k: int) -> None:
         for i in range(4):
             f.publish(i)
             assert all(0 <= g < STANDARDS["ax"].rates_mbps[80][11] for g in f.air.goodput_mbps(i))
         for frame, sender, hop, payload, kind, reliable, deadline_s in samples:
             if frame == k:
-                f.send(sender, (sender + hop) % 4, payload, kind=kind, reliable=reliable, deadline_s=deadline_s)
+                how = {"kind": kind, "reliable": reliable, "deadline_s": deadline_s, "piece_bytes": piece_bytes}
+                f.send(sender, (sender + hop) % 4, payload, **how)
         if k == silenced_at:
             f.air.silence(3)
 
     f.fly(2.0, tick)
-    flying = f.air.finish()
-    c = f.air.counters
-    rows = f.rows + flying
+    c, rows = f.air.counters, f.rows + f.air.finish()
     assert sorted(r.number for r in rows) == list(range(len(samples)))
     by = {s: sum(r.payload_bytes for r in rows if r.status is s) for s in Status}
-    assert by[Status.DELIVERED] == c.data_delivered_bytes
-    assert by[Status.LOST] == c.data_lost_bytes
-    assert by[Status.EXPIRED] == c.data_expired_bytes
+    arrived = sum(r.arrived_bytes for r in rows if r.status is Status.PARTIAL)
+    assert by[Status.DELIVERED] + arrived == c.data_delivered_bytes
     assert by[Status.IN_FLIGHT] == f.air.data_in_flight_bytes
-    assert sum(by.values()) == c.data_sent_bytes == sum(s[3] for s in samples)
+    settled = c.data_delivered_bytes + c.data_lost_bytes + c.data_expired_bytes
+    assert sum(by.values()) == settled + by[Status.IN_FLIGHT] == c.data_sent_bytes == sum(s[3] for s in samples)
+    if piece_bytes is None:
+        assert (by[Status.LOST], by[Status.EXPIRED]) == (c.data_lost_bytes, c.data_expired_bytes)
     for r in f.rows:
         assert r.t_sent_s <= r.t_done_s <= r.deadline_s + 1e-9
         assert isnan(r.t_start_s) or r.t_sent_s <= r.t_start_s <= r.t_done_s
-        assert (r.status is Status.DELIVERED) == (r.reason == "")
-        assert r.status is not Status.DELIVERED or r.wire_bytes >= r.payload_bytes
+        assert (r.status is Status.DELIVERED) == (r.reason == "") == (r.arrived_bytes == r.payload_bytes)
+        assert (r.status is Status.PARTIAL) == bool(r.missing) == (0 < r.arrived_bytes < r.payload_bytes)
+        assert r.wire_bytes >= r.arrived_bytes
+        assert r.hops <= hops
     assert sum(f.air.airtime_s) <= 4 * 2.0
     assert f.air.utilisation <= 1.0
 
@@ -366,20 +350,19 @@ def test_bytes_are_conserved_and_goodput_stays_below_the_phy_rate(
 # --- context -----------------------------------------------------------------------------------------
 
 
-def test_broadcasts_reach_everyone_near_and_cost_two_events_each() -> None:
-    f = Flight(STILL, spread=0.0)
-    f.fly(2.0, lambda t: f.publish(round(t * 10) % 5))
-    assert len(f.heard) == 20
-    assert all(ids == tuple(i for i in range(5) if i != sender) for _, sender, ids in f.heard)
+def test_broadcasts_reach_everyone_near_and_are_counted() -> None:
+    f = Hover(CALM, n=5, spread=0.0)
+    f.fly(2.0, lambda k: f.publish(k % 5))
+    assert [ids for _, _, ids in f.heard] == [tuple(i for i in range(5) if i != k % 5) for k in range(20)]
     assert f.air.counters.receptions == 80
-    assert next(f.env._eid) <= 20 + 2 * 20 + 3  # one a frame to tick, two a broadcast, the process and the end
+    assert next(f.env._eid) <= 20 + 2 * 20 + 3  # one event a frame to tick, two a broadcast, the process and the end
     assert f.air.airtime_s == pytest.approx([4 * 468e-6] * 5)
 
 
 def test_broadcasts_in_step_are_sent_together_and_out_of_step_hardly_collide() -> None:
     counters = {}
     for spread in (0.0, 0.8):
-        f = Flight(STILL, spread=spread)
+        f = Hover(CALM, n=5, spread=spread)
         f.fly(20.0, lambda t, f=f: [f.publish(i) for i in range(5)])
         counters[spread] = f.air.counters
         assert sum(counters[spread].lost_to.values()) == counters[spread].missed
@@ -388,9 +371,9 @@ def test_broadcasts_in_step_are_sent_together_and_out_of_step_hardly_collide() -
 
 
 def test_a_far_receiver_misses_some_broadcasts_a_dead_one_all() -> None:
-    f = Flight(AirSettings(shadowing_sigma_db=0.0, preamble_detection_dbm=-110.0), 3)
-    f.extra[0, 1], f.extra[0, 2] = 37.5, 90.0
-    f.fly(20.0, lambda t: f.publish(0))
+    f = Hover(replace(CALM, preamble_detection_dbm=-110.0), n=3)
+    f.extra = np.array([[0.0, 37.5, 90.0], [0.0] * 3, [0.0] * 3])
+    f.fly(20.0, lambda _: f.publish(0))
     counts = Counter(i for _, _, ids in f.heard for i in ids)
     assert 20 < counts[1] < 190
     assert counts[2] == 0
@@ -399,9 +382,9 @@ def test_a_far_receiver_misses_some_broadcasts_a_dead_one_all() -> None:
 
 def test_same_inputs_same_fates_and_a_sixth_silent_drone_changes_none() -> None:
     def fates(n: int, seed: int = 1) -> tuple[list, list]:
-        f = Flight(AirSettings(retry_limit=0), n, seed=seed)
+        f = Hover(AirSettings(retry_limit=0), n=n, seed=seed)
 
-        def tick(_: float) -> None:
+        def tick(_: int) -> None:
             for i in range(5):
                 f.publish(i)
                 f.send(i, (i + 1) % 5, 100_000)
@@ -415,7 +398,7 @@ def test_same_inputs_same_fates_and_a_sixth_silent_drone_changes_none() -> None:
 
 
 def test_the_first_frame_may_begin_after_the_air_is_there() -> None:
-    f = Flight(STILL)
+    f = Hover(CALM, n=5)
     f.env.run(until=0.25)
     f.air.advance()
     f.send(0, 1, 2000)
@@ -431,20 +414,21 @@ def test_a_descriptor_that_is_handed_over_early_is_as_one_that_is_handed_over_in
     due = list(zip(np.sort(rng.uniform(0.0, 0.9, 200)).tolist(), rng.integers(0, 5, 200).tolist(), strict=True))
 
     def flown(early: bool) -> tuple[list[object], list[object]]:
-        f, heard = Flight(seed=3, spread=0.0), []
+        f, heard = Hover(DEFAULT, n=5, seed=3, spread=0.0), []
 
         def give(at: float, sender: int) -> None:
             in_s = max(0.0, at - f.env.now)
             f.air.broadcast(sender, 208, lambda ids: heard.append((at, round(f.env.now, 9), list(ids))), in_s)
 
-        def tick(t: float) -> None:
+        def tick(frame: int) -> None:
+            t = frame / 10
             for at, sender in due:
                 if t <= at < t + 0.1 and early:
                     give(at, sender)
                 elif t <= at < t + 0.1:
                     wait = f.env.timeout(at - f.env.now, (at, sender))
                     wait.callbacks.append(lambda event: give(*event.value))
-            f.everyone(40_000, peers=1)(t)
+            everyone(f, 40_000, peers=1)
 
         f.fly(1.0, tick)
         return heard, [(row.status, round(row.t_done_s, 9), row.airtime_s) for row in f.rows]
@@ -455,32 +439,65 @@ def test_a_descriptor_that_is_handed_over_early_is_as_one_that_is_handed_over_in
     assert all(heard_s - at > 0.4e-3 for at, heard_s, _ in heard)
 
 
+def test_a_descriptor_that_meets_several_others_is_one_that_collided() -> None:
+    counters = Counters()
+    casts = Broadcasts(6.0, 4, counters, set(), seed=1, replication=0, frame_s=0.1, publish_spread=0.8, as_lists=True)
+    casts.end(casts.frame(2, 100, lambda ids: None), np.arange(4), bytes([1, 2, 0, 3]))
+    casts.end(casts.frame(2, 100, lambda ids: None), np.arange(4), bytes([4, 5, 0, 4]))
+    assert (counters.collided, counters.missed, counters.broadcasts) == (1, 6, 2)
+
+
+def test_every_living_drone_hears_a_descriptor_or_misses_it_for_a_reason() -> None:
+    """Drone 0 sends; 1 hears it, 2 meets another, 3 sends itself, 4 is too weak, or out of reach and not named at all."""
+
+    def check(as_lists: bool, gone: set[int], far: bool) -> None:
+        counters, heard = Counters(), []
+        casts = Broadcasts(
+            6.0, 6, counters, gone, seed=1, replication=0, frame_s=0.1, publish_spread=0.8, as_lists=as_lists
+        )
+        names = ("collision_data", "half_duplex", "weak_signal")
+        fates = [0, len(CAUSES) + 1, *(1 + CAUSES.index(name) for name in names), len(CAUSES) + 1]
+        receivers = np.arange(6)
+        if far:
+            receivers, fates = np.delete(receivers, 4), [*fates[:4], fates[5]]
+        casts.end(casts.frame(0, 180, heard.append), receivers, bytes(fates))
+        assert heard == [[1, 5]]
+        missed = 3 - (3 in gone)
+        assert (counters.receptions, counters.missed, counters.collided) == (2, missed, 1)
+        wanted = dict.fromkeys(CAUSES, 0) | {"collision_data": 1, "half_duplex": int(3 not in gone), "weak_signal": 1}
+        assert counters.lost_to == wanted
+        assert sum(counters.lost_to.values()) == counters.missed
+
+    assert wrong_rows(product([True, False], [set(), {3}, {0, 3}], [False, True]), check) == {}
+
+
 def test_arguments_out_of_bounds_are_refused() -> None:
-    f = Flight(STILL, 2)
-    f.air.advance()
-    with pytest.raises(ValueError, match=r"sender is 0 and receiver 0, must be two drones in \[0, 1\]"):
-        f.send(0, 0, 1)
-    with pytest.raises(ValueError, match="payload_bytes is 0, must be at least 1"):
-        f.send(0, 1, 0)
-    with pytest.raises(ValueError, match=r"deadline_s is nan, must be at least 0"):
-        f.send(0, 1, 1, deadline_s=float("nan"))
-    with pytest.raises(ValueError, match=r"sender is 2, must be in \[0, 1\]"):
-        f.air.broadcast(2, 10, print)
-    with pytest.raises(ValueError, match=r"payload_bytes is 3000, must be in \[1, 2200\]"):
-        f.air.broadcast(0, 3000, print)
-    with pytest.raises(ValueError, match=r"in_s is -0.1, must be at least 0"):
-        f.air.broadcast(0, 10, print, -0.1)
-    with pytest.raises(ValueError, match=r"publish_spread is 2\.0, must be in \[0, 1\]"):
-        Flight(STILL, 2, spread=2.0)
+    f = Hover(CALM).fly(0.1)
+    nan = float("nan")
+    rows = [
+        (lambda: f.send(0, 0, 1), r"sender is 0 and receiver 0, must be two drones in \[0, 1\]"),
+        (lambda: f.send(0, 1, 0), "payload_bytes is 0, must be at least 1"),
+        (lambda: f.send(0, 1, 1, deadline_s=nan), "deadline_s is nan, must be at least 0"),
+        (lambda: f.send(0, 1, 10, piece_bytes=0), "piece_bytes is 0, must be at least 1"),
+        (lambda: f.air.broadcast(2, 10, print), r"sender is 2, must be in \[0, 1\]"),
+        (lambda: f.air.broadcast(0, 3000, print), r"payload_bytes is 3000, must be in \[1, 2200\]"),
+        (lambda: f.air.broadcast(0, 10, print, -0.1), "in_s is -0.1, must be at least 0"),
+        (lambda: Hover(CALM, spread=2.0), r"publish_spread is 2\.0, must be in \[0, 1\]"),
+    ]
+
+    def check(call: Callable[[], object], message: str) -> None:
+        with pytest.raises(ValueError, match=message):
+            call()
+
+    assert wrong_rows(rows, check) == {}
 
 
-def test_a_link_whose_payloads_only_waited_is_not_silent() -> None:
-    """Silent means that something was tried and nothing got through; a queue behind another link says less."""
-    links = Goodput(3)
-    links.measured(0, 1, 50.0, 1.0)
-    links.bounded(0, 1, 0.0)
-    links.bounded(0, 2, 0.0)
-    assert {receiver: state_of(mbps) for receiver, mbps in links.read(0, 1.0).items()} == {1: LinkState.MEASURED}
-    links.measured(0, 1, 0.0, 1.0)
-    links.bounded(0, 1, 3.0)
-    assert state_of(links.read(0, 1.0)[1]) == LinkState.SILENT
+def test_one_class_takes_every_setting_and_repeats_itself() -> None:
+    more = dict(rate_control="minstrel", rts=True, relay_max_hops=2, block_ack_window=256, fading="frame")
+    config = AirSettings(
+        shadowing_distance_m=20.0, antenna="dipole", path_loss="two_ray", bursts=BurstSettings(good_to_bad=0.1), **more
+    )
+    flights = [Hover(config, n=4) for _ in range(2)]
+    for f in flights:
+        f.fly(1.0, lambda _, f=f: [f.send(i, (i + 1) % 4, 9000, piece_bytes=900) for i in range(4)])
+    assert flights[0].rows == flights[1].rows != []

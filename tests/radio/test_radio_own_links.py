@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from wrong_rows import wrong_rows
 
 from sortie.radio.channel.pathloss import free_space_loss_db, path_loss_db, range_m
 from sortie.radio.channel.snr import OUT_OF_RANGE_DB, Channel
@@ -15,8 +16,9 @@ from sortie.radio.settings import AirSettings
 from sortie.scenarios.plugins.reference import PluginError
 
 RNG = np.random.default_rng(1)
-STILL = np.broadcast_to(RNG.uniform(-200.0, 200.0, (1, 5, 3)), (8, 5, 3))
-CROWD = np.broadcast_to(RNG.uniform(-200.0, 200.0, (1, 40, 3)), (8, 40, 3))
+DRIFT_M = np.arange(8.0)[:, None, None] * np.array([0.5, 0.2, 0.0])
+FIVE = RNG.uniform(-200.0, 200.0, (1, 5, 3)) + DRIFT_M
+CROWD = RNG.uniform(-200.0, 200.0, (1, 40, 3)) + DRIFT_M
 
 
 def wall(distance_m: Any, height_a_m: Any, height_b_m: Any, carrier_ghz: float, *, wall_db: float = 12.0) -> Any:
@@ -27,7 +29,7 @@ class Less:
     """Takes 3 dB a frame from every link, and keeps what it was shown."""
 
     def __init__(self, drones: int, frame_s: float, rng: np.random.Generator) -> None:
-        self.made, self.seen = (drones, frame_s), []  # type: ignore[var-annotated]
+        self.made, self.seen = (drones, frame_s), []
 
     def snr_db(self, t_s: float, positions_m: Any, snr_db: Any) -> Any:
         self.seen.append((t_s, positions_m))
@@ -40,17 +42,13 @@ def channel(flight: Any, **settings: Any) -> Channel:
     return made
 
 
-@pytest.mark.parametrize("flight", [STILL, CROWD], ids=["five", "forty"])
-def test_a_path_loss_takes_the_place_of_the_built_in_one(flight: Any) -> None:
-    free, walled = channel(flight, path_loss="free_space"), channel(flight, path_loss=wall)
-    assert_allclose(walled.snr_db, free.snr_db - 12.0, atol=1e-4)
-
-
-def test_a_jammer_is_heard_through_the_same_path_loss() -> None:
+def test_a_path_loss_takes_the_place_of_the_built_in_one_for_links_and_for_jammers() -> None:
     jammer = [((0.0, 0.0, 60.0), 20.0)]
-    free, walled = channel(STILL, path_loss="free_space"), channel(STILL, path_loss=wall)
-    quiet_mw, loud_mw = (10.0 ** (c.noise_rise_db(jammer) / 10.0) - 1.0 for c in (walled, free))
-    assert_allclose(quiet_mw, loud_mw * 10.0**-1.2, rtol=1e-9)
+    for flight in (FIVE, CROWD):
+        free, walled = channel(flight, path_loss="free_space"), channel(flight, path_loss=wall)
+        assert_allclose(walled.snr_db, free.snr_db - 12.0, atol=1e-4)
+        quiet_mw, loud_mw = (10.0 ** (c.noise_rise_db(jammer) / 10.0) - 1.0 for c in (walled, free))
+        assert_allclose(quiet_mw, loud_mw * 10.0**-1.2, rtol=1e-6)
 
 
 def test_a_link_model_reaches_every_link_of_a_large_fleet() -> None:
@@ -66,8 +64,9 @@ def test_a_link_model_reaches_every_link_of_a_large_fleet() -> None:
     assert (good_db[~np.eye(40, dtype=bool)] == 30.0).all()
 
 
-@pytest.mark.parametrize("flight", [STILL, CROWD], ids=["five", "forty"])
+@pytest.mark.parametrize("flight", [FIVE, CROWD], ids=["five", "forty"])
 def test_a_link_model_changes_every_link_frame_by_frame(flight: Any) -> None:
+    """It is shown each frame's places. Events and jammers act on what it returns."""
     made: list[Less] = []
 
     def keep(*args: Any) -> Less:
@@ -75,23 +74,17 @@ def test_a_link_model_changes_every_link_frame_by_frame(flight: Any) -> None:
         return made[0]
 
     plain, own = channel(flight), channel(flight, link=keep)
-    for _ in range(3):
+    extra, jammer = np.full((flight.shape[1],) * 2, 7.0), [((0.0, 0.0, 60.0), 10.0)]
+    for how in ((), (extra,), (None, jammer)):
+        plain.advance(*how)
+        own.advance(*how)
         assert_allclose(own.snr_db, plain.snr_db - 3.0, atol=1e-4)
         assert np.isnan(np.diagonal(own.snr_db)).all()
-        plain.advance()
-        own.advance()
     (model,) = made
     assert model.made == (flight.shape[1], 0.1)
-    assert_allclose([t_s for t_s, _ in model.seen], [0.0, 0.1, 0.2, 0.3])
-    assert_allclose(model.seen[0][1], flight[0])
-
-
-def test_events_and_jammers_act_on_what_a_link_model_returns() -> None:
-    extra = np.full((5, 5), 7.0)
-    plain, own = (Channel(AirSettings(**s), STILL, 1, 0, 0.1) for s in ({}, {"link": Less}))
-    for each in (plain, own):
-        each.advance(extra, [((0.0, 0.0, 60.0), 10.0)])
-    assert_allclose(own.snr_db, plain.snr_db - 3.0, atol=1e-9)
+    for frame, (t_s, places_m) in enumerate(model.seen):
+        assert t_s == pytest.approx(0.1 * frame)
+        assert_allclose(places_m, flight[frame])
 
 
 def test_a_link_model_cannot_change_the_flight() -> None:
@@ -101,7 +94,7 @@ def test_a_link_model_cannot_change_the_flight() -> None:
             snr_db += 1.0
             return snr_db - 1.0
 
-    plain, own = channel(STILL), channel(STILL, link=Moves)
+    plain, own = channel(FIVE), channel(FIVE, link=Moves)
     for _ in range(3):
         assert_allclose(own.snr_db, plain.snr_db)
         plain.advance()
@@ -115,7 +108,7 @@ def test_a_path_loss_cannot_change_the_distances_that_antennas_and_jammers_use()
         height_b_m -= 1e3
         return free_space_loss_db(np.maximum(1000.0 * distance_m, 1.0), carrier_ghz)
 
-    plain, own = (channel(STILL, antenna="dipole", path_loss=loss) for loss in ("free_space", by_kilometres))
+    plain, own = (channel(FIVE, antenna="dipole", path_loss=loss) for loss in ("free_space", by_kilometres))
     assert_allclose(own.snr_db, plain.snr_db)
     jammer = [((0.0, 0.0, 60.0), 20.0)]
     assert_allclose(own.noise_rise_db(jammer), plain.noise_rise_db(jammer))
@@ -129,7 +122,7 @@ def test_its_random_numbers_are_its_own_and_the_same_each_time() -> None:
         def snr_db(self, t_s: float, positions_m: Any, snr_db: Any) -> Any:
             return snr_db + self._rng.normal(size=snr_db.shape)
 
-    one, again, plain = channel(STILL, link=Random), channel(STILL, link=Random), channel(STILL)
+    one, again, plain = channel(FIVE, link=Random), channel(FIVE, link=Random), channel(FIVE)
     assert_allclose(one.snr_db, again.snr_db)
     assert_allclose(one.shadow_db, plain.shadow_db, err_msg="shadowing is drawn as without it")
 
@@ -140,31 +133,30 @@ def test_no_frame_is_heard_beyond_the_range_of_a_path_loss_of_ones_own() -> None
     assert (path_loss_db(settings, far_m, 10.0, 10.0) >= 100.0).all()
 
 
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda d, a, b, c: 0.0 * d, r"^path_loss <lambda>: 0.0 dB at [\d.]+ m, must be at least [\d.]+ dB, that of free space less 6.1 dB$"),
-        (lambda d, a, b, c: d + np.nan, r"^path_loss <lambda>: returns nan, must be finite$"),
-        (lambda d, a, b, c: [1.0, 2.0], r"^path_loss <lambda>: returns shape \(2,\), must be \(8, 25\)$"),
-        (lambda d: d, r"^path_loss <lambda>: TypeError: .*takes 1 positional argument but 4 were given"),
-    ],
-)  # fmt: skip
-def test_a_path_loss_that_returns_something_else_is_refused(function: Callable[..., Any], message: str) -> None:
-    with pytest.raises(PluginError, match=message):
-        channel(STILL, path_loss=function)
-
-
-@pytest.mark.parametrize(
-    ("returned", "message"),
-    [
-        (lambda snr: snr[0], r"^link Own.snr_db: returns shape \(5,\), must be \(5, 5\)$"),
-        (lambda snr: np.where(snr > -1e9, np.inf, snr), r"^link Own.snr_db: returns inf, must be finite$"),
-    ],
-)
-def test_a_link_model_that_returns_something_else_is_refused(returned: Callable[..., Any], message: str) -> None:
+def returning(change: Callable[..., Any]) -> type[Less]:
     class Own(Less):
         def snr_db(self, t_s: float, positions_m: Any, snr_db: Any) -> Any:
-            return returned(snr_db)
+            return change(snr_db)
 
-    with pytest.raises(PluginError, match=message):
-        channel(STILL, link=Own)
+    return Own
+
+
+REFUSED = [
+    (
+        {"path_loss": lambda d, a, b, c: 0.0 * d},
+        r"path_loss <lambda>: 0.0 dB at [\d.]+ m, must be at least [\d.]+ dB, that of",
+    ),
+    ({"path_loss": lambda d, a, b, c: d + np.nan}, "path_loss <lambda>: returns nan, must be finite$"),
+    ({"path_loss": lambda d, a, b, c: [1.0, 2.0]}, r"path_loss <lambda>: returns shape \(2,\), must be \(8, 25\)$"),
+    ({"path_loss": lambda d: d}, "path_loss <lambda>: TypeError: .*takes 1 positional argument but 4 were given"),
+    ({"link": returning(lambda snr: snr[0])}, r"link Own.snr_db: returns shape \(5,\), must be \(5, 5\)$"),
+    ({"link": returning(lambda snr: snr + np.inf)}, "link Own.snr_db: returns inf, must be finite$"),
+]
+
+
+def test_a_model_that_returns_something_else_is_refused() -> None:
+    def check(settings: dict[str, Any], message: str) -> None:
+        with pytest.raises(PluginError, match=f"^{message}"):
+            channel(FIVE, **settings)
+
+    assert wrong_rows(REFUSED, check) == {}

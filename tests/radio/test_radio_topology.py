@@ -14,8 +14,14 @@ from hypothesis.extra.numpy import arrays
 from sortie.radio.topology import Connectivity, connectivity, linked_drones, widths
 
 NAN = np.nan
+
+
 CHAIN = np.array([[NAN, 9.0, 1.0, 0.0], [9.0, NAN, 6.0, 0.0], [1.0, 6.0, NAN, 0.0], [0.0, 0.0, 0.0, NAN]])
+
+
 ANY = arrays(float, st.integers(0, 6).map(lambda n: (n, n)), elements=st.floats(-10, 10) | st.just(NAN))
+
+
 FEW = arrays(float, st.integers(1, 5).map(lambda n: (n, n)), elements=st.integers(0, 4).map(float) | st.just(NAN))
 """Values that are often equal, and often no link at a threshold of 1."""
 

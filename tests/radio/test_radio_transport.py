@@ -7,17 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from radio_flights import Hover, trace
 from scipy import stats
 
 from sortie.radio import Status
 from sortie.radio.mac.airtime import sample_wire
-from sortie.radio.settings import AirSettings, BurstSettings
+from sortie.radio.settings import AirSettings
 
 
-def lossy(folder: Path, loss: float, goodput_mbps: float | None = 400.0, **knobs) -> AirSettings:  # type: ignore[no-untyped-def]
+def lossy(folder: Path, loss: float, goodput_mbps: float | None = 400.0, **knobs) -> AirSettings:
     """A link from drone 0 to 1 of that goodput which loses every `loss`-th frame, and no retries."""
     name = trace(folder, f"0,0,1,,{loss},{'' if goodput_mbps is None else goodput_mbps}")
     return AirSettings(trace=name, **{"retry_limit": 0, **knobs})
@@ -51,7 +49,28 @@ def test_repair_brings_back_what_a_heartbeat_finds_missing(tmp_path: Path) -> No
     once = sample_wire(40 * 1344, 1344)[1]
     for r in whole:
         assert r.t_done_s - r.t_sent_s >= r.repairs * 0.013
-        assert r.repairs == 0 or r.wire_bytes > once + r.fragments_lost * 1344
+        lost = r.fragments_lost
+        assert r.repairs == 0 or once + lost * 1344 < r.wire_bytes <= once + lost * 1494 + (r.repairs + 1) * 300
+    short = Hover(config)
+    short.fly(20.0, lambda frame: short.send(0, 1, 40 * 1344, reliable=True, deadline_s=0.012))
+    assert {(r.status, r.reason) for r in short.rows if r.fragments_lost} == {(Status.EXPIRED, "deadline_in_service")}
+
+
+@pytest.mark.parametrize(("heartbeat_s", "nack_delay_s"), [(0.02, 0.005), (0.05, 0.03), (0.0, 0.04)])
+def test_a_repair_waits_for_the_heartbeat_and_the_answer(
+    heartbeat_s: float, nack_delay_s: float, tmp_path: Path
+) -> None:
+    """Both, in every round."""
+    file = trace(tmp_path, "0,0,1,,0.5,", "0,1,0,,0.5,")
+    config = AirSettings(trace=file, retry_limit=0, heartbeat_s=heartbeat_s, nack_delay_s=nack_delay_s)
+    flight = Hover(config)
+    flight.fly(6.0, lambda k: flight.send(0, 1, 6000, reliable=True, deadline_s=0.95) if k % 10 == 0 else None)
+    repaired = [r for r in flight.rows if r.repairs and r.status == "delivered"]
+    assert len(repaired) >= 3
+    for r in repaired:
+        took_s = r.t_done_s - r.t_start_s
+        waits_s = r.repairs * (heartbeat_s + nack_delay_s)
+        assert waits_s <= took_s < waits_s + 0.01 * (r.repairs + 1)
 
 
 def test_keep_last_1_replaces_what_is_not_through(tmp_path: Path) -> None:
@@ -59,9 +78,6 @@ def test_keep_last_1_replaces_what_is_not_through(tmp_path: Path) -> None:
     flight.fly(3.0, lambda frame: flight.send(0, 1, 1000, reliable=True, deadline_s=5.0))
     assert {(r.status, r.reason) for r in flight.rows} == {(Status.EXPIRED, "replaced")}
     assert all(r.t_done_s - r.t_sent_s == pytest.approx(0.1) for r in flight.rows)
-
-
-# --- pieces --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("loss", [0.01, 0.1, 0.5])
@@ -117,52 +133,3 @@ def test_reliable_pieces_come_back_and_the_sample_is_whole(tmp_path: Path) -> No
     done = [r for r in flight.rows if r.reason != "replaced"]
     assert {r.status for r in done} == {Status.DELIVERED}
     assert all(r.arrived_bytes == 133_610 and r.missing == () and r.repairs > 0 for r in done)
-
-
-def test_a_piece_has_a_byte() -> None:
-    with pytest.raises(ValueError, match="piece_bytes is 0, must be at least 1"):
-        Hover(AirSettings()).fly(0.1, lambda frame: None).send(0, 1, 10, piece_bytes=0)
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    pieces=st.integers(1, 500), spare=st.integers(0, 1335), reliable=st.booleans(), seed=st.integers(0, 1000),
-    deadline_s=st.floats(0.0, 0.2), bad=st.floats(0.0, 1.0), power_dbm=st.floats(-15.0, 20.0), hops=st.integers(1, 3),
-)  # fmt: skip
-def test_bytes_are_conserved_whatever_is_flown(
-    pieces: int, spare: int, reliable: bool, seed: int, deadline_s: float, bad: float, power_dbm: float, hops: int
-) -> None:
-    config = AirSettings(
-        bursts=BurstSettings(good_to_bad=0.3, loss_bad=bad, step_s=0.1), tx_power_dbm=power_dbm, relay_max_hops=hops
-    )
-    flight = Hover(config, n=3, seed=seed)
-    size = max(1, pieces * 1336 - spare)
-
-    def tick(frame: int) -> None:
-        for i in range(3):
-            flight.send(i, (i + 1) % 3, size, piece_bytes=1336, reliable=reliable, deadline_s=deadline_s)
-        if frame == 12:
-            flight.air.silence(2)
-
-    flight.fly(2.0, tick)
-    c = flight.air.counters
-    settled = c.data_delivered_bytes + c.data_lost_bytes + c.data_expired_bytes
-    assert c.data_sent_bytes == settled + flight.air.data_in_flight_bytes
-    for r in flight.rows:
-        assert 0 <= r.arrived_bytes <= size
-        assert r.t_sent_s <= r.t_done_s <= r.deadline_s + 1e-9
-        assert (r.status is Status.DELIVERED) == (r.arrived_bytes == size)
-        assert (r.status is Status.PARTIAL) == bool(r.missing) == (0 < r.arrived_bytes < size)
-        assert r.hops <= hops
-
-
-def test_equal_flights_lose_equal_pieces() -> None:
-    config = AirSettings(bursts=BurstSettings(good_to_bad=0.3, step_s=0.1, loss_bad=0.8))
-
-    def missing(n: int) -> list[tuple[int, ...]]:
-        flight = Hover(config, n=n)
-        flight.fly(5.0, lambda frame: flight.send(0, 1, 50 * 1336, piece_bytes=1336))
-        return [r.missing for r in flight.rows]
-
-    assert missing(2) == missing(2) == missing(4)  # a bystander changes nothing
-    assert any(missing(2))

@@ -1,13 +1,18 @@
-"""Path loss, shadowing, fading and rates against closed forms and independent computations."""
+"""The link budget, shadowing, fading and rates against closed forms and independent computations."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
-from radio_examples import CROSS_M, fades_db, still
+from radio_examples import CROSS_M, fades_db, moving, still, tilting
 from scipy import integrate, stats
+from wrong_rows import wrong_rows
 
-from sortie.radio.channel.pathloss import free_space_loss_db, log_distance_loss_db
+from sortie.radio.channel.antenna import antenna_loss_db
+from sortie.radio.channel.pathloss import free_space_loss_db, log_distance_loss_db, path_loss_db
 from sortie.radio.channel.snr import Channel, noise_dbm
 from sortie.radio.rates import (
     CURVES,
@@ -19,6 +24,7 @@ from sortie.radio.rates import (
     per,
     rate_table,
     rescale,
+    snr_index,
 )
 from sortie.radio.settings import AirSettings
 
@@ -29,16 +35,12 @@ def step(channel: Channel, *args: object) -> np.ndarray:
     return channel.snr_db
 
 
-@pytest.mark.parametrize(
-    ("carrier_ghz", "distance_m", "loss_db"),
-    [
-        *[(2.437, 1, 40.2), (2.437, 20, 66.2), (2.437, 100, 80.2), (2.437, 300, 89.7)],
-        *[(5.2, 1, 46.8), (5.2, 20, 72.8), (5.2, 100, 86.8), (5.2, 300, 96.3)],
-    ],
-)
-def test_free_space_loss_is_friis(carrier_ghz: float, distance_m: float, loss_db: float) -> None:
-    assert float(free_space_loss_db(distance_m, carrier_ghz)) == pytest.approx(loss_db, abs=0.06)
-    assert float(log_distance_loss_db(distance_m, carrier_ghz, 2.0)) == pytest.approx(loss_db, abs=0.06)
+def test_free_space_loss_is_friis_and_the_noise_floor_that_of_the_bandwidth() -> None:
+    distance_m = np.array([1.0, 20.0, 100.0, 300.0])
+    for carrier_ghz, loss_db in ((2.437, [40.2, 66.2, 80.2, 89.7]), (5.2, [46.8, 72.8, 86.8, 96.3])):
+        assert free_space_loss_db(distance_m, carrier_ghz) == pytest.approx(loss_db, abs=0.06)
+        assert log_distance_loss_db(distance_m, carrier_ghz, 2.0) == pytest.approx(loss_db, abs=0.06)
+    assert [noise_dbm(mhz, 7.0) for mhz in (20, 40, 80)] == pytest.approx([-94.0, -91.0, -88.0], abs=0.05)
 
 
 def test_log_distance_adds_ten_times_the_exponent_a_decade_and_stops_at_one_metre() -> None:
@@ -47,30 +49,60 @@ def test_log_distance_adds_ten_times_the_exponent_a_decade_and_stops_at_one_metr
     assert log_distance_loss_db(0.0, 5.2, 2.7) == log_distance_loss_db(1.0, 5.2, 2.7)
 
 
-@pytest.mark.parametrize(("bandwidth_mhz", "dbm"), [(20, -94.0), (40, -91.0), (80, -88.0)])
-def test_noise_floor(bandwidth_mhz: int, dbm: float) -> None:
-    assert noise_dbm(bandwidth_mhz, 7.0) == pytest.approx(dbm, abs=0.05)
+@pytest.mark.parametrize("antenna", ["isotropic", "dipole"])
+@pytest.mark.parametrize("path_loss", ["log_distance", "two_ray"])
+def test_every_frame_is_the_link_budget_of_that_frame(antenna: Any, path_loss: Any) -> None:
+    """With jammers, losses that differ by direction, tilted antennas of some drones: by hand, link by link."""
+    n, frames = 4, 40
+    own = {1: "isotropic"} if antenna == "dipole" else {2: "dipole"}
+    config = AirSettings(
+        shadowing_sigma_db=0.0,
+        antenna=antenna,
+        own_antennas=own,
+        path_loss=path_loss,
+        ground_roughness_m=0.0,
+    )
+    at, up = moving(frames, n), tilting(frames, n)
+    channel = Channel(config, at, 1, 0, 0.1, up)
+    extra = np.arange(n * n, dtype=float).reshape(n, n)
+    jammers = [((50.0, 40.0, 10.0), 15.0), ((-80.0, 0.0, 90.0), 25.0)]
+    pattern = config.antennas(n)
+
+    def lost_db(drone: int, toward: np.ndarray, frame: int) -> float:
+        cosine = toward @ up[frame, drone] / np.linalg.norm(toward)
+        return float(antenna_loss_db(pattern[drone], cosine))
+
+    for frame in range(frames):
+        channel.advance(extra, jammers)
+        for j in range(n):
+            noise_mw = 10 ** (channel.noise_dbm / 10)
+            for place, power_dbm in jammers:
+                away = at[frame, j] - place
+                loss = float(path_loss_db(config, np.linalg.norm(away), at[frame, j, 2], place[2]))
+                noise_mw += 10 ** ((power_dbm - loss - lost_db(j, away, frame)) / 10)
+            for i in set(range(n)) - {j}:
+                away = at[frame, i] - at[frame, j]
+                loss = float(path_loss_db(config, np.linalg.norm(away), at[frame, i, 2], at[frame, j, 2]))
+                loss += lost_db(i, away, frame) + lost_db(j, away, frame) + extra[i, j]
+                wanted = config.tx_power_dbm - loss - 10 * np.log10(noise_mw)
+                assert channel.snr_db[i, j] == pytest.approx(wanted, abs=1e-6), (frame, i, j)
 
 
-def test_snr_without_shadowing_is_the_link_budget() -> None:
-    channel = Channel(AirSettings(shadowing_sigma_db=0.0), still(CROSS_M[:2]), 1, 0, 0.1)
-    snr = step(channel)
-    assert snr[0, 1] == pytest.approx(20.0 - float(log_distance_loss_db(20.0, 5.2, 2.1)) - noise_dbm(80, 7.0))
-    assert np.isnan(np.diag(snr)).all()
-    extra = np.array([[0.0, 30.0], [0.0, 0.0]])
-    again = step(channel, extra)
-    np.testing.assert_allclose((snr - again)[[0, 1], [1, 0]], [30.0, 0.0], atol=1e-9)
-
-
-def test_a_jammer_adds_its_received_power_to_the_noise() -> None:
-    channel = Channel(AirSettings(shadowing_sigma_db=0.0), still(CROSS_M[:2]), 1, 0, 0.1)
-    clear = step(channel)
-    where = (20.0, 50.0, 60.0)
-    received = [20.0 - float(log_distance_loss_db(d, 5.2, 2.1)) for d in (np.hypot(20, 50), 50.0)]
-    jammed = step(channel, None, [(where, 20.0)])
-    for sender, receiver in ((0, 1), (1, 0)):
-        rise = 10 * np.log10(1 + 10 ** ((received[receiver] - channel.noise_dbm) / 10))
-        assert clear[sender, receiver] - jammed[sender, receiver] == pytest.approx(rise)
+def test_a_sender_knows_the_frame_before_whatever_has_changed_since() -> None:
+    """Jammer, loss and motion show in what it knows one frame later, and then as they were."""
+    at = still(CROSS_M[:3], 10).copy()
+    at[5:, 1, 0] += 100.0
+    channel = Channel(AirSettings(), at, 1, 0, 0.1)
+    jammers = [((0.0, 30.0, 60.0), 10.0)]
+    channel.advance()
+    was = channel.now.square_db
+    np.testing.assert_array_equal(channel.before.square_db, was)  # in the first frame its own
+    for frame in range(1, 10):
+        extra = None if frame % 3 else np.full((3, 3), float(frame))
+        channel.advance(extra, jammers if frame % 2 else ())
+        np.testing.assert_array_equal(channel.before.square_db, was)
+        assert not np.allclose(channel.now.square_db[0, 1], was[0, 1], atol=1e-6)
+        was = channel.now.square_db
 
 
 def _shadowing(frames: int) -> np.ndarray:
@@ -83,11 +115,12 @@ def _shadowing(frames: int) -> np.ndarray:
 
 
 def test_shadowing_is_symmetric_and_has_its_deviation_and_autocorrelation() -> None:
-    channel = Channel(AirSettings(), still(CROSS_M), 3, 0, 0.1)
-    channel.advance()
-    channel.advance()
+    channel, rows = Channel(AirSettings(), still(CROSS_M), 3, 0, 0.1), []
+    for _ in range(12_000):  # 1200 s × 15 pairs, about 2000 independent values
+        channel.advance()
+        rows.append(channel.shadow_db[np.triu_indices(6, 1)])
     np.testing.assert_array_equal(channel.shadow_db, channel.shadow_db.T)
-    x = _shadowing(12_000)  # 1200 s × 15 pairs, about 2000 independent values
+    x = np.array(rows)
     assert x.std() == pytest.approx(3.5, rel=0.08)
     lagged = (x[:-10] * x[10:]).mean() / x.var()
     assert lagged == pytest.approx(np.exp(-1 / 4.5), abs=0.03)  # 0.80 at one second
@@ -150,40 +183,29 @@ def test_a_flight_of_many_blocks_is_one_flight() -> None:
         np.testing.assert_array_equal(step(two), step(many)[:2, :2])
 
 
-@pytest.mark.parametrize("distance_m", [None, 30.0])
-@pytest.mark.parametrize("antenna", ["isotropic", "dipole"])
-def test_a_flight_that_goes_another_way_is_as_if_it_had_been_planned(distance_m: float | None, antenna: str) -> None:
-    """From the next frame on; what is drawn stays, within a block and across its end."""
-    config = AirSettings(**{"shadowing_distance_m": distance_m, "antenna": antenna})
-    planned = still(CROSS_M, 1300)
-    other = planned.copy()
-    other[700:, 2] += np.linspace(0, 40, 600)[:, None] * np.array([0.6, 0.8, 0.1])
-    changed, known = Channel(config, planned, 1, 0, 0.1), Channel(config, other, 1, 0, 0.1)
-    for frame in range(1300):
-        if frame == 700:
-            changed.reroute(other)
-        changed.advance()
-        known.advance()
-        assert np.array_equal(changed.snr_db, known.snr_db, equal_nan=True)
-        assert changed.now.rows_db[2][1] == known.now.rows_db[2][1]
-    with pytest.raises(ValueError, match=r"positions_m has shape \(1300, 4, 3\), must be \(1300, 6, 3\) and finite"):
-        changed.reroute(other[:, :4])
-
-
 def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"positions_m has shape \(3, 3\), must be \(frames, drones, 3\)"):
-        Channel(AirSettings(), np.zeros((3, 3)), 1, 0, 0.1)
-    with pytest.raises(ValueError, match=r"positions_m has shape \(9, 0, 3\), must be \(frames, drones, 3\)"):
-        Channel(AirSettings(), np.zeros((9, 0, 3)), 1, 0, 0.1)
-    with pytest.raises(ValueError, match="positions_m holds a value that is not finite"):
-        Channel(AirSettings(), np.full((9, 2, 3), np.nan), 1, 0, 0.1)
-    with pytest.raises(ValueError, match=r"frame_s is 0\.0, must be > 0"):
-        Channel(AirSettings(), np.zeros((9, 1, 3)), 1, 0, 0.0)
-    channel = Channel(AirSettings(), np.zeros((1, 2, 3)), 1, 0, 0.1)
-    with pytest.raises(ValueError, match=r"extra_loss_db has shape \(3, 3\), must be \(2, 2\)"):
-        channel.advance(np.zeros((3, 3)))
-    with pytest.raises(IndexError, match="the flight has 1 frames"):
-        channel.advance()
+    one = Channel(AirSettings(), np.zeros((1, 2, 3)), 1, 0, 0.1)
+    nan, flat = np.full((9, 2, 3), np.nan), np.zeros((9, 2, 3))
+    rows = [
+        (lambda: Channel(AirSettings(), np.zeros((3, 3)), 1, 0, 0.1), r"positions_m has shape \(3, 3\), must be \(fra"),
+        (lambda: Channel(AirSettings(), np.zeros((9, 0, 3)), 1, 0, 0.1), r"positions_m has shape \(9, 0, 3\), must be"),
+        (lambda: Channel(AirSettings(), nan, 1, 0, 0.1), "positions_m holds a value that is not finite"),
+        (lambda: Channel(AirSettings(), flat, 1, 0, 0.0), r"frame_s is 0\.0, must be > 0"),
+        (
+            lambda: Channel(AirSettings(), flat, 1, 0, 0.1, flat[..., :2]),
+            r"up has shape \(9, 2, 2\), must be \(9, 2, 3",
+        ),
+        (lambda: Channel(AirSettings(), flat, 1, 0, 0.1, nan), "up holds a value that is not finite"),
+        (lambda: one.advance(np.zeros((3, 3))), r"extra_loss_db has shape \(3, 3\), must be \(2, 2\)"),
+        (lambda: one.reroute(flat), r"positions_m has shape \(9, 2, 3\), must be \(1, 2, 3\) and finite"),
+        (lambda: [one.advance() for _ in range(2)], "the flight has 1 frames"),
+    ]
+
+    def check(call: Callable[[], object], message: str) -> None:
+        with pytest.raises((ValueError, IndexError), match=message):
+            call()
+
+    assert wrong_rows(rows, check) == {}
 
 
 # --- rates -----------------------------------------------------------------------------------------
@@ -232,10 +254,18 @@ def test_no_link_below_mcs_zero_and_the_top_rate_above() -> None:
     assert table.all_per[0][edge] <= NO_LINK_PER < table.all_per[0][edge - 1]
 
 
-def test_basic_rates_have_curves_of_their_own() -> None:
-    assert [group_curve(rate) for rate in LEGACY_CURVES] == list(LEGACY_CURVES.values())
-    assert group_curve(1.0) is LEGACY_CURVES[6.0]
-    assert group_curve(9.0) is LEGACY_CURVES[12.0]
+def test_basic_rates_have_curves_of_their_own_or_of_the_next_above() -> None:
+    for rate, wanted in ((1.0, 6.0), (6.0, 6.0), (6.5, 12.0), (9.0, 12.0), (12.0, 12.0), (53.0, 54.0), (54.0, 54.0)):
+        assert group_curve(rate) is LEGACY_CURVES[wanted]
     halves_db = [curve.snr_db(0.5, 334) for curve in LEGACY_CURVES.values()]
     assert halves_db == sorted(halves_db)
     assert all(legacy > he.snr_db(0.5, 334) for legacy, he in zip(halves_db, CURVES, strict=False))  # no LDPC
+
+
+def test_a_rate_table_is_read_at_the_nearest_of_its_points() -> None:
+    table = rate_table(80, 12.0)
+    for snr_db in (-7.013, 0.026, 3.0, 11.349, 29.874):
+        at_db = -20.0 + 0.05 * snr_index(snr_db)
+        assert abs(at_db - snr_db) <= 0.025 + 1e-9
+        assert table.at(snr_db) == table.at(at_db)
+    assert (snr_index(-500.0), snr_index(500.0)) == (0, len(table.mcs) - 1)

@@ -1,7 +1,9 @@
-"""Link traces: read with care, and flown in place of the models."""
+"""Link traces: read with care, and flown in place of the models; losses and jammers act on them as on other links."""
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +11,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from radio_examples import CROSS_M
 from radio_flights import Hover, trace
+from wrong_rows import wrong_rows
 
 from sortie.radio import Status
-from sortie.radio.channel.traces import read_links
+from sortie.radio.channel.traces import LinkTrace, read_links
+from sortie.radio.overrides import Overrides
 from sortie.radio.settings import AirSettings, BurstSettings
 from sortie.scenarios.traces import TraceError
 
@@ -42,32 +47,106 @@ def test_a_goodput_without_a_loss_loses_nothing_or_all(tmp_path: Path) -> None:
     assert [links.at(0, 3).loss[e] for e in ((0, 1), (1, 0), (0, 2))] == [0.0, 1.0, 0.3]
 
 
+WHOLE = "t_s,sender,receiver,snr_db,loss,goodput_mbps"
 BROKEN = [
-    (("0,0,0,1,,",), "sender and receiver in row 1 are both drone 0"),
-    (("0,0,7,1,,",), "receiver in row 1 is 7, must be below fleet.drones = 5"),
-    (("0,0.5,1,1,,",), "sender in row 1 is 0.5, must be a whole number"),
-    (("1,0,1,1,,", "1,0,1,2,,"), "t_s in row 2 of link 0 to 1 is 1, must increase"),
-    (("0,0,1,,1.2,",), "loss in row 1 is 1.2, must be within 0 … 1"),
-    (("0,0,1,,,-3",), "goodput_mbps in row 1 is -3, must be within 0 … 10000"),
-    ((",0,1,,,3",), "t_s in row 1 is nan, must be within 0 … 86400"),
+    (WHOLE, ("0,0,0,1,,",), "sender and receiver in row 1 are both drone 0"),
+    (WHOLE, ("0,0,7,1,,",), "receiver in row 1 is 7, must be below fleet.drones = 5"),
+    (WHOLE, ("0,0.5,1,1,,",), "sender in row 1 is 0.5, must be a whole number"),
+    (WHOLE, ("1,0,1,1,,", "1,0,1,2,,"), "t_s in row 2 of link 0 to 1 is 1, must increase"),
+    (WHOLE, ("0,0,1,,1.2,",), "loss in row 1 is 1.2, must be within 0 … 1"),
+    (WHOLE, ("0,0,1,,,-3",), "goodput_mbps in row 1 is -3, must be within 0 … 10000"),
+    (WHOLE, (",0,1,,,3",), "t_s in row 1 is nan, must be within 0 … 86400"),
+    (WHOLE, ("0,0,1,,,",), "no row has a value of snr_db, loss or goodput_mbps"),
+    ("t_s,sender,snr_db", ("0,0,1",), "no column receiver, a trace needs t_s, sender, receiver"),
+    ("t_s,sender,receiver", ("0,0,1",), "no row has a value of snr_db, loss or goodput_mbps"),
 ]
 
 
-@pytest.mark.parametrize(("rows", "message"), BROKEN)
-def test_what_is_wrong_is_named(rows: tuple[str, ...], message: str, tmp_path: Path) -> None:
-    path = trace(tmp_path, *rows)
-    with pytest.raises(TraceError) as caught:
-        read_links(path, 5)
-    assert str(caught.value) == f"{path}: {message}"
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    def check(columns: str, rows: tuple[str, ...], message: str) -> None:
+        path = trace(tmp_path, *rows, columns=columns)
+        with pytest.raises(TraceError, match=re.escape(f"{path}: {message}")):
+            read_links(path, 5)
+
+    assert wrong_rows(BROKEN, check) == {}
 
 
-def test_a_trace_has_ends_and_a_quality(tmp_path: Path) -> None:
-    with pytest.raises(TraceError, match="no column receiver, a trace needs t_s, sender, receiver"):
-        read_links(trace(tmp_path, "0,0,1", columns="t_s,sender,snr_db"), 5)
-    with pytest.raises(TraceError, match="no row has a value of snr_db, loss or goodput_mbps"):
-        read_links(trace(tmp_path, "0,0,1", columns="t_s,sender,receiver"), 5)
-    with pytest.raises(TraceError, match="no row has a value of snr_db, loss or goodput_mbps"):
-        read_links(trace(tmp_path, "0,0,1,,,"), 5)
+CALM = AirSettings(shadowing_sigma_db=0.0, rician_k_db=40.0)
+
+# --- beside the models ---------------------------------------------------------------------------------
+
+
+def overrides(trace: LinkTrace | None = None, n: int = 3, **bursts: float) -> Overrides:
+    settings = AirSettings(bursts=BurstSettings(**bursts))
+    return Overrides(settings, trace, n, seed=2, replication=0, frame_s=0.1)
+
+
+def given(**qualities: tuple[list[float], list[float]]) -> LinkTrace:
+    """A trace of the link from 0 to 1."""
+    return LinkTrace({(0, 1): {name: (np.array(t), np.array(v)) for name, (t, v) in qualities.items()}})
+
+
+def traced(tmp_path: Path, *rows: str, n: int = 3) -> Overrides:
+    file = trace(tmp_path, *rows, columns="t_s,sender,receiver,snr_db,loss,goodput_mbps")
+    settings = AirSettings(trace=file)
+    return Overrides(settings, read_links(file, n), n, seed=1, replication=0, frame_s=0.1)
+
+
+def test_losses_and_jammers_act_on_a_traced_link_as_on_a_modelled_one(tmp_path: Path) -> None:
+    """By sender and receiver for a loss, by receiver for a jammer; known one frame later."""
+    over = traced(tmp_path, "0,0,1,30,,", "0,1,0,25,,", "0,1,2,20,,")
+    extra, rise = np.arange(9.0).reshape(3, 3), np.array([1.0, 5.0, 11.0])
+    model = np.full((3, 3), -50.0)
+    over.advance(None)
+    assert over.snr_of(0, 1, -9.0, -8.0) == (30.0, 30.0)
+    over.advance(extra, rise)
+    wanted = {(0, 1): 30 - 1 - 5, (1, 0): 25 - 3 - 1, (1, 2): 20 - 5 - 11}
+    for (i, j), snr_db in wanted.items():
+        assert over.snr_db(model)[i, j] == snr_db
+        assert over.snr_of(i, j, -9.0, -8.0) == ({(0, 1): 30.0, (1, 0): 25.0, (1, 2): 20.0}[i, j], snr_db)
+        assert over.known_snr_db(model)[i, j] == {(0, 1): 30.0, (1, 0): 25.0, (1, 2): 20.0}[i, j]
+    assert over.snr_of(2, 0, -9.0, -8.0) == (-9.0, -8.0)  # not traced
+    over.advance(None)
+    for (i, j), snr_db in wanted.items():
+        assert over.known_snr_db(model)[i, j] == snr_db
+        assert over.snr_of(i, j, 0.0, 0.0)[0] == snr_db
+
+
+def test_losses_and_jammers_that_the_air_is_told_of_reach_traced_links(tmp_path: Path) -> None:
+    """The same through the air as for the links alone, beside modelled ones, and only while they last."""
+    links = trace(tmp_path, "0,0,1,30,,", "0,1,0,25,,")
+    flight = Hover(AirSettings(shadowing_sigma_db=0.0, trace=links), n=3)
+    jammers, extra = [((0.0, 30.0, 60.0), 10.0)], np.arange(9.0).reshape(3, 3)
+    flight.air.advance()
+    plain = flight.air.snr_db
+    assert (plain[0, 1], plain[1, 0]) == (30.0, 25.0)
+    for loss, by in ((extra, ()), (None, jammers), (extra, jammers), (None, ())):
+        flight.air.advance(loss, by)
+        rise = flight.air.channel.noise_rise_db(by)
+        assert (rise > 1.0).all() == bool(by)
+        lost = plain - flight.air.snr_db
+        wanted = rise[None] + (0.0 if loss is None else loss)
+        off = ~np.eye(3, dtype=bool)
+        np.testing.assert_allclose(lost[off], np.broadcast_to(wanted, (3, 3))[off], atol=1e-9)
+
+
+def test_a_traced_loss_stands_in_place_of_bursts() -> None:
+    lossy = overrides(given(loss=([0.0], [0.2])), loss_good=0.5)
+    lossy.advance(None)
+    assert lossy.group_loss()[0, 1] == 0.2
+    assert lossy.group_loss()[1, 0] == 0.5
+    assert lossy.link(0, 1) == (0.5, 0.2, pytest.approx(math.nan, nan_ok=True))
+
+
+@pytest.mark.parametrize(
+    ("bursts", "wanted"), [({"loss_good": 0.1}, True), ({"good_to_bad": 0.1}, True), ({"loss_bad": 1.0}, False)]
+)
+def test_good_pairs_that_lose_are_bursts_too(bursts: dict[str, float], wanted: bool) -> None:
+    assert Overrides.wanted(AirSettings(bursts=BurstSettings(**bursts))) is wanted
+    both = overrides(**bursts)
+    both.advance(None)
+    if "good_to_bad" not in bursts:
+        assert bool(both.group_loss()[0, 1]) is wanted
 
 
 # --- flown ---------------------------------------------------------------------------------------------
@@ -141,3 +220,68 @@ def test_descriptors_on_a_traced_snr_fade_as_the_models_do(tmp_path: Path) -> No
     shares = [np.mean([bool(ids) for _, _, ids in f.heard]) for f in (model, traced)]
     assert 0.2 < shares[0] < 0.95
     assert shares[1] == pytest.approx(shares[0], abs=4 * np.sqrt(2 * 0.25 / 3000))
+
+
+def test_descriptors_go_by_the_trace_and_over_the_way_back_of_a_traced_link_by_its_snr(tmp_path: Path) -> None:
+    """A trace says nothing of the way back: where the model's signal is too weak to be detected none comes."""
+    there, both = ("0,0,1,,0,",), ("0,0,1,,,30", "0,1,0,,,30")
+    for rows, power_dbm, back in ((there, 20.0, True), (there, -60.0, False), (both, -60.0, True)):
+        links = trace(tmp_path, *rows)
+        flight = Hover(AirSettings(shadowing_sigma_db=0.0, tx_power_dbm=power_dbm, trace=links))
+        flight.fly(2.0, lambda k, flight=flight: [flight.publish(0), flight.publish(1)])
+        heard = {sender: [ids for _, who, ids in flight.heard if who == sender] for sender in (0, 1)}
+        assert heard == {0: [(1,)] * 20, 1: [(0,) if back else ()] * 20}, (rows, power_dbm)
+
+
+@pytest.mark.parametrize("loss", [0.3, 0.9])
+def test_a_traced_loss_takes_tries_as_a_burst_of_that_loss_does(loss: float, tmp_path: Path) -> None:
+    """Of fragments and of requests for a block ack: on a good link the two are the same, draw by draw."""
+    rows = [f"0,{i},{j},,{loss}," for i, j in ((0, 1), (1, 0))]
+    flown = []
+    for given in (dict(trace=trace(tmp_path, *rows)), dict(bursts=BurstSettings(loss_good=loss))):
+        flight = Hover(AirSettings(shadowing_sigma_db=0.0, rician_k_db=30.0, **given))
+        flight.fly(6.0, lambda k, flight=flight: flight.send(0, 1, 2_600))
+        flown.append(
+            [(r.number, r.status, r.t_start_s, r.t_done_s, r.airtime_s, r.fragments_lost) for r in flight.rows]
+        )
+    assert len(flown[0]) == 60
+    assert flown[0] == flown[1]
+
+
+def test_a_link_is_usable_by_its_snr_or_by_what_its_trace_says(tmp_path: Path) -> None:
+    """Of a traced loss or goodput whatever carries anything, though its SNR be low; of a traced SNR that one."""
+    rows = ("0,0,1,,,0", "0,1,0,,,3", "0,0,2,,1,", "0,2,0,,0.5,", "0,1,2,4,,")
+    flight = Hover(AirSettings(shadowing_sigma_db=0.0, trace=trace(tmp_path, *rows)), CROSS_M[[0, 1, 3]]).fly(0.2)
+    mbps = flight.air.link_mbps()
+    assert (mbps[0, 1], mbps[1, 0], mbps[0, 2]) == (0.0, 3.0, 0.0)
+    for least_db, modelled, low in ((10.0, True, False), (3.0, True, True), (90.0, False, False)):
+        usable = flight.air.usable(least_db)
+        wanted = [[False, False, False], [True, False, low], [True, modelled, False]]
+        assert usable.tolist() == wanted, least_db
+
+
+def test_a_traced_link_is_there_however_far_apart_its_ends_are(tmp_path: Path) -> None:
+    """In fleets of every size: only links within earshot are worked out in large ones, and those of the trace."""
+
+    def check(drones: int) -> None:
+        at = np.array([[1000.0 * i, 0.0, 60.0] for i in range(drones)])
+        settings = replace(
+            CALM,
+            tx_power_dbm=-12.0,
+            path_loss_exponent=3.0,
+            trace=trace(tmp_path, "0,0,1,30,,", "0,1,0,30,,", "0,2,0,,0,50"),
+        )
+        fleet = Hover(settings, at, spread=0.0)
+
+        def tick(frame: int) -> None:
+            if frame == 0:
+                for sender, receiver in ((0, 1), (2, 0), (0, 2)):
+                    fleet.send(sender, receiver, 10_000, deadline_s=0.05)
+                fleet.env.timeout(0.06).callbacks.append(lambda _: fleet.publish(0))
+
+        fleet.fly(0.1, tick)
+        fates = {(row.sender, row.receiver): row.status for row in fleet.rows}
+        assert fates == {(0, 1): Status.DELIVERED, (2, 0): Status.DELIVERED, (0, 2): Status.LOST}
+        assert [ids for _, _, ids in fleet.heard] == [(1,)]
+
+    assert wrong_rows([32, 33], check) == {}

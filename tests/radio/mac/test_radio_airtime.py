@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from wrong_rows import wrong_rows
 
 from sortie.radio.mac import airtime
 from sortie.radio.mac.airtime import frames_exchanges, legacy_ppdu_s
@@ -18,28 +19,21 @@ def test_a_descriptor_on_the_wire() -> None:
     assert airtime.group_frame_s(180, 6.0) == pytest.approx(432e-6, abs=1e-12)
 
 
-@pytest.mark.parametrize(("n", "share"), [(5, 0.027 * 0.8), (20, 0.0864), (50, 0.216), (100, 0.432)])
-def test_descriptors_alone_claim_this_share_of_the_channel(n: int, share: float) -> None:
-    """432 µs × 10 Hz × N; with AIFS and a mean backoff it is FACTS' 2.7 / 10.7 / 26.7 / 53 %."""
-    assert n * 10 * airtime.group_frame_s(180, 6.0) == pytest.approx(share, rel=0.01)
-    backoff_s = SIFS_S + 2 * SLOT_S + 7.5 * SLOT_S
-    assert n * 10 * (airtime.group_frame_s(180, 6.0) + backoff_s) == pytest.approx(n * 0.00534, rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("payload_bytes", "count"), [(655_360, 488), (163_840, 122), (13_120, 10), (1000, 1), (1344, 1), (1345, 2)]
-)
-def test_fragments(payload_bytes: int, count: int) -> None:
-    assert airtime.fragments(payload_bytes, 1344) == count
-
-
 def test_wire_bytes_of_a_sample_are_its_fragments_headers() -> None:
     """A piece that is of use alone has the headers of a sample of its own."""
+    counts = {655_360: 488, 163_840: 122, 13_120: 10, 1000: 1, 1344: 1, 1345: 2}
+    assert {size: airtime.fragments(size, 1344) for size in counts} == counts
     whole, fragment = 20 + 12 + 16 + 28 + 28 + 38, 20 + 12 + 16 + 36 + 28 + 38
     assert airtime.sample_wire(1000, 1344) == airtime.sample_wire(1000, 1344, alone=True) == (1, 1000 + whole)
     assert airtime.sample_wire(2000, 1344) == (2, 2000 + 2 * fragment)
     assert airtime.sample_wire(2000, 1344, alone=True) == (2, 2000 + 2 * whole)
-    assert airtime.repair_wire_bytes(40) == 2 * (20 + 16 + 28 + 38) + 32 + 28 + 8
+
+
+def test_a_repair_names_each_fragment_that_it_may_ask_for() -> None:
+    """A bit of a word of 32 for each, up to 256."""
+    one = 2 * (20 + 16 + 28 + 38) + 28 + 32
+    more = {1: 0, 32: 0, 33: 4, 64: 4, 65: 8, 256: 28, 257: 28, 4000: 28}
+    assert {lost: airtime.repair_wire_bytes(lost) - one for lost in more} == {n: more[n] + 4 for n in more}
 
 
 def test_control_frames_last_as_the_standard_says() -> None:
@@ -50,59 +44,68 @@ def test_control_frames_last_as_the_standard_says() -> None:
 N, AX = STANDARDS["n"], STANDARDS["ax"]
 
 
-@pytest.mark.parametrize(
-    ("frame", "rate_mbps", "most", "standard", "count"),
-    [
-        # by number: what is asked for, and what the standard's block ack can answer
-        (1494, 600.5, 64, AX, 64),
-        (1494, 600.5, 300, AX, 256),
-        (1494, 390.0, 256, STANDARDS["ac"], 64),
-        # by length, delimiters included: 65,535 B hold 43 frames of 1524 B, and only 42 with 4 B more each
-        (1494, 135.0, 256, N, 43),
-        (1524, 135.0, 256, N, 42),
-        (1520, 135.0, 256, N, 43),
-        # by time: 5,484 µs less the preamble's 44 µs carry 5,848 B at 8.6 Mb/s; without its 44 µs they were 5,895 B
-        (1458, 8.6, 64, AX, 4),
-        (1460, 8.6, 64, AX, 3),
-        (1494, 36.0, 64, AX, 16),
-        # one frame goes, however long it takes
-        (65_000, 8.6, 64, AX, 1),
-    ],
-)
-def test_an_ampdu_ends_at_its_number_its_length_or_at_5484_us(
-    frame: int, rate_mbps: float, most: int, standard: Standard, count: int
-) -> None:
-    assert airtime.ampdu_frames(frame, rate_mbps, most, standard) == count
+def test_an_ampdu_ends_at_its_number_its_length_or_at_5484_us() -> None:
+    def check(frame: int, rate_mbps: float, most: int, standard: Standard, count: int) -> None:
+        assert airtime.ampdu_frames(frame, rate_mbps, most, standard) == count
+
+    assert (
+        wrong_rows(
+            [
+                # by number: what is asked for, and what the standard's block ack can answer
+                (1494, 600.5, 64, AX, 64),
+                (1494, 600.5, 300, AX, 256),
+                (1494, 390.0, 256, STANDARDS["ac"], 64),
+                # by length, delimiters included: 65,535 B hold 43 frames of 1524 B, and only 42 with 4 B more each
+                (1494, 135.0, 256, N, 43),
+                (1524, 135.0, 256, N, 42),
+                (1520, 135.0, 256, N, 43),
+                # by time: 5,484 µs less the preamble's 44 µs carry 5,848 B at 8.6 Mb/s; without its 44 µs they were 5,895 B
+                (1458, 8.6, 64, AX, 4),
+                (1460, 8.6, 64, AX, 3),
+                (1494, 36.0, 64, AX, 16),
+                # one frame goes, however long it takes
+                (65_000, 8.6, 64, AX, 1),
+            ],
+            check,
+        )
+        == {}
+    )
 
 
-@pytest.mark.parametrize(
-    ("payload_bytes", "fragment_bytes", "alone", "rate_mbps", "most", "ampdus"),
-    [
-        # fragments have 150 B around them, and 4 B of delimiter in an A-MPDU
-        (130 * 1344, 1344, False, 600.5, 64, [64 * 1498, 64 * 1498, 2 * 1498]),
-        (128 * 1344, 1344, False, 600.5, 64, [64 * 1498, 64 * 1498]),
-        # the last, short one rides behind the others, or alone in an A-MPDU of its own
-        (63 * 1344 + 100, 1344, False, 600.5, 64, [63 * 1498 + 254]),
-        (64 * 1344 + 100, 1344, False, 600.5, 64, [64 * 1498, 254]),
-        *[(3 * 1344 + rest, 1344, False, 8.6, 64, [3 * 1498, rest + 154]) for rest in range(1, 60, 3)],
-        *[(1344 + rest, 1344, False, 8.6, 64, [1498 + rest + 154]) for rest in range(1, 60, 3)],
-        # whole samples and pieces that are of use alone have 142 B around them
-        *[(size, 1344, False, 8.6, 64, [size + 146]) for size in range(100, 160, 3)],
-        *[(5 * 500 + rest, 500, True, 8.6, 4, [4 * 646, 646 + rest + 146]) for rest in range(1, 60, 3)],
-        # frames that travel one by one have no delimiter
-        *[(2 * 500 + rest, 500, False, 8.6, 1, [650, 650, rest + 150]) for rest in range(1, 60, 3)],
-    ],
-)
-def test_a_sample_takes_its_ampdus_and_what_lies_between(
-    payload_bytes: int, fragment_bytes: int, alone: bool, rate_mbps: float, most: int, ampdus: list[int]
-) -> None:
+def test_a_sample_takes_its_ampdus_and_what_lies_between() -> None:
     """Of each A-MPDU its preamble of 44 µs and whole symbols of 13.6 µs for 22 bits and its bytes; then SIFS, ack, DIFS, a slot."""
-    whole = airtime.sample_exchanges(payload_bytes, fragment_bytes, rate_mbps, most, alone=alone)
-    symbols = sum(math.ceil((22 + 8 * size) / (rate_mbps * 13.6)) for size in ampdus)
-    assert whole.count == len(ampdus)
-    assert whole.ppdu_s == pytest.approx(len(ampdus) * 44e-6 + symbols * 13.6e-6, rel=1e-9)
-    between_s = SIFS_S + airtime.BLOCK_ACK_S + DIFS_S + SLOT_S
-    assert whole.clean_s == pytest.approx(whole.ppdu_s + len(ampdus) * between_s, rel=1e-9)
+
+    def check(
+        payload_bytes: int, fragment_bytes: int, alone: bool, rate_mbps: float, most: int, ampdus: list[int]
+    ) -> None:
+        whole = airtime.sample_exchanges(payload_bytes, fragment_bytes, rate_mbps, most, alone=alone)
+        symbols = sum(math.ceil((22 + 8 * size) / (rate_mbps * 13.6)) for size in ampdus)
+        assert whole.count == len(ampdus)
+        assert whole.ppdu_s == pytest.approx(len(ampdus) * 44e-6 + symbols * 13.6e-6, rel=1e-9)
+        between_s = SIFS_S + airtime.BLOCK_ACK_S + DIFS_S + SLOT_S
+        assert whole.clean_s == pytest.approx(whole.ppdu_s + len(ampdus) * between_s, rel=1e-9)
+
+    assert (
+        wrong_rows(
+            [
+                # fragments have 150 B around them, and 4 B of delimiter in an A-MPDU
+                (130 * 1344, 1344, False, 600.5, 64, [64 * 1498, 64 * 1498, 2 * 1498]),
+                (128 * 1344, 1344, False, 600.5, 64, [64 * 1498, 64 * 1498]),
+                # the last, short one rides behind the others, or alone in an A-MPDU of its own
+                (63 * 1344 + 100, 1344, False, 600.5, 64, [63 * 1498 + 254]),
+                (64 * 1344 + 100, 1344, False, 600.5, 64, [64 * 1498, 254]),
+                *[(3 * 1344 + rest, 1344, False, 8.6, 64, [3 * 1498, rest + 154]) for rest in range(1, 60, 3)],
+                *[(1344 + rest, 1344, False, 8.6, 64, [1498 + rest + 154]) for rest in range(1, 60, 3)],
+                # whole samples and pieces that are of use alone have 142 B around them
+                *[(size, 1344, False, 8.6, 64, [size + 146]) for size in range(100, 160, 3)],
+                *[(5 * 500 + rest, 500, True, 8.6, 4, [4 * 646, 646 + rest + 146]) for rest in range(1, 60, 3)],
+                # frames that travel one by one have no delimiter
+                *[(2 * 500 + rest, 500, False, 8.6, 1, [650, 650, rest + 150]) for rest in range(1, 60, 3)],
+            ],
+            check,
+        )
+        == {}
+    )
 
 
 def test_tries_and_residual_loss() -> None:
@@ -112,9 +115,9 @@ def test_tries_and_residual_loss() -> None:
     assert airtime.residual_loss(0.5, 2) == 0.125
 
 
-@pytest.mark.parametrize(("n", "p"), [(5, 0.2715), (10, 0.3844), (20, 0.4809), (50, 0.5953)])
-def test_collision_probability_is_bianchis(n: int, p: float) -> None:
-    assert contention(n).collision_probability == pytest.approx(p, abs=5e-5)
+def test_collision_probability_is_bianchis() -> None:
+    found = [contention(n).collision_probability for n in (5, 10, 20, 50)]
+    assert found == pytest.approx([0.2715, 0.3844, 0.4809, 0.5953], abs=5e-5)
 
 
 def test_a_lone_sender_waits_half_its_window_and_never_collides() -> None:
@@ -125,24 +128,17 @@ def test_a_lone_sender_waits_half_its_window_and_never_collides() -> None:
         contention(0)
 
 
-@pytest.mark.parametrize(
-    ("rate_mbps", "expected"),
-    [(86.0, (34.967, 33.074, 30.928, 27.698)), (360.3, (55.839, 53.936, 51.286, 46.857))],
-)
-def test_he_throughput_without_aggregation_is_ns3s(rate_mbps: float, expected: tuple[float, ...]) -> None:
-    one = frames_exchanges(1, 1538, 1538, rate_mbps, 1, airtime.ACK_S)
-    ours = [12e-3 / one.channel_s(contention(n)) for n in (5, 10, 20, 50)]
-    assert ours == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("rate_mbps", "frames", "expected"),
-    [(86.0, 16, (76.8, 66.7, 55.9, 48.8, 42.8)), (360.3, 64, (319, 277, 233, 203, 178))],
-)
-def test_he_throughput_with_aggregation(rate_mbps: float, frames: int, expected: tuple[float, ...]) -> None:
-    one = frames_exchanges(frames, 1538, 1538, rate_mbps, frames)
-    ours = [frames * 12e-3 / one.channel_s(contention(n)) for n in (1, 5, 20, 50, 100)]
-    assert ours == pytest.approx(expected, rel=2e-3)
+def test_he_throughput_is_ns3s() -> None:
+    """Of 5 to 50 senders of single frames, and of 1 to 100 senders of A-MPDUs."""
+    single = {86.0: (34.967, 33.074, 30.928, 27.698), 360.3: (55.839, 53.936, 51.286, 46.857)}
+    for rate_mbps, mbps in single.items():
+        one = frames_exchanges(1, 1538, 1538, rate_mbps, 1, airtime.ACK_S)
+        assert [12e-3 / one.channel_s(contention(n)) for n in (5, 10, 20, 50)] == pytest.approx(mbps, rel=1e-4)
+    several = {(86.0, 16): (76.8, 66.7, 55.9, 48.8, 42.8), (360.3, 64): (319, 277, 233, 203, 178)}
+    for (rate_mbps, frames), mbps in several.items():
+        one = frames_exchanges(frames, 1538, 1538, rate_mbps, frames)
+        ours = [frames * 12e-3 / one.channel_s(contention(n)) for n in (1, 5, 20, 50, 100)]
+        assert ours == pytest.approx(mbps, rel=2e-3)
 
 
 def test_11a_throughput_is_ns3s_once_the_winner_may_go_on() -> None:
@@ -155,22 +151,18 @@ def test_11a_throughput_is_ns3s_once_the_winner_may_go_on() -> None:
         assert -0.04 < plain / reference - 1 < -0.02
 
 
-@pytest.mark.parametrize("n", [1, 5, 50])
-def test_throughput_is_payload_over_the_channel_time_of_an_exchange(n: int) -> None:
-    one = frames_exchanges(16, 1538, 1538, 86.0, 16)
-    whole = saturation_mbps(n, 16 * 12e3, one.ppdu_s, airtime.BLOCK_ACK_S)
-    assert whole == pytest.approx(16 * 12e-3 / one.channel_s(contention(n)))
-
-
-@pytest.mark.parametrize("standard", STANDARDS.values(), ids=STANDARDS)
-def test_rates_follow_from_subcarriers_modulation_code_and_symbol(standard: Standard) -> None:
+def test_rates_follow_from_subcarriers_modulation_code_and_symbol() -> None:
     """Data subcarriers × bits × code rate / symbol time (IEEE 802.11-2020 §19.5, §21.5; 802.11ax §27.5), to 0.05 Mb/s."""
-    subcarriers = {"n": {20: 52, 40: 108}, "ac": {20: 52, 40: 108, 80: 234}, "ax": {20: 234, 40: 468, 80: 980}}
-    bits = (0.5, 1, 1.5, 2, 3, 4, 4.5, 5, 6, 20 / 3, 7.5, 25 / 3)
-    assert set(standard.rates_mbps) == set(subcarriers[standard.name])
-    for width, rates in standard.rates_mbps.items():
-        exact = [subcarriers[standard.name][width] * b / standard.symbol_s * 1e-6 for b in bits[: len(rates)]]
-        assert rates == pytest.approx(exact, abs=0.051)
+
+    def check(standard: Standard) -> None:
+        subcarriers = {"n": {20: 52, 40: 108}, "ac": {20: 52, 40: 108, 80: 234}, "ax": {20: 234, 40: 468, 80: 980}}
+        bits = (0.5, 1, 1.5, 2, 3, 4, 4.5, 5, 6, 20 / 3, 7.5, 25 / 3)
+        assert set(standard.rates_mbps) == set(subcarriers[standard.name])
+        for width, rates in standard.rates_mbps.items():
+            exact = [subcarriers[standard.name][width] * b / standard.symbol_s * 1e-6 for b in bits[: len(rates)]]
+            assert rates == pytest.approx(exact, abs=0.051)
+
+    assert wrong_rows(STANDARDS.values(), check) == {}
 
 
 def test_generations_differ_in_preamble_and_symbol() -> None:
