@@ -33,7 +33,7 @@ def moving(frames: int, n: int) -> NDArray[np.float64]:
 
 
 def fades_db(settings: AirSettings, n: int, frames: int, seed: int = 1, per_frame: int = 1) -> np.ndarray:
-    """[frames, n, n]: the fades of group frames that stations send one after another, sender by receiver; NaN to itself.
+    """[frames, n, n]: fades of group frames that stations send in turn, by sender and receiver; NaN to itself.
 
     Args: `per_frame`: how many a station sends within one frame of the flight.
     """

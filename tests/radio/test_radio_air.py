@@ -1,4 +1,4 @@
-"""The air as a whole: fates of samples, accounts, descriptors, silenced drones, conservation, determinism."""
+"""The air as a whole: fates of samples, descriptors, silenced drones, conservation, determinism."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from radio_examples import CROSS_M
 from radio_flights import Hover, trace
 from wrong_rows import wrong_rows
 
@@ -81,15 +80,6 @@ def test_a_dead_link_costs_a_few_tries_and_says_so() -> None:
     assert all(r.airtime_s < 10e-3 and r.mcs == -1 and r.wire_bytes == 0 for r in f.rows if r.receiver == 1)
     assert f.air.goodput_mbps(0)[0] == SILENT_MBPS
     assert f.air.goodput_mbps(0)[1] > 100
-
-
-def test_a_newer_sample_replaces_the_older_of_its_kind_only() -> None:
-    f = Hover(CALM).fly(0.1)
-    for kind in ("features", "detections", "features"):
-        f.send(0, 1, 600_000, kind=kind)
-    f.env.run(until=0.2)
-    assert [(r.number, r.reason) for r in f.rows] == [(0, "replaced"), (1, ""), (2, "")]
-    assert isnan(f.rows[0].t_start_s) or f.rows[0].airtime_s == 0.0
 
 
 def test_what_a_silenced_drone_had_put_on_the_air_is_counted() -> None:
@@ -188,66 +178,6 @@ def test_a_silenced_drone_answers_nobody(tmp_path: Path) -> None:
     assert asked > 6
 
 
-@pytest.mark.parametrize("hops", [1, 2])
-def test_the_row_of_a_sample_that_was_never_served_has_the_snr_of_its_link_at_its_sending(hops: int) -> None:
-    """Of this frame and not of the one before, which its sender knows; of the first hop."""
-    flight = Hover(AirSettings(shadowing_sigma_db=0.0, relay_max_hops=hops), CROSS_M[[0, 1, 3]])
-    flight.air.advance()
-    flight.extra = np.array([[0.0, 7.0, 0.0], [0.0] * 3, [0.0] * 3])
-    flight.air.advance(flight.extra)
-    snr_db = flight.air.snr_db
-    flight.send(0, 2, 2_000_000, kind="long", deadline_s=0.05)
-    flight.send(0, 1, 1000, kind="waits", deadline_s=0.02)
-    flight.env.run(until=0.06)
-    (waited,) = [r for r in flight.rows if r.kind == "waits"]
-    assert (waited.reason, waited.mcs) == ("deadline_queued", -1)
-    assert waited.snr_db == pytest.approx(snr_db[0, 1])
-    assert snr_db[0, 1] == pytest.approx(snr_db[1, 0] - 7.0)
-
-
-@pytest.mark.parametrize("by_trace", [False, True])
-def test_a_payload_goes_at_the_rate_of_the_frame_before_and_is_lost_to_the_present_one(
-    by_trace: bool, tmp_path: Path
-) -> None:
-    """A link that fades from one frame to the next, for four frames: its sender learns it a frame late, both times."""
-    weak = set(range(5, 9))
-    rows = [f"{0.1 * k:.1f},0,1,{8 if k in weak else 40},," for k in range(20)]
-    config = AirSettings(trace=trace(tmp_path, *rows)) if by_trace else CALM
-    flight = Hover(config, np.array([[0.0, 0.0, 60.0], [20.0, 0.0, 60.0]]))
-    planned: list[Any] = []
-
-    def tick(k: int) -> None:
-        flight.send(0, 1, 3000)
-        planned.append(flight.air.link_mbps()[0, 1])
-
-    for k in range(12):
-        flight.extra = None
-        if not by_trace and k in weak:
-            flight.extra = np.full((2, 2), 38.0)
-        flight.air.advance(flight.extra)
-        tick(k)
-        flight.env.run(until=0.1 * (k + 1))
-    mcs, snr_db = ({round(10 * r.t_sent_s): getattr(r, name) for r in flight.rows} for name in ("mcs", "snr_db"))
-    fast = mcs[0]
-    assert {k for k in range(12) if mcs[k] < fast} == {k for k in range(12) if planned[k] < planned[0]} == {6, 7, 8, 9}
-    assert {k for k in range(12) if snr_db[k] < 20} == weak
-
-
-def test_accounts_do_not_depend_on_what_was_asked_before() -> None:
-    """Half-way through a transmission: each figure asked first, and after the others."""
-
-    def asked(*names: str) -> dict[str, Any]:
-        flight = Hover(CALM, n=2)
-        flight.air.advance()
-        flight.send(0, 1, 200_000, deadline_s=0.5)
-        flight.env.run(until=0.0213)
-        return {name: getattr(flight.air, name) for name in names}
-
-    together = asked("airtime_s", "utilisation")
-    assert asked("utilisation", "airtime_s") == together
-    assert asked("utilisation")["utilisation"] == together["utilisation"]
-
-
 def test_a_link_too_weak_to_be_detected_is_none_for_routes_and_for_payloads() -> None:
     """Though its rate would still be one."""
     at = np.array([[0.0, 0.0, 60.0], [60.0, 0.0, 60.0], [400.0, 0.0, 60.0]])
@@ -259,18 +189,6 @@ def test_a_link_too_weak_to_be_detected_is_none_for_routes_and_for_payloads() ->
         assert mbps[0, 1] > 0
         assert (mbps[0, 2] > 0) == there
         assert all((r.reason == "no_link") != there for r in flight.rows)
-
-
-def test_a_sample_was_given_the_channel_in_all_its_passes(tmp_path: Path) -> None:
-    """Repairs included: what its sender has transmitted, it was given at least, and no more than passed meanwhile."""
-    settings = AirSettings(retry_limit=0, trace=trace(tmp_path, "0,0,1,,0.5,", "0,1,0,,0,"))
-    flight = Hover(settings)
-    flight.air.advance()
-    flight.send(0, 1, 40_000, reliable=True, deadline_s=2.0)
-    flight.env.run(until=2.0)
-    (row,) = flight.rows
-    assert row.repairs > 1
-    assert flight.air.airtime_s[0] <= row.airtime_s < row.t_done_s - row.t_start_s
 
 
 traffic = st.lists(
@@ -370,16 +288,6 @@ def test_broadcasts_in_step_are_sent_together_and_out_of_step_hardly_collide() -
     assert counters[0.8].missed < 0.02 * 4000
 
 
-def test_a_far_receiver_misses_some_broadcasts_a_dead_one_all() -> None:
-    f = Hover(replace(CALM, preamble_detection_dbm=-110.0), n=3)
-    f.extra = np.array([[0.0, 37.5, 90.0], [0.0] * 3, [0.0] * 3])
-    f.fly(20.0, lambda _: f.publish(0))
-    counts = Counter(i for _, _, ids in f.heard for i in ids)
-    assert 20 < counts[1] < 190
-    assert counts[2] == 0
-    assert f.air.counters.missed == 400 - counts[1]
-
-
 def test_same_inputs_same_fates_and_a_sixth_silent_drone_changes_none() -> None:
     def fates(n: int, seed: int = 1) -> tuple[list, list]:
         f = Hover(AirSettings(retry_limit=0), n=n, seed=seed)
@@ -395,17 +303,6 @@ def test_same_inputs_same_fates_and_a_sixth_silent_drone_changes_none() -> None:
     assert fates(5) == fates(5)
     assert fates(5) == fates(6)
     assert fates(5) != fates(5, seed=2)
-
-
-def test_the_first_frame_may_begin_after_the_air_is_there() -> None:
-    f = Hover(CALM, n=5)
-    f.env.run(until=0.25)
-    f.air.advance()
-    f.send(0, 1, 2000)
-    f.publish(0)
-    f.env.run(until=0.5)
-    assert [r.status for r in f.rows] == [Status.DELIVERED]
-    assert [ids for _, _, ids in f.heard] == [(1, 2, 3, 4)]
 
 
 def test_a_descriptor_that_is_handed_over_early_is_as_one_that_is_handed_over_in_time() -> None:
@@ -439,16 +336,8 @@ def test_a_descriptor_that_is_handed_over_early_is_as_one_that_is_handed_over_in
     assert all(heard_s - at > 0.4e-3 for at, heard_s, _ in heard)
 
 
-def test_a_descriptor_that_meets_several_others_is_one_that_collided() -> None:
-    counters = Counters()
-    casts = Broadcasts(6.0, 4, counters, set(), seed=1, replication=0, frame_s=0.1, publish_spread=0.8, as_lists=True)
-    casts.end(casts.frame(2, 100, lambda ids: None), np.arange(4), bytes([1, 2, 0, 3]))
-    casts.end(casts.frame(2, 100, lambda ids: None), np.arange(4), bytes([4, 5, 0, 4]))
-    assert (counters.collided, counters.missed, counters.broadcasts) == (1, 6, 2)
-
-
 def test_every_living_drone_hears_a_descriptor_or_misses_it_for_a_reason() -> None:
-    """Drone 0 sends; 1 hears it, 2 meets another, 3 sends itself, 4 is too weak, or out of reach and not named at all."""
+    """Drone 0 sends; 1 hears it, 2 meets another, 3 sends itself, 4 is too weak, or out of reach and not named."""
 
     def check(as_lists: bool, gone: set[int], far: bool) -> None:
         counters, heard = Counters(), []

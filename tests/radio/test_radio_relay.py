@@ -1,7 +1,8 @@
-"""Routes over several hops: the cheapest by an independent search, flown, paid for, and reported; what relays do."""
+"""Routes over several hops and how a fleet hangs together, beside networkx; relays, flown and paid for."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -12,12 +13,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from radio_examples import CROSS_M
 from radio_flights import Hover, trace
 
 from sortie.radio import Status
 from sortie.radio.relay import Routes, cheapest
 from sortie.radio.settings import AirSettings
+from sortie.radio.topology import Connectivity, connectivity, linked_drones, widths
 
 LINE_M = np.array([[0.0, 0.0, 60.0], [150.0, 0.0, 60.0], [300.0, 0.0, 60.0]])
 """Three in a row: either end is heard badly by the other, well by the middle."""
@@ -90,24 +93,6 @@ def test_a_route_over_others_pays_airtime_for_each_hop(tmp_path: Path) -> None:
     assert alone_s[1] == pytest.approx(100_000 * 8 / 10e6, rel=0.05)
 
 
-def test_a_good_direct_link_is_not_left() -> None:
-    flight = Hover(AirSettings(relay_max_hops=4), n=5)
-    flight.fly(5.0, lambda frame: [flight.send(i, (i + 1) % 5, 3000, kind="d") for i in range(5)])
-    assert {r.hops for r in flight.rows} == {1}
-
-
-def test_far_ends_of_a_row_are_reached_over_its_middle() -> None:
-    config = AirSettings(shadowing_sigma_db=0.0, tx_power_dbm=7.0, preamble_detection_dbm=-101.0)
-    came = {}
-    for hops in (1, 2):
-        flight = Hover(replace(config, relay_max_hops=hops), LINE_M)
-        flight.fly(10.0, lambda frame, f=flight: f.send(0, 2, 60_000))
-        came[hops] = sum(r.status is Status.DELIVERED for r in flight.rows) / len(flight.rows)
-        assert sum(r.hops == hops for r in flight.rows) > 90  # in the first frame nothing is known before it
-    assert came[1] < 0.2
-    assert came[2] > 0.9
-
-
 def test_routes_know_a_traced_loss(tmp_path: Path) -> None:
     """0 → 1 loses all at a perfect SNR, 0 → 2 half; 0 → 3, by the models out of everyone's range, nothing."""
     at_m = np.array([[0.0, 0.0, 60.0], [20.0, 0.0, 60.0], [0.0, 20.0, 60.0], [2e6, 0.0, 60.0]])
@@ -139,7 +124,7 @@ def test_a_lost_relay_is_left(tmp_path: Path) -> None:
 
 
 def test_a_relayed_sample_takes_at_most_the_hops_that_a_route_may_have(tmp_path: Path) -> None:
-    """Links that change while it is under way: each relay has only what is left, and then goes straight to the target."""
+    """Each relay has only the hops that are left, and then goes straight to the target."""
     n = 5
     mbps = {1: 60.0, 2: 6.0, 3: 3.0, 4: 2.0}
     rows = [f"0,{i},{j},,,{mbps[abs(i - j)]}" for i in range(n) for j in range(n) if i != j]
@@ -168,15 +153,6 @@ def test_what_dies_in_a_relay_s_queue_was_served_on_its_first_hop(tmp_path: Path
     assert late.airtime_s == 0.0
 
 
-def test_no_row_of_a_flight_over_relays_has_airtime_and_was_never_served() -> None:
-    line_m = np.array([[150.0 * i, 0.0, 60.0] for i in range(5)])
-    flight = Hover(AirSettings(relay_max_hops=4, tx_power_dbm=10.0), line_m)
-    flight.fly(5.0, lambda frame: [flight.send(i, j, 60_000) for i in range(5) for j in range(5) if i != j])
-    rows = flight.rows + flight.air.finish()
-    assert sum(r.hops > 1 and r.reason == "deadline_queued" for r in rows) > 30
-    assert [r for r in rows if np.isnan(r.t_start_s) and r.airtime_s > 0.0] == []
-
-
 def test_pieces_lost_on_one_hop_are_not_sent_on_the_next(tmp_path: Path) -> None:
     links = trace(tmp_path, "0,0,1,,0.3,100", "0,1,2,,0.3,100", "0,0,2,,,0")
     flight = Hover(AirSettings(trace=links, retry_limit=0, relay_max_hops=2), LINE_M)
@@ -191,7 +167,7 @@ def test_pieces_lost_on_one_hop_are_not_sent_on_the_next(tmp_path: Path) -> None
 
 
 def over_one(folder: Path, *links: tuple[int, int, float]) -> Hover:
-    """A fleet of four in the frame 0, with links of these goodputs (sender, receiver, Mb/s) and none else, two hops at most."""
+    """A fleet of four with links of these goodputs (sender, receiver, Mb/s) and none else, two hops at most."""
     given = {(i, j): mbps for i, j, mbps in links}
     rows = [f"0,{i},{j},,,{given.get((i, j), 0)}" for i in range(4) for j in range(4) if i != j]
     return Hover(
@@ -217,7 +193,7 @@ def test_what_a_lost_drone_has_at_hand_dies_with_it_and_what_it_handed_on_does_n
 
 
 def test_a_relay_counts_a_payload_s_wait_from_when_it_came(tmp_path: Path) -> None:
-    """It came over a slow hop to a relay that is busy with another link: that says nothing of the link on which it waits."""
+    """It came over a slow hop to a relay that is busy: that says nothing of the link on which it waits."""
     flight = over_one(tmp_path, (0, 1, 4.0), (1, 2, 40.0), (1, 3, 2.0))
     flight.send(1, 2, 40_000, kind="before", deadline_s=1.0)
     flight.env.run(until=0.2)
@@ -306,3 +282,75 @@ def test_a_sample_that_waits_in_a_relay_was_queued_whether_it_was_repaired_befor
     (row,) = [row for row in fleet.rows if row.kind == "f"]
     assert (row.hops, row.repairs > 0) == (2, loss > 0)
     assert (row.status, row.reason) == (Status.EXPIRED, "deadline_queued")
+
+
+NAN = np.nan
+
+
+CHAIN = np.array([[NAN, 9.0, 1.0, 0.0], [9.0, NAN, 6.0, 0.0], [1.0, 6.0, NAN, 0.0], [0.0, 0.0, 0.0, NAN]])
+
+
+ANY = arrays(float, st.integers(0, 6).map(lambda n: (n, n)), elements=st.floats(-10, 10) | st.just(NAN))
+
+
+FEW = arrays(float, st.integers(1, 5).map(lambda n: (n, n)), elements=st.integers(0, 4).map(float) | st.just(NAN))
+"""Values that are often equal, and often no link at a threshold of 1."""
+
+
+def graph_of(quality: np.ndarray, threshold: float) -> nx.DiGraph:
+    """The usable links."""
+    graph = nx.DiGraph()
+    graph.add_nodes_from(range(len(quality)))
+    n = range(len(quality))
+    graph.add_edges_from((i, j) for i in n for j in n if i != j and quality[i, j] >= threshold)
+    return graph
+
+
+def test_who_is_connected_and_who_is_cut() -> None:
+    assert connectivity(CHAIN, 5.0) == Connectivity(False, (3,), (1, 2, 6.0))
+    assert connectivity(CHAIN[:3, :3], 5.0) == Connectivity(True, (), (1, 2, 6.0))
+    assert connectivity(CHAIN, 100.0) == Connectivity(False, (1, 2, 3), None)
+    one_way = np.array([[NAN, 9.0], [0.0, NAN]])
+    assert connectivity(one_way, 5.0) == Connectivity(False, (1,), (0, 1, 9.0))
+    assert connectivity(np.zeros((1, 1)), 5.0) == Connectivity(True, (), None)
+    assert connectivity(np.zeros((0, 0)), 5.0) == Connectivity(True, (), None)
+
+
+@given(ANY)
+def test_linked_drones_are_those_with_an_edge(quality: np.ndarray) -> None:
+    graph = graph_of(quality, 0.0)
+    assert linked_drones(quality, 0.0) == [i for i in sorted(graph) if graph.degree(i)]
+
+
+@given(ANY)
+def test_groups_are_strongly_connected_components(quality: np.ndarray) -> None:
+    groups = sorted(nx.strongly_connected_components(graph_of(quality, 0.0)), key=lambda g: (-len(g), min(g)))
+    found = connectivity(quality, 0.0)
+    assert found.connected == (len(groups) <= 1)
+    assert set(found.cut) == {i for group in groups[1:] for i in group}
+    assert list(found.cut) == sorted(found.cut)
+
+
+@given(FEW)
+def test_no_path_is_wider_than_the_widest(quality: np.ndarray) -> None:
+    n = len(quality)
+    usable = np.where(quality >= 1.0, quality, NAN)
+    found, reached = widths(usable), []
+    for i, j in itertools.product(range(n), repeat=2):
+        others = [k for k in range(n) if k not in (i, j)]
+        paths = [(i, *via, j) for r in range(n - 1) for via in itertools.permutations(others, r)] if i != j else []
+        ways = [[usable[a, b] for a, b in itertools.pairwise(path)] for path in paths]
+        best = max((min(way) for way in ways if not np.isnan(way).any()), default=-np.inf)
+        assert found[i, j] == best
+        reached += [best] if np.isfinite(best) else []
+    bottleneck = connectivity(quality, 1.0).bottleneck
+    assert (bottleneck is None) == (not reached)
+    if bottleneck is not None:
+        i, j, width = bottleneck
+        assert i != j
+        assert width == min(reached) == quality[i, j]
+
+
+def test_broken_input() -> None:
+    with pytest.raises(ValueError, match=r"^quality has shape \(2, 3\), must be square$"):
+        connectivity(np.zeros((2, 3)), 1.0)

@@ -1,23 +1,27 @@
-"""Fleets of any size: links of a pair do not depend on who else flies, and only links within earshot are worked out."""
+"""Fleets of any size: links of a pair do not depend on who else flies; only links within earshot are worked out."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pytest
 import simpy
 from radio_examples import CROSS_M, moving, still, tilting
+from radio_flights import Hover
 from wrong_rows import wrong_rows
 
 from sortie.radio import Air
-from sortie.radio.channel.crowd_loops import distances, shadowing
-from sortie.radio.channel.draws import mix, normal_table
+from sortie.radio.channel.bursts import PairStates
+from sortie.radio.channel.draws import StreamShadowing
 from sortie.radio.channel.earshot import both_ways, near_pairs
 from sortie.radio.channel.large_fleet import EPOCH
-from sortie.radio.channel.shadowing import ShadowField, gauss_markov
+from sortie.radio.channel.shadowing import ShadowField
 from sortie.radio.channel.snr import OUT_OF_RANGE_DB, SQUARE, Channel, earshot_m
-from sortie.radio.settings import AirSettings
+from sortie.radio.settings import AirSettings, BurstSettings
 
 NEAR = AirSettings(tx_power_dbm=0.0, path_loss_exponent=3.0)
 
@@ -79,7 +83,7 @@ def test_a_field_of_shadows_has_the_time_of_the_flight_in_every_block(n: int) ->
 @pytest.mark.parametrize("n", [4, SQUARE + 3])
 @pytest.mark.parametrize("at_frame", [5, 32])
 def test_a_fleet_that_takes_another_way_has_the_links_of_one_that_flew_it_all_along(n: int, at_frame: int) -> None:
-    """Places and attitudes, for the links between drones and for a jammer; large fleets follow from their next block on."""
+    """Places and attitudes, between drones and for a jammer; large fleets follow from their next block on."""
     frames, config = 70, AirSettings(shadowing_sigma_db=0.0, antenna="dipole")
     at, up = moving(frames, n), tilting(frames, n)
     other, turned = at.copy(), up.copy()
@@ -170,26 +174,6 @@ def test_nothing_out_of_earshot_is_heard() -> None:
     assert wrong_rows([(3.5, 12.0), (0.0, 40.0)], check) == {}
 
 
-def test_a_descriptor_reaches_drones_of_a_large_fleet_within_earshot_in_the_order_of_their_ids() -> None:
-    positions = _wide_fleet(120) * [0.4, 0.4, 1.0]
-    far_m, heard = earshot_m(NEAR), []
-    env = simpy.Environment()
-    air = Air(env, NEAR, positions, seed=1, frame_s=0.1)
-    for frame in range(70):
-        env.run(until=0.1 * frame + 1e-3)
-        air.advance()
-        apart = np.sqrt(((positions[frame][:, None] - positions[frame][None]) ** 2).sum(axis=-1))
-        for i in range(0, 120, 13):
-            near = set(np.flatnonzero(apart[i] <= far_m).tolist())
-            air.broadcast(i, 208, lambda ids, near=near: heard.append((list(ids), near)))
-    env.run(until=7.0)
-    assert len(heard) == 70 * 10
-    assert sum(len(ids) for ids, _ in heard) > 300
-    for ids, near in heard:
-        assert ids == sorted(ids)
-        assert set(ids) <= near
-
-
 def test_shadowing_by_counter_has_the_distribution_of_that_by_stream() -> None:
     n = SQUARE + 16
     place = np.random.default_rng(1).random((n, 3)) * 30.0
@@ -227,33 +211,85 @@ def test_pairs_that_are_always_listed_stand_in_order_among_the_near_ones() -> No
     assert near_pairs(at, 5.0, [(0, 1)])[0].tolist() == [0]
 
 
-def test_distances_are_numpys_and_a_pair_is_near_that_is_so_in_one_frame() -> None:
-    rng = np.random.default_rng(4)
-    at = rng.uniform(-900.0, 900.0, (7, 40, 3)).astype(np.float32)
-    high, low = np.tril_indices(40, -1)
-    step = at[:, low] - at[:, high]
-    step *= step
-    wanted = np.sqrt(step[..., 0] + step[..., 1] + step[..., 2])
-    apart, near = np.empty_like(wanted), np.zeros(len(low), bool)
-    near[3] = True  # one that is listed however far apart it is
-    reach = np.float32(wanted[2, 5])
-    distances(at, low, high, reach, apart, near)
-    np.testing.assert_array_equal(apart, wanted)
-    expected = (wanted <= reach).any(axis=0)
-    assert 0 < expected.sum() < len(low)
-    expected[3] = True
-    np.testing.assert_array_equal(near, expected)
+Array = np.ndarray[Any, Any]
+CALM = AirSettings(shadowing_sigma_db=0.0)
+LOSSY = AirSettings(shadowing_sigma_db=0.0, retry_limit=0, bursts=BurstSettings(loss_good=0.5))
 
 
-def test_shadowing_is_numpys_and_begins_anew_where_there_was_none() -> None:
-    rng = np.random.default_rng(5)
-    keys = rng.integers(0, 1 << 63, 500).astype(np.uint64)
-    before = rng.normal(0.0, 4.0, 500).astype(np.float32)
-    before[::3] = np.nan
-    counters = mix(np.arange(64, 76, dtype=np.uint64))
-    z = normal_table()[mix(keys[None, :] + counters[:, None]) >> np.uint64(48)]
-    wanted = gauss_markov(z, 3.3, 0.97, before)
-    found = np.empty((12, 500), np.float32)
-    single = map(np.float32, (3.3, np.sqrt(1.0 - 0.97**2) * 3.3, 0.97))
-    shadowing(keys, 64, normal_table(), *single, before, found)
-    np.testing.assert_array_equal(found, wanted)
+def lost_pieces(sender: int, receiver: int, seed: int = 1, replication: int = 0) -> Array:
+    """Which pieces of 40 samples were lost, one bit each, where a link loses half of them and nobody else sends."""
+    flight = Hover(LOSSY, n=4, seed=seed, replication=replication)
+    flight.fly(4.0, lambda k: flight.send(sender, receiver, 60 * 200, piece_bytes=200))
+    lost = np.zeros((40, 60), bool)
+    assert len(flight.rows) == 40
+    for k, row in enumerate(flight.rows):
+        lost[k, list(row.missing) if row.arrived_bytes else slice(None)] = True
+    return lost[lost.mean(axis=1) < 1].ravel()[: 60 * 20]
+
+
+def test_losses_are_drawn_for_each_sender_direction_seed_and_replication() -> None:
+    """Also between senders with the same history: neither shares its losses with the way back."""
+    flights = {
+        "there": lost_pieces(0, 1),
+        "back": lost_pieces(1, 0),
+        "other pair": lost_pieces(2, 3),
+        "other receiver": lost_pieces(0, 2),
+        "other seed": lost_pieces(0, 1, seed=2),
+        "other replication": lost_pieces(0, 1, replication=1),
+    }
+    assert np.array_equal(flights["there"], lost_pieces(0, 1))
+    for (a, one), (b, other) in combinations(flights.items(), 2):
+        if {a, b} == {"there", "other receiver"}:
+            continue  # one sender with one history
+        n = min(len(one), len(other))
+        assert n > 500
+        assert 0.3 < one.mean() < 0.7
+        agree = float(np.mean(one[:n] == other[:n]))
+        assert agree == pytest.approx(0.5, abs=0.09), (a, b)
+
+
+def test_receivers_lose_a_descriptor_each_by_a_draw_of_its_own() -> None:
+    flight = Hover(LOSSY, n=5)
+    flight.fly(60.0, lambda k: flight.publish(k % 2))
+    for sender in (0, 1):
+        others = [j for j in range(5) if j != sender]
+        heard = np.array([[j in ids for j in others] for _, who, ids in flight.heard if who == sender])
+        assert heard.mean() == pytest.approx(0.5, abs=0.06)
+        off = np.corrcoef(heard.T)[~np.eye(4, dtype=bool)]
+        assert np.abs(off).max() < 0.25
+
+
+def columns(n: int, seed: int = 1, replication: int = 0) -> Iterator[tuple[str, Array]]:
+    """Shadowing and bursts of every pair of n drones, frame by frame."""
+    frames, pairs = 3000, np.triu_indices(n, 1)
+    settings = AirSettings(shadowing_time_s=0.02)  # hardly any memory
+    shadow = StreamShadowing(settings, seed, replication, n, 0.1).block(frames)
+    states = PairStates(BurstSettings(good_to_bad=0.5, bad_to_good=0.5, step_s=0.1), n, seed, replication, 0.1)
+    bad = np.array([states.advance() for _ in range(frames)])
+    for i, j in zip(*pairs, strict=True):
+        yield f"shadowing {i} {j} {seed} {replication}", shadow[:, i, j]
+        yield f"bursts {i} {j} {seed} {replication}", bad[:, i, j]
+
+
+def test_pairs_purposes_seeds_and_replications_share_no_draws() -> None:
+    each = dict([*columns(3), *columns(3, seed=2), *columns(3, replication=1)])
+    values = np.array(list(each.values()), float)
+    assert (values.std(axis=1) > 0).all()
+    correlation = np.corrcoef(values)
+    np.fill_diagonal(correlation, 0.0)
+    worst = np.unravel_index(np.abs(correlation).argmax(), correlation.shape)
+    assert np.abs(correlation).max() < 0.1, [list(each)[k] for k in worst]
+
+
+def test_drones_publish_at_moments_of_their_own() -> None:
+    def moments(seed: int, replication: int = 0) -> list[float]:
+        flight = Hover(CALM, CROSS_M, seed=seed, replication=replication)
+        flight.fly(0.3, lambda k: [flight.publish(i) for i in range(6)] if k == 1 else None)
+        at = {sender: t_s - 0.1 for t_s, sender, _ in flight.heard}
+        assert 0.0 < min(at.values()) < max(at.values()) < 0.09
+        return [at[i] for i in range(6)]
+
+    all_of_them = [*moments(1), *moments(2), *moments(1, replication=1)]
+    gaps = np.diff(np.sort(all_of_them))
+    assert gaps.min() > 1e-6
+    assert np.ptp(all_of_them) > 0.05

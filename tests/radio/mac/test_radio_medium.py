@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+
 import numpy as np
 import pytest
+import simpy
 from radio_bench import AIFS_S, FRAME, GROUP_S, NOISE_DBM, Bench, exchange_s
 from scipy import integrate, stats
 from wrong_rows import wrong_rows
 
+from sortie.radio import Air
 from sortie.radio.mac import edca
 from sortie.radio.mac.airtime import ACK_S, BLOCK_ACK_S, legacy_ppdu_s, ppdu_s
 from sortie.radio.mac.contention import SIFS_S, SLOT_S, saturation_mbps
@@ -31,9 +37,12 @@ def test_a_lone_sample_ends_after_its_frames_at_the_next_slot() -> None:
 
 
 def test_a_sample_has_the_channel_for_its_frames_and_answers() -> None:
-    """Frames with 4 B of delimiter each, padded to 4 B; an ack of one, a block ack of several, longer where there may be 256."""
+    """Frames with 4 B of delimiter each, padded to 4 B; an ack of one, a block ack of several, longer for up to 256."""
 
-    def check(rts: bool, window: int, frames: int, last: int, size: int) -> None:
+    sizes = {(1, 1494): 1500, (1, 197): 204, (4, 200): 3 * 1500 + 204, (4, 1491): 3 * 1500 + 1496, (4, 1493): 4 * 1500}
+
+    def check(rts: bool, window: int, sample: tuple[int, int]) -> None:
+        (frames, last), size = sample, sizes[sample]
         b = Bench(-50.0, rts=rts, block_ack_window=window)
         job = b.job(0, frames)
         job.last_bytes = last
@@ -44,24 +53,7 @@ def test_a_sample_has_the_channel_for_its_frames_and_answers() -> None:
         assert job.granted_s == pytest.approx(sent_s + SIFS_S + answer_s + rts * 2 * (28e-6 + SIFS_S), abs=2e-9)
         assert b.medium.transmit_s[:2] == pytest.approx([sent_s + rts * 28e-6, answer_s + rts * 28e-6], abs=2e-9)
 
-    assert (
-        wrong_rows(
-            [
-                (r0, r1, *r2)
-                for r0 in [False, True]
-                for r1 in [64, 256]
-                for r2 in [
-                    (1, 1494, 1500),
-                    (1, 197, 204),
-                    (4, 200, 3 * 1500 + 204),
-                    (4, 1491, 3 * 1500 + 1496),
-                    (4, 1493, 4 * 1500),
-                ]
-            ],
-            check,
-        )
-        == {}
-    )
+    assert wrong_rows(product((False, True), (64, 256), sizes), check) == {}
 
 
 def test_a_descriptor_on_an_idle_medium_goes_at_once() -> None:
@@ -108,7 +100,7 @@ def test_saturated_ampdus_are_as_in_ns3() -> None:
 def test_twenty_saturated_senders_in_a_grid_are_as_in_ns3() -> None:
     """ns-3 3.44, 20 m apart, each to a neighbour, mean of three seeds.
 
-    Two pairs whose exchanges overlap must not hold the channel for good, though each station misses what begins while it sends.
+    Two pairs whose exchanges overlap must not hold the channel for good, though each misses what begins while it sends.
     """
 
     def check(mcs: int, mbps: float) -> None:
@@ -124,7 +116,7 @@ def test_twenty_saturated_senders_in_a_grid_are_as_in_ns3() -> None:
 def test_how_often_a_descriptor_meets_a_saturated_sender() -> None:
     """It waits for the frame on the air and draws v of 0 … 3 slots, the sender b of 0 … 15 and one slot more of AIFS.
 
-    They meet where v = b + 1, and where b + 1 < v leaves one slot to v and the sender's next draw is 0: 3 / 64 + 1 / 1024.
+    They meet where v = b + 1, and where b + 1 < v leaves a slot to v and the next draw is 0: 3 / 64 + 1 / 1024.
     """
     b = Bench(-50.0, mcs=3)
     b.again = {0}
@@ -221,7 +213,7 @@ def test_hidden_senders_lose_and_rts_brings_most_of_it_back() -> None:
 
 
 def test_after_its_own_frame_a_station_senses_by_energy_what_began_before() -> None:
-    """Its first frame begins with another's long one, whose preamble it misses; -62 dBm is 20 dB above the weakest preamble."""
+    """It misses the preamble of a frame that begins with its first; -62 dBm is 20 dB above the weakest preamble."""
 
     def check(power_dbm: float, waits: bool) -> None:
         power = np.full((4, 4), -50.0)
@@ -300,3 +292,68 @@ def test_control_frames_take_as_long_as_their_bytes_at_24_mbps() -> None:
     last = {"ACK": 14, "CONTROL": 20, "REQUEST_NS": 24, "BLOCK_ACK": 32, "BLOCK_ACK_LONG": 56}
     wanted = {name: round(legacy_ppdu_s(length, 24.0) * 1e9) for name, length in last.items()}
     assert {name: getattr(edca, name) for name in last} == wanted
+
+
+DRONES, SECONDS = 40, 1.2
+
+
+class CopiesAll:
+    """The compiled stations; before each plan every station counts as different."""
+
+    def __init__(self, medium: Any) -> None:
+        self._medium = medium
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(edca, name)
+
+    def ahead(self, *args: Any) -> Any:
+        n = (len(self._medium._differing) - 1) // 2
+        self._medium._differing[:] = [n, *range(n), *[edca.SENDS] * n]
+        return edca.ahead(*args)
+
+
+def flown(*, copies_all: bool, seed: int) -> list[tuple[Any, ...]]:
+    """All that small groups over 1.5 km hear of each other, with payloads, replaced ones, and drones that leave."""
+    rng, env, log = np.random.default_rng(seed), simpy.Environment(), []
+    at_m = rng.uniform(0.0, 1500.0, (DRONES // 4, 1, 2)) + rng.uniform(0.0, 120.0, (DRONES // 4, 4, 2))
+    place_m = np.concatenate([at_m.reshape(-1, 2), np.full((DRONES, 1), 60.0)], axis=1)
+    place_m[:4, 0] += 1e5 * np.arange(1, 5)  # four that nobody hears
+    drift_m = np.linspace(0.0, 200.0, 40)[:, None, None] * rng.uniform(-1.0, 1.0, (1, DRONES, 3))
+    air = Air(env, AirSettings(), place_m + drift_m, seed=seed, frame_s=0.1)
+    if copies_all:
+        air.medium._e = CopiesAll(air.medium)
+
+    def fly() -> Iterator[simpy.Event]:
+        for _ in range(round(SECONDS / 0.1) - 1):
+            air.advance()
+            for i in range(DRONES):
+                air.broadcast(i, 1400, lambda heard, i=i: log.append((env.now, i, tuple(heard))))
+            for i in rng.choice(DRONES, 16, replace=False).tolist():
+                peer = 4 * (i // 4) + (i + 1) % 4
+                air.send(
+                    i,
+                    peer,
+                    int(rng.integers(200, 90_000)),
+                    kind="features",
+                    reliable=bool(i % 2),
+                    deadline_s=0.09,
+                    on_done=lambda row: log.append((env.now, *row)),
+                )
+            for part_s in (0.013, 0.021, 0.066):
+                yield env.timeout(part_s)
+                who = int(rng.integers(DRONES if part_s > 0.02 else 4))
+                air.silence(who)
+                air.wake(who)
+
+    env.process(fly())
+    env.run(until=SECONDS)
+    return [*log, tuple(air.airtime_s), str(air.counters), *map(str, air.finish())]
+
+
+def test_copying_what_differs_is_copying_all() -> None:
+    def check(seed: int) -> None:
+        some, everything = flown(copies_all=False, seed=seed), flown(copies_all=True, seed=seed)
+        assert len(some) > 400
+        assert list(map(repr, some)) == list(map(repr, everything))
+
+    assert wrong_rows([1, 2, 3], check) == {}

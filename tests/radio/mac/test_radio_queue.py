@@ -207,27 +207,6 @@ def test_a_frame_that_comes_after_the_plan_is_sent_also_where_somebody_looks_bef
     assert [(round(t, 2), sender) for t, sender, _ in b.heard] == [(1.0, 1)]
 
 
-def test_rows_of_jobs_that_are_over_are_used_again() -> None:
-    """Also by jobs that come while the end of another is told."""
-    b = Bench(-50.0)
-    b.saturate(2, 4, until=1.0)
-    assert b.jobs > 500
-    assert len(b.medium._settled.rows) <= 64 * edca.JOB_COLUMNS
-
-
-def test_it_never_polls() -> None:
-    b = Bench(-50.0, 5)
-    for i in range(5):
-        for _ in range(10):
-            b.submit(i, 600)
-    steps = 0
-    while b.env.peek() < inf:
-        b.env.step()
-        steps += 1
-    assert len(b.log) == 50
-    assert steps < 4 * 50  # about one event a job, however many exchanges it takes
-
-
 # --- laws ----------------------------------------------------------------------------------------------
 
 
@@ -314,7 +293,7 @@ def test_nobody_begins_to_send_on_a_medium_that_it_senses_busy(traffic: list, po
 
 
 def test_accounts_of_who_is_on_the_air_are_those_of_the_stations() -> None:
-    """Event by event: the list of senders, and how many and how strong they are at each station. The last power is faint."""
+    """Event by event: who sends, and how many and how strong they are at each station. The last power is faint."""
 
     def check(power_dbm: float) -> None:
         b, most = Bench(power_dbm, 6), 0

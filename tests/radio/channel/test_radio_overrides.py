@@ -1,21 +1,26 @@
-"""Link traces: read with care, and flown in place of the models; losses and jammers act on them as on other links."""
+"""What stands beside the models: link traces, bursts, and losses and jammers that act on either."""
 
 from __future__ import annotations
 
 import math
 import re
 from dataclasses import replace
+from itertools import groupby, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from radio_examples import CROSS_M
 from radio_flights import Hover, trace
 from wrong_rows import wrong_rows
 
 from sortie.radio import Status
+from sortie.radio.channel.bursts import PairStates, bad_share, mean_loss, walk
 from sortie.radio.channel.traces import LinkTrace, read_links
 from sortie.radio.overrides import Overrides
 from sortie.radio.settings import AirSettings, BurstSettings
@@ -81,7 +86,7 @@ def overrides(trace: LinkTrace | None = None, n: int = 3, **bursts: float) -> Ov
     return Overrides(settings, trace, n, seed=2, replication=0, frame_s=0.1)
 
 
-def given(**qualities: tuple[list[float], list[float]]) -> LinkTrace:
+def link_trace(**qualities: tuple[list[float], list[float]]) -> LinkTrace:
     """A trace of the link from 0 to 1."""
     return LinkTrace({(0, 1): {name: (np.array(t), np.array(v)) for name, (t, v) in qualities.items()}})
 
@@ -131,7 +136,7 @@ def test_losses_and_jammers_that_the_air_is_told_of_reach_traced_links(tmp_path:
 
 
 def test_a_traced_loss_stands_in_place_of_bursts() -> None:
-    lossy = overrides(given(loss=([0.0], [0.2])), loss_good=0.5)
+    lossy = overrides(link_trace(loss=([0.0], [0.2])), loss_good=0.5)
     lossy.advance(None)
     assert lossy.group_loss()[0, 1] == 0.2
     assert lossy.group_loss()[1, 0] == 0.5
@@ -175,28 +180,6 @@ def test_a_traced_goodput_is_what_a_link_carries(tmp_path: Path) -> None:
     assert flight.air.goodput_mbps(0)[0] == pytest.approx(24.0, rel=0.03)
 
 
-@pytest.mark.parametrize("frames", [16, 64])
-def test_a_traced_goodput_holds_with_rts(frames: int, tmp_path: Path) -> None:
-    """RTS and CTS are within it, also where A-MPDUs take some two milliseconds."""
-    settings = AirSettings(trace=trace(tmp_path, "0,0,1,,,80"), rts=True, max_ampdu_frames=frames)
-    flight = Hover(settings)
-    flight.fly(4.0, lambda frame: flight.send(0, 1, 640 * 1344, kind=f"{frame}"))
-    took_s = [r.t_done_s - r.t_start_s for r in flight.rows if r.status is Status.DELIVERED]
-    assert np.mean(took_s) == pytest.approx(640 * 1344 * 8 / 80e6, rel=0.008)
-
-
-def test_no_goodput_is_no_link(tmp_path: Path) -> None:
-    flight = Hover(AirSettings(trace=trace(tmp_path, "0,0,1,,,0")))
-
-    def tick(frame: int) -> None:
-        flight.send(0, 1, 1000)
-        flight.publish(0)
-
-    flight.fly(2.0, tick)
-    assert {(r.status, r.reason) for r in flight.rows} == {(Status.LOST, "no_link")}
-    assert {ids for _, _, ids in flight.heard} == {()}
-
-
 def test_a_traced_loss_replaces_fading_and_bursts(tmp_path: Path) -> None:
     config = AirSettings(
         trace=trace(tmp_path, "0,0,1,,0.25,"), bursts=BurstSettings(good_to_bad=1.0, bad_to_good=0.01), tx_power_dbm=-20
@@ -206,20 +189,6 @@ def test_a_traced_loss_replaces_fading_and_bursts(tmp_path: Path) -> None:
     share = np.mean([1 in ids for _, _, ids in flight.heard])
     assert share == pytest.approx(0.75, abs=0.03)
     assert not any(2 in ids for _, _, ids in flight.heard)  # an untraced link has its bursts
-
-
-def test_descriptors_on_a_traced_snr_fade_as_the_models_do(tmp_path: Path) -> None:
-    config = AirSettings(
-        tx_power_dbm=-10.5, noise_figure_db=12.0, shadowing_sigma_db=0.0, preamble_detection_dbm=-120.0
-    )
-    model = Hover(config)
-    model.fly(300.0, lambda frame: model.publish(0))
-    snr_db = float(model.air.snr_db[0, 1])
-    traced = Hover(replace(config, trace=trace(tmp_path, f"0,0,1,{snr_db},,")))
-    traced.fly(300.0, lambda frame: traced.publish(0))
-    shares = [np.mean([bool(ids) for _, _, ids in f.heard]) for f in (model, traced)]
-    assert 0.2 < shares[0] < 0.95
-    assert shares[1] == pytest.approx(shares[0], abs=4 * np.sqrt(2 * 0.25 / 3000))
 
 
 def test_descriptors_go_by_the_trace_and_over_the_way_back_of_a_traced_link_by_its_snr(tmp_path: Path) -> None:
@@ -238,8 +207,8 @@ def test_a_traced_loss_takes_tries_as_a_burst_of_that_loss_does(loss: float, tmp
     """Of fragments and of requests for a block ack: on a good link the two are the same, draw by draw."""
     rows = [f"0,{i},{j},,{loss}," for i, j in ((0, 1), (1, 0))]
     flown = []
-    for given in (dict(trace=trace(tmp_path, *rows)), dict(bursts=BurstSettings(loss_good=loss))):
-        flight = Hover(AirSettings(shadowing_sigma_db=0.0, rician_k_db=30.0, **given))
+    for how in (dict(trace=trace(tmp_path, *rows)), dict(bursts=BurstSettings(loss_good=loss))):
+        flight = Hover(AirSettings(shadowing_sigma_db=0.0, rician_k_db=30.0, **how))
         flight.fly(6.0, lambda k, flight=flight: flight.send(0, 1, 2_600))
         flown.append(
             [(r.number, r.status, r.t_start_s, r.t_done_s, r.airtime_s, r.fragments_lost) for r in flight.rows]
@@ -285,3 +254,135 @@ def test_a_traced_link_is_there_however_far_apart_its_ends_are(tmp_path: Path) -
         assert [ids for _, _, ids in fleet.heard] == [(1,)]
 
     assert wrong_rows([32, 33], check) == {}
+
+
+FLOWN = BurstSettings(good_to_bad=0.05, bad_to_good=0.28, step_s=0.1)
+
+
+def states(config: BurstSettings, frames: int, n: int = 3, *, seed: int = 1, frame_s: float = 0.1) -> np.ndarray:
+    """[frames, n, n]: which pairs are bad."""
+    pairs = PairStates(config, n, seed, 0, frame_s)
+    out = []
+    for _ in range(frames):
+        pairs.advance()
+        out.append(pairs.bad)
+    return np.array(out)
+
+
+def test_share_and_length_of_bursts() -> None:
+    bad = states(FLOWN, 60_000)
+    series = [bad[:, i, j] for i, j in ((0, 1), (0, 2), (1, 2))]
+    lengths = np.array([len(list(run)) for s in series for is_bad, run in groupby(s) if is_bad])
+    assert np.mean(series) == pytest.approx(bad_share(0.05, 0.28), abs=0.01)
+    assert lengths.mean() == pytest.approx(1 / 0.28, rel=0.03)
+    assert np.mean(lengths == 1) == pytest.approx(0.28, abs=0.02)  # geometric
+    assert np.mean(lengths > 5) == pytest.approx(0.72**5, abs=0.02)
+
+
+def test_pairs_are_alike_both_ways_and_unlike_each_other_and_one_more_drone_changes_none() -> None:
+    bad = states(FLOWN, 5000)
+    assert (bad == bad.transpose(0, 2, 1)).all()
+    assert abs(np.corrcoef(bad[:, 0, 1], bad[:, 0, 2])[0, 1]) < 0.05
+    assert (bad == states(FLOWN, 5000, 6)[:, :3, :3]).all()
+    assert (bad != states(FLOWN, 5000, seed=2)).any()
+
+
+def test_a_step_may_last_many_frames_or_less_than_one() -> None:
+    slow = states(replace(FLOWN, step_s=1.0), 1000)
+    assert (slow.reshape(100, 10, 3, 3) == slow[::10, None]).all()
+    fast = states(replace(FLOWN, step_s=0.05), 1000)
+    every = states(FLOWN, 1999, frame_s=0.1)  # the same chain, seen at every step
+    assert (fast[:990] == every[0:1980:2]).all()
+
+
+def test_a_step_as_long_as_a_frame_is_one_in_every_frame() -> None:
+    """However the multiples of a tenth are rounded: pairs that change at each step change a hundred times."""
+    pairs = PairStates(BurstSettings(good_to_bad=1.0, bad_to_good=1.0, step_s=0.1), 3, 1, 0, 0.1)
+    states = [bool(pairs.advance()[0, 1]) for _ in range(101)]
+    assert [a != b for a, b in pairwise(states)] == [True] * 100
+
+
+def test_pairs_change_once_a_step_and_lose_by_their_state() -> None:
+    """Steps of three frames, of which the last begins by rounding a little late."""
+    bursts = BurstSettings(good_to_bad=0.3, bad_to_good=0.3, step_s=0.3, loss_good=0.25, loss_bad=0.75)
+    pairs = PairStates(bursts, 12, 5, 0, 0.1)
+    rows = [pairs.advance() for _ in range(30)]
+    for frame in range(1, 30):
+        assert np.array_equal(rows[frame], rows[frame - 1]) is (frame % 3 != 0)
+    assert set(np.unique(np.array(rows))) == {0.25, 0.75}
+    first = [PairStates(bursts, 40, seed, 0, 0.1).advance() for seed in range(3)]
+    upper = np.triu_indices(40, 1)
+    bad = np.mean([(row[upper] == 0.75).mean() for row in first])
+    assert bad == pytest.approx(bad_share(0.3, 0.3), abs=0.04)
+
+
+@given(p=st.floats(0.0, 1.0), r=st.floats(0.01, 1.0), u=st.lists(st.floats(0.0, 0.999), min_size=1, max_size=30))
+def test_a_walk_obeys_its_draws(p: float, r: float, u: list[float]) -> None:
+    bad = False
+    for step, state in enumerate(walk(np.array(False), np.array(u), p, r)):
+        bad = (u[step] >= r) if bad else (u[step] < p)
+        assert state == bad
+
+
+def test_the_mean_of_what_is_lost() -> None:
+    assert mean_loss(BurstSettings(good_to_bad=0.05, bad_to_good=0.2, loss_good=0.1, loss_bad=0.6)) == pytest.approx(
+        0.2
+    )
+
+
+def test_a_bad_pair_hears_no_descriptor_and_gets_no_sample() -> None:
+    often = BurstSettings(good_to_bad=0.1, bad_to_good=0.2, step_s=0.1)
+    flight = Hover(AirSettings(bursts=often, shadowing_sigma_db=0.0), spread=0)
+
+    def tick(frame: int) -> None:
+        flight.publish(0)
+        flight.send(0, 1, 5000, kind=f"{frame}")
+
+    flight.fly(200.0, tick)
+    bad = states(often, 2000, 2)[:, 0, 1]
+    heard = np.array([bool(ids) for _, _, ids in flight.heard])
+    came = np.array([r.status is Status.DELIVERED for r in flight.rows])
+    assert (heard == ~bad[: len(heard)]).all()
+    assert (came == ~bad[: len(came)]).all()
+    missed = {(r.status, r.reason) for r in flight.rows if r.status is not Status.DELIVERED}
+    # tried until then, or behind the block-ack requests of the one before
+    assert missed == {(Status.EXPIRED, "deadline_in_service"), (Status.EXPIRED, "deadline_queued")}
+
+
+def faint(loss: float, **more: Any) -> AirSettings:
+    """Links at the edge of what can be received, in bursts of so much loss."""
+    return AirSettings(
+        shadowing_sigma_db=0.0,
+        tx_power_dbm=-11.5,
+        rician_k_db=30.0,
+        preamble_detection_dbm=-120.0,
+        bursts=BurstSettings(loss_good=loss),
+        **more,
+    )
+
+
+def test_a_burst_takes_its_share_of_the_fragments_that_the_signal_lets_through() -> None:
+    """On a link that loses some by itself, a burst of a half takes half of the rest."""
+
+    def lost(loss: float) -> float:
+        flight = Hover(faint(loss, retry_limit=0), n=2)
+        flight.fly(20.0, lambda k: flight.send(0, 1, 13_000))
+        assert {r.mcs for r in flight.rows} == {1}
+        return sum(r.fragments_lost for r in flight.rows) / sum(r.fragments for r in flight.rows)
+
+    alone = lost(0.0)
+    assert 0.1 < alone < 0.3
+    assert lost(0.5) == pytest.approx(alone + 0.5 * (1 - alone), abs=0.03)
+
+
+def test_a_burst_takes_its_share_of_the_descriptors_that_the_signal_lets_through() -> None:
+    """Two causes, a draw each: of descriptors that half come by their signal, a burst of a half leaves a quarter."""
+
+    def heard(loss: float) -> float:
+        flight = Hover(faint(loss, group_rate_mbps=24.0), n=5)
+        flight.fly(12.0, lambda k: flight.publish(0))
+        return sum(len(ids) for _, _, ids in flight.heard) / (4 * len(flight.heard))
+
+    alone = heard(0.0)
+    assert 0.35 < alone < 0.65
+    assert heard(0.5) == pytest.approx(0.5 * alone, abs=0.06)
