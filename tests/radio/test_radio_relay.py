@@ -265,25 +265,6 @@ def test_an_older_sample_on_a_longer_way_does_not_replace_a_newer_one(monkeypatc
     assert [fates[n] for n in numbers] == [(Status.EXPIRED, "replaced"), (Status.DELIVERED, "")]
 
 
-@pytest.mark.parametrize("loss", [0.0, 0.4])
-def test_a_sample_that_waits_in_a_relay_was_queued_whether_it_was_repaired_before_or_not(
-    loss: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    settings = replace(CALM, relay_max_hops=4, retry_limit=0, trace=trace(tmp_path, f"0,0,2,,{loss},", "0,2,0,,0,"))
-    fleet = Hover(settings, CROSS_M[:5], spread=0.0)
-    monkeypatch.setattr(fleet.air, "_routes", _Ways({0: [0, 2, 3]}))
-
-    def tick(frame: int) -> None:
-        if frame == 0:
-            fleet.send(0, 3, 20_000, reliable=True, deadline_s=0.25)
-            fleet.send(2, 1, 40_000_000, kind="other", deadline_s=0.4)  # the relay has no time for it
-
-    fleet.fly(0.6, tick)
-    (row,) = [row for row in fleet.rows if row.kind == "f"]
-    assert (row.hops, row.repairs > 0) == (2, loss > 0)
-    assert (row.status, row.reason) == (Status.EXPIRED, "deadline_queued")
-
-
 NAN = np.nan
 
 

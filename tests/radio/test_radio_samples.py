@@ -20,7 +20,7 @@ from sortie.radio.mac.contention import SIFS_S, SLOT_S
 from sortie.radio.overrides import LinkNow
 from sortie.radio.rates import STANDARDS
 from sortie.radio.sample import UNUSED, Sample, Service
-from sortie.radio.settings import AccessName, AccessSettings, AirSettings, EdcaSettings
+from sortie.radio.settings import AccessName, AirSettings
 from sortie.radio.transmission import Status
 from sortie.scenarios.link_state import MEASURED_FOR_S, SILENT_MBPS, WAITING_MBPS, LinkState, state_of
 
@@ -137,21 +137,6 @@ def test_what_a_link_is_used_at_follows_what_stands_beside_the_models() -> None:
     assert use(50.0, None, gone=True).unreachable == "receiver_gone"
     assert use(50.0, LinkNow(0.1, nan, nan)).link.burst_loss == 0.1
     assert math.isnan(use(50.0, None).link.loss)
-
-
-@pytest.mark.parametrize("name", ["voice", "background"])
-def test_a_traced_goodput_is_that_of_its_own_class_of_traffic(name: str) -> None:
-    """Whose frames wait longer for the medium need a higher data rate for the same goodput."""
-    rates = {}
-    for payload_class in ("best_effort", name):
-        settings = AirSettings(payload_class=payload_class, max_ampdu_frames=4)
-        rates[payload_class] = Service(settings, -88.0).use(0, 1, 0.0, 30.0, False, LinkNow(0.0, math.nan, 20.0)).link
-    assert (rates[name].rate_mbps < rates["best_effort"].rate_mbps) is (name == "voice")
-    assert rates[name].frames == 4
-    few = AirSettings(
-        standard="n", bandwidth_mhz=20, max_ampdu_frames=256, edca=EdcaSettings(background=AccessSettings(7, 15, 1023))
-    )
-    assert Service(few, -88.0).use(0, 1, 0.0, 30.0, False, LinkNow(0.0, math.nan, 300.0)).link.frames <= 64
 
 
 def test_a_measurement_begins_anew_with_another_rate_alone() -> None:
@@ -356,21 +341,6 @@ def test_fragments_lost_do_not_depend_on_who_looks(piece_bytes: int | None, tmp_
     ((lost, arrived, _),) = found
     assert lost > 10
     assert arrived == ((300 - lost) * 1344 if piece_bytes else 0)
-
-
-def test_a_sample_that_is_cut_short_tells_what_it_lost_until_then(tmp_path: Path) -> None:
-    """Replaced in service: half of the fragments that it sent had used up their only try."""
-    fleet = Hover(replace(CLEAR, retry_limit=0, trace=lossy(tmp_path, 0.5)))
-
-    def tick(frame: int) -> None:
-        if frame < 2:
-            fleet.send(0, 1, 1344 * 6000, deadline_s=0.5)
-
-    first = fleet.fly(0.3, tick).rows[0]
-    assert (first.status, first.reason) == (Status.EXPIRED, "replaced")
-    sent = first.wire_bytes / (1344 + 58)  # with their headers
-    assert 1000 < sent < 6000
-    assert 0.5 * (sent - 256) - 150 < first.fragments_lost < 0.5 * sent + 150  # a window of them was not yet answered
 
 
 def test_what_was_sent_before_a_link_dies_or_its_receiver_goes_stays_counted() -> None:

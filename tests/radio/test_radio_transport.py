@@ -1,4 +1,4 @@
-"""Samples and pieces on a lossy link; the clock that may skip an event; settings as plain values."""
+"""Samples and pieces on a lossy link, what their rows say; the clock that may skip an event; settings as plain values."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ from sortie.radio.event_loop import EventLoop
 from sortie.radio.mac.airtime import sample_wire
 from sortie.radio.settings import AirSettings
 from sortie.scenarios.schema import Radio
+
+CALM = AirSettings(shadowing_sigma_db=0.0)
+LOSSY = AirSettings(shadowing_sigma_db=0.0, retry_limit=0, bursts=BurstSettings(loss_good=0.5))
 
 
 def lossy(folder: Path, loss: float, goodput_mbps: float | None = 400.0, **knobs) -> AirSettings:
@@ -137,6 +140,85 @@ def test_reliable_pieces_come_back_and_the_sample_is_whole(tmp_path: Path) -> No
     assert all(r.arrived_bytes == 133_610 and r.missing == () and r.repairs > 0 for r in done)
 
 
+def test_a_newer_sample_replaces_the_older_of_its_kind_only() -> None:
+    f = Hover(CALM).fly(0.1)
+    for kind in ("features", "detections", "features"):
+        f.send(0, 1, 600_000, kind=kind)
+    f.env.run(until=0.2)
+    assert [(r.number, r.reason) for r in f.rows] == [(0, "replaced"), (1, ""), (2, "")]
+    assert isnan(f.rows[0].t_start_s) or f.rows[0].airtime_s == 0.0
+
+
+@pytest.mark.parametrize("hops", [1, 2])
+def test_the_row_of_a_sample_that_was_never_served_has_the_snr_of_its_link_at_its_sending(hops: int) -> None:
+    """Of this frame and not of the one before, which its sender knows; of the first hop."""
+    flight = Hover(AirSettings(shadowing_sigma_db=0.0, relay_max_hops=hops), CROSS_M[[0, 1, 3]])
+    flight.air.advance()
+    flight.extra = np.array([[0.0, 7.0, 0.0], [0.0] * 3, [0.0] * 3])
+    flight.air.advance(flight.extra)
+    snr_db = flight.air.snr_db
+    flight.send(0, 2, 2_000_000, kind="long", deadline_s=0.05)
+    flight.send(0, 1, 1000, kind="waits", deadline_s=0.02)
+    flight.env.run(until=0.06)
+    (waited,) = [r for r in flight.rows if r.kind == "waits"]
+    assert (waited.reason, waited.mcs) == ("deadline_queued", -1)
+    assert waited.snr_db == pytest.approx(snr_db[0, 1])
+    assert snr_db[0, 1] == pytest.approx(snr_db[1, 0] - 7.0)
+
+
+@pytest.mark.parametrize("by_trace", [False, True])
+def test_a_payload_goes_at_the_rate_of_the_frame_before_and_is_lost_to_the_present_one(
+    by_trace: bool, tmp_path: Path
+) -> None:
+    """A link that fades from one frame to the next, for four frames: its sender learns it a frame late, both times."""
+    weak = set(range(5, 9))
+    rows = [f"{0.1 * k:.1f},0,1,{8 if k in weak else 40},," for k in range(20)]
+    config = AirSettings(trace=trace(tmp_path, *rows)) if by_trace else CALM
+    flight = Hover(config, np.array([[0.0, 0.0, 60.0], [20.0, 0.0, 60.0]]))
+    planned: list[Any] = []
+
+    def tick(k: int) -> None:
+        flight.send(0, 1, 3000)
+        planned.append(flight.air.link_mbps()[0, 1])
+
+    for k in range(12):
+        flight.extra = None
+        if not by_trace and k in weak:
+            flight.extra = np.full((2, 2), 38.0)
+        flight.air.advance(flight.extra)
+        tick(k)
+        flight.env.run(until=0.1 * (k + 1))
+    mcs, snr_db = ({round(10 * r.t_sent_s): getattr(r, name) for r in flight.rows} for name in ("mcs", "snr_db"))
+    fast = mcs[0]
+    assert {k for k in range(12) if mcs[k] < fast} == {k for k in range(12) if planned[k] < planned[0]} == {6, 7, 8, 9}
+    assert {k for k in range(12) if snr_db[k] < 20} == weak
+
+
+def test_a_sample_was_given_the_channel_in_all_its_passes(tmp_path: Path) -> None:
+    """Repairs included: what its sender has transmitted, it was given at least, and no more than passed meanwhile."""
+    settings = AirSettings(retry_limit=0, trace=trace(tmp_path, "0,0,1,,0.5,", "0,1,0,,0,"))
+    flight = Hover(settings)
+    flight.air.advance()
+    flight.send(0, 1, 40_000, reliable=True, deadline_s=2.0)
+    flight.env.run(until=2.0)
+    (row,) = flight.rows
+    assert row.repairs > 1
+    assert flight.air.airtime_s[0] <= row.airtime_s < row.t_done_s - row.t_start_s
+
+
+def test_bytes_that_arrived_are_those_of_the_pieces_that_did() -> None:
+    """Of 53 pieces the last is shorter, and counts as what it is, whether it comes or not."""
+    flight = Hover(LOSSY, n=2)
+    flight.fly(8.0, lambda k: flight.send(0, 1, 52 * 200 + 30, piece_bytes=200))
+    cut = [r for r in flight.rows if r.missing]
+    assert {52 in r.missing for r in cut} == {True, False}
+    for r in cut:
+        assert r.arrived_bytes == sum(30 if k == 52 else 200 for k in range(53) if k not in r.missing)
+
+
+# --- the clock and the settings ---------------------------------------------------------------------
+
+
 Told = tuple[float, Transmission | tuple[int, ...]]
 
 
@@ -237,83 +319,3 @@ def test_choices_of_the_schema_are_those_of_the_settings() -> None:
 def test_an_unknown_choice_is_refused(values: dict[str, object], what: str) -> None:
     with pytest.raises(ValueError, match=what):
         AirSettings.of(values)
-
-
-def test_a_newer_sample_replaces_the_older_of_its_kind_only() -> None:
-    f = Hover(CALM).fly(0.1)
-    for kind in ("features", "detections", "features"):
-        f.send(0, 1, 600_000, kind=kind)
-    f.env.run(until=0.2)
-    assert [(r.number, r.reason) for r in f.rows] == [(0, "replaced"), (1, ""), (2, "")]
-    assert isnan(f.rows[0].t_start_s) or f.rows[0].airtime_s == 0.0
-
-
-@pytest.mark.parametrize("hops", [1, 2])
-def test_the_row_of_a_sample_that_was_never_served_has_the_snr_of_its_link_at_its_sending(hops: int) -> None:
-    """Of this frame and not of the one before, which its sender knows; of the first hop."""
-    flight = Hover(AirSettings(shadowing_sigma_db=0.0, relay_max_hops=hops), CROSS_M[[0, 1, 3]])
-    flight.air.advance()
-    flight.extra = np.array([[0.0, 7.0, 0.0], [0.0] * 3, [0.0] * 3])
-    flight.air.advance(flight.extra)
-    snr_db = flight.air.snr_db
-    flight.send(0, 2, 2_000_000, kind="long", deadline_s=0.05)
-    flight.send(0, 1, 1000, kind="waits", deadline_s=0.02)
-    flight.env.run(until=0.06)
-    (waited,) = [r for r in flight.rows if r.kind == "waits"]
-    assert (waited.reason, waited.mcs) == ("deadline_queued", -1)
-    assert waited.snr_db == pytest.approx(snr_db[0, 1])
-    assert snr_db[0, 1] == pytest.approx(snr_db[1, 0] - 7.0)
-
-
-@pytest.mark.parametrize("by_trace", [False, True])
-def test_a_payload_goes_at_the_rate_of_the_frame_before_and_is_lost_to_the_present_one(
-    by_trace: bool, tmp_path: Path
-) -> None:
-    """A link that fades from one frame to the next, for four frames: its sender learns it a frame late, both times."""
-    weak = set(range(5, 9))
-    rows = [f"{0.1 * k:.1f},0,1,{8 if k in weak else 40},," for k in range(20)]
-    config = AirSettings(trace=trace(tmp_path, *rows)) if by_trace else CALM
-    flight = Hover(config, np.array([[0.0, 0.0, 60.0], [20.0, 0.0, 60.0]]))
-    planned: list[Any] = []
-
-    def tick(k: int) -> None:
-        flight.send(0, 1, 3000)
-        planned.append(flight.air.link_mbps()[0, 1])
-
-    for k in range(12):
-        flight.extra = None
-        if not by_trace and k in weak:
-            flight.extra = np.full((2, 2), 38.0)
-        flight.air.advance(flight.extra)
-        tick(k)
-        flight.env.run(until=0.1 * (k + 1))
-    mcs, snr_db = ({round(10 * r.t_sent_s): getattr(r, name) for r in flight.rows} for name in ("mcs", "snr_db"))
-    fast = mcs[0]
-    assert {k for k in range(12) if mcs[k] < fast} == {k for k in range(12) if planned[k] < planned[0]} == {6, 7, 8, 9}
-    assert {k for k in range(12) if snr_db[k] < 20} == weak
-
-
-def test_a_sample_was_given_the_channel_in_all_its_passes(tmp_path: Path) -> None:
-    """Repairs included: what its sender has transmitted, it was given at least, and no more than passed meanwhile."""
-    settings = AirSettings(retry_limit=0, trace=trace(tmp_path, "0,0,1,,0.5,", "0,1,0,,0,"))
-    flight = Hover(settings)
-    flight.air.advance()
-    flight.send(0, 1, 40_000, reliable=True, deadline_s=2.0)
-    flight.env.run(until=2.0)
-    (row,) = flight.rows
-    assert row.repairs > 1
-    assert flight.air.airtime_s[0] <= row.airtime_s < row.t_done_s - row.t_start_s
-
-
-CALM = AirSettings(shadowing_sigma_db=0.0)
-LOSSY = AirSettings(shadowing_sigma_db=0.0, retry_limit=0, bursts=BurstSettings(loss_good=0.5))
-
-
-def test_bytes_that_arrived_are_those_of_the_pieces_that_did() -> None:
-    """Of 53 pieces the last is shorter, and counts as what it is, whether it comes or not."""
-    flight = Hover(LOSSY, n=2)
-    flight.fly(8.0, lambda k: flight.send(0, 1, 52 * 200 + 30, piece_bytes=200))
-    cut = [r for r in flight.rows if r.missing]
-    assert {52 in r.missing for r in cut} == {True, False}
-    for r in cut:
-        assert r.arrived_bytes == sum(30 if k == 52 else 200 for k in range(53) if k not in r.missing)

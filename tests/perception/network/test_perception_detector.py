@@ -1,27 +1,24 @@
 """The detector over one scene, with the shipped weights: what shares do, what age does, what repeats."""
 
+from __future__ import annotations
+
 import subprocess
 import sys
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
-from perception_examples import capture, cross
+from perception_examples import cross, same
 from places import HELPERS
 
-from sortie.perception.detectors import make_detector
 from sortie.perception.ground_truth import ground_truth
-from sortie.perception.joining import EgoSources, joined_many, source_of
+from sortie.perception.joining import source_of
 from sortie.perception.metrics.ap import match
 from sortie.perception.network.detector import TorchDetector
 from sortie.perception.scene import render
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.types import Boxes, Capture, Share
-from sortie.perception.uncertainty import BoxErrors
+from sortie.perception.types import Capture, Share
 from sortie.scenarios.schema import Perception, Scene, Target
 
 
@@ -40,12 +37,10 @@ def fleet() -> list[Capture]:
     return cross(10.0, 20.0, 0.3)
 
 
-def share(c: Capture, representation: str = "features", rho: float = 1.0, weight: float = 1.0, roi: tuple[float, float, float] | None = None) -> Share:  # fmt: skip
-    return Share(c, representation, rho, roi, weight)
-
-
-def same(a: Boxes, b: Boxes) -> bool:
-    return len(a) == len(b) and all(np.array_equal(getattr(a, f), getattr(b, f)) for f in Boxes.__slots__)
+def share(
+    c: Capture, representation: str = "features", rho: float = 1.0, roi: tuple[float, ...] | None = None
+) -> Share:
+    return Share(c, representation, rho, roi, 1.0)
 
 
 def test_boxes_look_like_cars_and_come_best_first(detector: TorchDetector, fleet: list[Capture]) -> None:
@@ -96,93 +91,43 @@ def test_boxes_are_equal_across_processes() -> None:
     assert runs[0].stdout == runs[1].stdout
 
 
-def test_nothing_sent_and_nothing_trusted_is_a_single_drone(detector: TorchDetector, fleet: list[Capture]) -> None:
-    jobs = [
-        (fleet[0], []),
-        (fleet[0], [share(fleet[1], rho=0.0)]),
-        (fleet[0], [share(fleet[1], roi=(5000.0, 0.0, 32.0))]),
-        (fleet[0], [share(fleet[1], weight=0.0)]),
-        (fleet[0], [share(fleet[1], "detections", weight=0.0)]),
-    ]
-    single, *others = detector.detect(jobs)
-    for other in others:
-        assert len(other) == len(single)
-        assert other.xy_m == pytest.approx(single.xy_m, abs=1e-2)
-
-
-def test_raw_is_every_feature(detector: TorchDetector, fleet: list[Capture]) -> None:
-    raw, full = detector.detect([(fleet[0], [share(fleet[1], "raw", rho=0.0)]), (fleet[0], [share(fleet[1])])])
-    assert same(raw, full)
-
-
-def test_a_budget_an_roi_and_the_two_masks_matter(
+def test_a_budget_an_roi_the_two_masks_and_age_matter_and_nothing_sent_is_a_single_drone(
     scene: SceneModel, detector: TorchDetector, fleet: list[Capture]
 ) -> None:
     shares = [share(c, rho=0.1) for c in fleet[1:]]
-    full, tenth, disc = detector.detect(
+    full, tenth, disc, late, single, nothing, aside, raw = detector.detect(
         [
             (fleet[0], [share(c) for c in fleet[1:]]),
             (fleet[0], shares),
             (fleet[0], [s._replace(roi=(10.0, 20.0, 32.0)) for s in shares]),
+            (fleet[0], [share(c._replace(t_s=c.t_s - 2.0)) for c in fleet[1:]]),
+            (fleet[0], []),
+            (fleet[0], [share(fleet[1], rho=0.0)]),
+            (fleet[0], [share(fleet[1], roi=(5000.0, 0.0, 32.0))]),
+            (fleet[0], [share(c, "raw", rho=0.0) for c in fleet[1:]]),
         ]
     )
     zero = TorchDetector(scene, Perception(unsent_cells="zero"), seed=1).detect([(fleet[0], shares)])[0]
-    answers = [full, tenth, disc, zero]
+    answers = [full, tenth, disc, late, zero, single]
     assert not any(same(a, b) for k, a in enumerate(answers) for b in answers[:k])
-
-
-def test_weights_without_fitted_errors_join_uncertain_boxes_of_another_network(tmp_path: Path) -> None:
-    """The ego's own box has the usual covariance of its class."""
-    car = Boxes.placed(np.array([(20.0, 0.0, 4.5, 1.9, 0.0, 0.8)]), (0.0, 0.0, 0.0))
-    theirs, errors = replace(car, xy_m=car.xy_m + np.float32(0.3)), BoxErrors((-0.7, 0, 0, 0, 0), (-1.5, 0, 0, 0, 0))
-
-    class Alone(TorchDetector):
-        def __init__(self) -> None:
-            self._config, self._shares, self._weights = Perception(), "features", tmp_path / "net.safetensors"
-
-        def _head(self, *_: object) -> torch.Tensor:
-            return torch.zeros(0)
-
-        def _place(self, *_: object) -> Boxes:
-            return car
-
-    ego, peer = cross(0.0, 0.0, 0.0)[:2]
-    share = Share(peer, "uncertain_boxes", 0.0, None, 1.0, boxes=theirs, errors=errors)
-    maps: Future[torch.Tensor] = Future()
-    maps.set_result(torch.zeros(0))
-    found = Alone()._detect_ego(ego, [share], {0: ego, 1: peer}, {ego: SimpleNamespace(boxes=None, maps=maps)})  # type: ignore[dict-item]
-    wanted = joined_many([EgoSources(ego.est_pose, car, False, [source_of(share, None)])], "average")[0]
-    assert same(found, wanted)
+    assert same(raw, full)
+    for other in (nothing, aside):
+        assert len(other) == len(single)
+        assert other.xy_m == pytest.approx(single.xy_m, abs=1e-2)
 
 
 def test_sent_boxes_join_and_tracks_are_at_most_twelve_in_the_region(
     detector: TorchDetector, fleet: list[Capture]
 ) -> None:
     roi = (10.0, 20.0, 60.0)
-    single, joined = detector.detect([(fleet[0], []), (fleet[0], [share(fleet[2], "detections")])])
+    single, joined, alone = detector.detect(
+        [(fleet[0], []), (fleet[0], [share(fleet[2], "detections")]), (fleet[2], [])]
+    )
     assert len(joined) >= len(single)
     assert detector.count_boxes(fleet[2], None) >= detector.count_boxes(fleet[2], roi)
-    tracks = source_of(share(fleet[2], "tracks", roi=roi), detector.detect([(fleet[2], [])])[0]).boxes
+    tracks = source_of(share(fleet[2], "tracks", roi=roi), alone).boxes
     assert len(tracks) == min(12, detector.count_boxes(fleet[2], roi))
     assert (np.hypot(*(tracks.xy_m - roi[:2]).T) <= roi[2] + 1e-3).all()
-
-
-def test_a_replication_has_camera_noise_of_its_own(
-    scene: SceneModel, detector: TorchDetector, fleet: list[Capture]
-) -> None:
-    other = make_detector(scene, Perception(), 1, 1)
-    assert other is not None
-    first, second = (d.camera_views(fleet[0]).astype(int) for d in (detector, other))
-    assert 0 < np.abs(first - second).max() <= 15  # the scene is the same
-    again = make_detector(scene, Perception(), 1, 1)
-    assert again is not None
-    assert np.array_equal(again.camera_views(fleet[0]), second)
-
-
-def test_a_late_share_is_rendered_as_it_was(detector: TorchDetector, fleet: list[Capture]) -> None:
-    now = [(fleet[0], [share(c) for c in fleet[1:]])]
-    late = [(fleet[0], [share(c._replace(t_s=c.t_s - 2.0)) for c in fleet[1:]])]
-    assert not same(detector.detect(now)[0], detector.detect(late)[0])
 
 
 def test_moments_begun_together_are_one_after_the_other(
@@ -283,10 +228,3 @@ def test_ground_truth_is_every_car_in_the_turned_square(scene: SceneModel) -> No
             count += abs(forward) < 60 and abs(left) < 60
         assert len(truth) == count > 5
     assert (truth.score == 1).all()
-
-
-def test_camera_views_are_what_the_detector_saw(detector: TorchDetector) -> None:
-    views = detector.camera_views(capture(t_s=2.0))
-    assert views.shape == (5, 90, 160, 3)
-    assert views.dtype == np.uint8
-    assert views.std() > 20

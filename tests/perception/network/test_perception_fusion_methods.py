@@ -1,5 +1,7 @@
 """Every fusion method: who has a say, what a weight does, what cells that were not sent do, and the formula itself."""
 
+from __future__ import annotations
+
 import math
 
 import pytest
@@ -8,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 from torch.nn import functional as F  # noqa: N812
+from wrong_rows import wrong_rows
 
 from sortie.perception.geometry import CHANNELS
 from sortie.perception.network.fusion.base import Fusion, takes_part
@@ -16,6 +19,7 @@ from sortie.perception.network.fusion.traffic import LinkBytes
 from sortie.perception.network.fusion.v2vnet import V2VNet
 from sortie.perception.network.fusion.when2com import When2com, asked
 from sortie.perception.network.fusion.where2comm import HEADS, Where2comm, confidence_map, requested_rank
+from sortie.scenarios.schema import Perception
 
 SIDE = 12
 LEARNED = ("disconet", "v2vnet", "when2com", "where2comm")
@@ -37,7 +41,7 @@ METHODS = {name: made(name) for name in FUSIONS}
 
 
 def maps(seed: int, count: int, cells: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
-    """[1, count, 80, 12, 12] features ≥ 0 and which cells of them were sent [1, count − 1, 12, 12]; the rest is zero."""
+    """Features ≥ 0 [1, count, 80, 12, 12], and which cells of them were sent [1, count − 1, 12, 12]; others are 0."""
     rng = torch.Generator().manual_seed(seed)
     agents = torch.randn(1, count, CHANNELS, SIDE, SIDE, generator=rng).relu()
     sent = torch.rand(1, count - 1, SIDE, SIDE, generator=rng) < cells
@@ -50,29 +54,31 @@ def fuse(
     name: str, agents: torch.Tensor, sent: torch.Tensor, weight: list[float], unsent: str = "masked"
 ) -> torch.Tensor:
     peers = torch.tensor([weight])
-    part = takes_part(sent, torch.ones_like(sent), peers, unsent)  # type: ignore[arg-type]
+    part = takes_part(sent, torch.ones_like(sent), peers, unsent)
     out: torch.Tensor = METHODS[name](agents, part, F.pad(peers, (1, 0), value=1.0))
     return out
 
 
-@pytest.mark.parametrize("name", FUSIONS)
-def test_a_peer_that_is_absent_mute_or_weightless_changes_nothing(name: str) -> None:
-    agents, sent = maps(1, 3)
-    ego = agents[:, 0]
-    assert torch.equal(fuse(name, agents[:, :1], sent[:, :0], []), ego)
-    assert torch.equal(fuse(name, agents, sent, [0.0, 0.0]), ego)
-    mute = agents.clone()
-    mute[:, 1:] = 0.0
-    assert torch.equal(fuse(name, mute, torch.zeros_like(sent), [1.0, 1.0]), ego)
-    one = fuse(name, agents[:, :2], sent[:, :1], [0.8])
-    for silent in ([0.8, 0.0], [0.8, 1.0]):
-        with_silent = agents.clone()
-        heard = sent.clone()
-        if silent[1]:
-            with_silent[:, 2], heard[:, 1] = 0.0, False
-        assert torch.allclose(fuse(name, with_silent, heard, silent), one, atol=1e-5)
-    if FUSIONS[name].shares == "features":
-        assert not torch.allclose(one, ego, atol=1e-2)
+def test_a_peer_that_is_absent_mute_or_weightless_changes_nothing() -> None:
+    def check(name: str) -> None:
+        agents, sent = maps(1, 3)
+        ego = agents[:, 0]
+        assert torch.equal(fuse(name, agents[:, :1], sent[:, :0], []), ego)
+        assert torch.equal(fuse(name, agents, sent, [0.0, 0.0]), ego)
+        mute = agents.clone()
+        mute[:, 1:] = 0.0
+        assert torch.equal(fuse(name, mute, torch.zeros_like(sent), [1.0, 1.0]), ego)
+        one = fuse(name, agents[:, :2], sent[:, :1], [0.8])
+        for silent in ([0.8, 0.0], [0.8, 1.0]):
+            with_silent = agents.clone()
+            heard = sent.clone()
+            if silent[1]:
+                with_silent[:, 2], heard[:, 1] = 0.0, False
+            assert torch.allclose(fuse(name, with_silent, heard, silent), one, atol=1e-5)
+        if FUSIONS[name].shares == "features":
+            assert not torch.allclose(one, ego, atol=1e-2)
+
+    assert wrong_rows(FUSIONS, check) == {}
 
 
 @pytest.mark.parametrize("name", FUSING)
@@ -104,42 +110,48 @@ def test_zeros_and_masks_differ_only_where_something_was_not_sent(name: str, see
     assert differ[row, column] or name == "fcooper"  # the maximum with zeros of what is ≥ 0 is the maximum
 
 
-@pytest.mark.parametrize("name", FUSING)
-def test_a_weight_leads_from_absent_to_trusted_without_a_jump(name: str) -> None:
-    agents, sent = maps(3, 2)
-    ego = agents[:, 0]
-    assert torch.allclose(fuse(name, agents, sent, [1e-9]), ego, atol=1e-4)
-    moved = [float((fuse(name, agents, sent, [w]) - ego).norm()) for w in (0.1, 0.4, 1.0)]
-    assert moved[0] < moved[1] < moved[2]
+def test_a_weight_leads_from_absent_to_trusted_without_a_jump() -> None:
+    def check(name: str) -> None:
+        agents, sent = maps(3, 2)
+        ego = agents[:, 0]
+        assert torch.allclose(fuse(name, agents, sent, [1e-9]), ego, atol=1e-4)
+        moved = [float((fuse(name, agents, sent, [w]) - ego).norm()) for w in (0.1, 0.4, 1.0)]
+        assert moved[0] < moved[1] < moved[2]
+
+    assert wrong_rows(FUSING, check) == {}
 
 
-@pytest.mark.parametrize("name", FUSING)
-def test_egos_fused_together_are_egos_fused_alone(name: str) -> None:
-    agents, sent = maps(4, 3, 0.3)
-    more, heard = maps(5, 3, 0.3)
-    one = torch.ones(2, 2)
-    part = takes_part(torch.cat([sent, heard]), torch.ones(2, 2, SIDE, SIDE, dtype=torch.bool), one, "masked")
-    with torch.inference_mode():
-        both = METHODS[name](torch.cat([agents, more]), part, torch.ones(2, 3))
-    assert torch.allclose(both[:1], fuse(name, agents, sent, [1.0, 1.0]), atol=1e-5)
-    assert torch.allclose(both[1:], fuse(name, more, heard, [1.0, 1.0]), atol=1e-5)
+def test_egos_fused_together_are_egos_fused_alone() -> None:
+    def check(name: str) -> None:
+        agents, sent = maps(4, 3, 0.3)
+        more, heard = maps(5, 3, 0.3)
+        one = torch.ones(2, 2)
+        part = takes_part(torch.cat([sent, heard]), torch.ones(2, 2, SIDE, SIDE, dtype=torch.bool), one, "masked")
+        with torch.inference_mode():
+            both = METHODS[name](torch.cat([agents, more]), part, torch.ones(2, 3))
+        assert torch.allclose(both[:1], fuse(name, agents, sent, [1.0, 1.0]), atol=1e-5)
+        assert torch.allclose(both[1:], fuse(name, more, heard, [1.0, 1.0]), atol=1e-5)
+
+    assert wrong_rows(FUSING, check) == {}
 
 
-@pytest.mark.parametrize("name", FUSIONS)
-def test_folding_changes_nothing_and_every_parameter_learns(name: str) -> None:
-    agents, sent = maps(6, 3, 0.6)
-    part = takes_part(sent, torch.ones_like(sent), torch.ones(1, 2), "masked")
-    fusion = made(name)
-    with torch.no_grad():
-        before = fusion(agents, part, torch.ones(1, 3))
-        fusion.fold()
-        assert torch.allclose(fusion(agents, part, torch.ones(1, 3)), before, atol=1e-4)
-    fusion = FUSIONS[name]().train()
-    parameters = list(fusion.parameters())
-    if parameters:
-        weight = F.pad(fusion.weigh(agents[:, 0], agents[:, 1:], torch.ones(1, 2)), (1, 0), value=1.0)
-        grads = torch.autograd.grad(fusion(agents, part, weight).square().sum(), parameters)
-        assert all(torch.isfinite(g).all() for g in grads)
+def test_folding_changes_nothing_and_every_parameter_learns() -> None:
+    def check(name: str) -> None:
+        agents, sent = maps(6, 3, 0.6)
+        part = takes_part(sent, torch.ones_like(sent), torch.ones(1, 2), "masked")
+        fusion = made(name)
+        with torch.no_grad():
+            before = fusion(agents, part, torch.ones(1, 3))
+            fusion.fold()
+            assert torch.allclose(fusion(agents, part, torch.ones(1, 3)), before, atol=1e-4)
+        fusion = FUSIONS[name]().train()
+        parameters = list(fusion.parameters())
+        if parameters:
+            weight = F.pad(fusion.weigh(agents[:, 0], agents[:, 1:], torch.ones(1, 2)), (1, 0), value=1.0)
+            grads = torch.autograd.grad(fusion(agents, part, weight).square().sum(), parameters)
+            assert all(torch.isfinite(g).all() for g in grads)
+
+    assert wrong_rows(FUSIONS, check) == {}
 
 
 def test_f_cooper_is_the_maximum() -> None:
@@ -159,7 +171,7 @@ def test_v2vnet_is_the_stated_rounds() -> None:
     message = nn.Conv2d(2 * CHANNELS, net.from_ego.out_channels, 3, padding=1)
     with torch.inference_mode():
         message.weight.copy_(torch.cat([net.from_peer.weight, net.from_ego.weight], dim=1))
-        message.bias.copy_(net.from_ego.bias)  # type: ignore[union-attr,arg-type]
+        message.bias.copy_(net.from_ego.bias)
         state = agents[:, 0]
         for _ in range(2):
             said = [F.relu(message(torch.cat([agents[:, j], state], dim=1))) * sent[:, j - 1 : j] for j in (1, 2)]
@@ -237,22 +249,10 @@ def test_a_handshake_is_of_whole_maps_and_of_nobody_elses() -> None:
     assert len(set(three[0].tolist())) == 3
 
 
-def test_who2com_asks_one_and_when2com_whoever_has_attention() -> None:
-    attention = torch.tensor([[0.9, 0.04, 0.06], [0.2, 0.5, 0.3]])
-    assert asked(attention).tolist() == [[False, True], [True, False]]
-    assert asked(attention, 0.2).tolist() == [[False, False], [True, True]]
-
-
-@pytest.mark.parametrize("name", FUSIONS)
-def test_a_method_says_whether_it_weighs_by_a_handshake(name: str) -> None:
-    assert FUSIONS[name].weighs == (FUSIONS[name].weigh is not Fusion.weigh)
-
-
-@pytest.mark.parametrize("name", [n for n in FUSIONS if n != "when2com"])
-def test_without_a_handshake_weights_are_the_directives(name: str) -> None:
-    agents, _ = maps(12, 3)
-    weight = torch.tensor([[0.3, 1.0]])
-    assert METHODS[name].weigh(agents[:, 0], agents[:, 1:], weight) is weight
+def test_who2com_asks_one_and_when2com_whoever_has_more_attention_than_the_threshold() -> None:
+    attention = torch.tensor([[0.9, 0.04, 0.06], [0.2, 0.5, 0.3], [0.5, 0.25, 0.25]])
+    assert asked(attention).tolist() == [[False, True], [True, False], [True, False]]
+    assert asked(attention, 0.25).tolist() == [[False, False], [True, True], [False, False]]
 
 
 def test_confidence_is_smoothed_and_requests_ask_for_what_is_unknown() -> None:
@@ -268,17 +268,13 @@ def test_confidence_is_smoothed_and_requests_ask_for_what_is_unknown() -> None:
     assert float(requested_rank(sure, torch.ones(1))) == 0.0
 
 
-@pytest.mark.parametrize("name", FUSING)
-def test_bytes_of_features(name: str) -> None:
-    method = FUSIONS[name]
-    first = 132 if name == "when2com" else 0  # a query of 32 floats and a score
-    assert method.link_bytes(cells=4096) == LinkBytes(655_360, 0, first)
-    assert method.link_bytes(cells=1024) == LinkBytes(163_840, 512, first)
-    assert method.link_bytes(cells=82).total == 82 * 160 + 123 + first
-    assert method.link_bytes(cells=0).total == first
-
-
-def test_bytes_of_what_is_not_features() -> None:
+def test_bytes_of_each_method() -> None:
+    for name in FUSING:
+        first = 132 if name == "when2com" else 0  # a query of 32 floats and a score
+        assert FUSIONS[name].link_bytes(cells=4096) == LinkBytes(655_360, 0, first)
+        assert FUSIONS[name].link_bytes(cells=1024) == LinkBytes(163_840, 512, first)
+        assert FUSIONS[name].link_bytes(cells=82).total == 82 * 160 + 123 + first
+        assert FUSIONS[name].link_bytes(cells=0).total == first
     assert FUSIONS["none"].link_bytes(cells=4096, boxes=9).total == 0
     assert FUSIONS["late"].link_bytes(cells=4096, boxes=9) == LinkBytes(216)
     assert Where2comm.link_bytes(cells=82, rounds=2) == LinkBytes(13_120, 123, 8192)
@@ -292,9 +288,8 @@ def test_bytes_of_what_is_not_features() -> None:
 
 
 def test_the_registry_is_what_a_scenario_may_name() -> None:
-    from sortie.scenarios.schema import Perception
-
     allowed = Perception.model_json_schema()["properties"]["fusion"]
     assert set(allowed["anyOf"][0]["enum"]) == set(FUSIONS)
     assert allowed["default"] == DEFAULT
+    assert {name for name in FUSIONS if FUSIONS[name].weighs} == {"when2com"}
     assert all(f.about and "\n" not in f.about for f in FUSIONS.values())

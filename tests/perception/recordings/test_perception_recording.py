@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from recording_examples import score_map, small
+from wrong_rows import wrong_rows
 
 from sortie.perception.recordings.exchange import moved
 from sortie.perception.recordings.recording import RecordingError, cells_of, open_recording
@@ -42,9 +43,8 @@ def test_zarr_reads_only_what_is_asked_for(tmp_path: Path) -> None:
             yield np.full((2, 4, 64, 64), k, np.float16)
 
     none = [[np.zeros((0, 6))] * 2] * 3
-    rec = open_recording(
-        write_recording(tmp_path / "r", t_s=[0, 1, 2], pose=np.zeros((3, 2, 3)), boxes=none, truth=[np.zeros((0, 5))] * 3, cell_m=3.2, features=frames())
-    )  # fmt: skip
+    arrays = dict(t_s=[0, 1, 2], pose=np.zeros((3, 2, 3)), boxes=none, truth=[np.zeros((0, 5))] * 3, cell_m=3.2)
+    rec = open_recording(write_recording(tmp_path / "r", **arrays, features=frames()))
     chunks = sorted(p for p in (tmp_path / "r" / "features").rglob("*") if p.is_file() and p.name != "zarr.json")
     assert len(chunks) == 4  # of six, as frame 0 is all zeros
     for chunk in chunks:
@@ -59,6 +59,15 @@ def test_confidence_left_out_is_the_score_of_the_boxes(path: Path) -> None:
     rank = open_recording(path).rank(0, 1)
     assert np.argwhere(rank).tolist() == [[32, 38]]  # the car 20 m to the left, 0 m ahead
     assert rank.max() == pytest.approx(0.8)
+
+
+def test_a_cell_ranks_by_its_best_box_whichever_comes_last_and_a_box_may_be_anywhere(tmp_path: Path) -> None:
+    """Of 1e300 m: it lies in no cell, and nothing warns."""
+    rows = np.array([(8, 1, 4.5, 1.9, 0.1, 0.9), (8.5, 1.5, 4.5, 1.9, 0.1, 0.3), (1e300, 0, 4.5, 1.9, 0.1, 1.0)])
+    for order in ([0, 1, 2], [2, 1, 0]):
+        path = small(tmp_path / "r.npz", boxes=[[rows[order], []]] * 2, features=None)
+        rank = open_recording(path).rank(0, 0)
+        assert (rank[34, 32], rank.sum()) == (0.9, 0.9)
 
 
 def test_finer_grids_are_exchanged_in_blocks(tmp_path: Path) -> None:
@@ -95,63 +104,71 @@ def put(at: Any, value: Any) -> Any:
     return change
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (dict(t_s=None), "t_s is missing, a recording must hold format, cell_m, t_s, pose, boxes, boxes_offset, truth, truth_offset"),
-        (dict(speed=np.zeros(2)), "speed is unknown, beside what it must hold a recording may hold scene, est_pose, features, confidence"),
-        (dict(format=np.array(2)), "format is 2, must be 1"),
-        (dict(cell_m=np.array(0.0)), "cell_m is 0, must be 0.001 to 1000 m"),
-        (dict(cell_m=np.array("a")), "cell_m is <U1, must be numbers"),
-        (dict(t_s=np.array([0.1, 0.1])), "t_s is 0.1 in frame 1, must be above 0.1, the frame before"),
-        (dict(t_s=np.array([0.0, np.nan])), "t_s [1] is nan, must be finite"),
-        (dict(t_s=np.zeros((2, 1))), "t_s has shape [2, 1], must be [any]"),
-        (dict(scene=np.array([0.0, 1.0])), "scene is float64, must be whole numbers"),
-        (dict(pose=np.zeros((3, 2, 3))), "pose has shape [3, 2, 3], must be [2, any, 3]"),
-        (dict(pose=put((0, 1, 2), np.inf)), "pose [0, 1, 2] is inf, must be finite"),
-        (dict(pose=np.zeros((2, 0, 3))), "pose has no drones, must be at least one"),
-        (dict(est_pose=np.zeros((2, 1, 3))), "est_pose has shape [2, 1, 3], must be [2, 2, 3]"),
-        (dict(boxes=np.ones((4, 7))), "boxes has shape [4, 7], must be [any, 6]"),
-        (dict(boxes=put((2, 3), 0.0)), "boxes: width in row 2 (from 0) is 0, must be 0.001 to 1000 m"),
-        (dict(boxes=put((1, 2), -4.5)), "boxes: length in row 1 (from 0) is -4.5, must be 0.001 to 1000 m"),
-        (dict(boxes=put((0, 3), np.nan)), "boxes [0, 3] is nan, must be finite"),
-        (dict(boxes=put((0, 3), 1e-50)), "boxes: width in row 0 (from 0) is 1e-50, must be 0.001 to 1000 m"),
-        (dict(boxes=put((3, 5), 1.5)), "boxes: score in row 3 (from 0) is 1.5, must be 0 to 1"),
-        (dict(boxes=put((3, 5), -0.1)), "boxes: score in row 3 (from 0) is -0.1, must be 0 to 1"),
-        (dict(boxes=put((3, 4), 90)), "boxes: yaw in row 3 (from 0) is 90, must be within ±12.57 rad, not degrees"),
-        (dict(boxes=put((3, 4), -np.inf)), "boxes [3, 4] is -inf, must be finite"),
-        (dict(truth=put((1, 4), -90)), "truth: yaw in row 1 (from 0) is -90, must be within ±12.57 rad, not degrees"),
-        (dict(truth=put((1, 2), 0)), "truth: length in row 1 (from 0) is 0, must be 0.001 to 1000 m"),
-        (dict(pose=put((1, 0, 2), 180)), "pose [1, 0, 2] is 180, must be within ±12.57 rad, not degrees"),
-        (dict(boxes_offset=np.array([0, 1, 2, 3, 5])), "boxes_offset runs from 0 to 5, must be 0 to 4, the rows of boxes"),
-        (dict(boxes_offset=np.array([0, 3, 2, 3, 4])), "boxes_offset falls, must be ascending"),
-        (dict(boxes_offset=np.array([0, 4])), "boxes_offset has shape [2], must be [5]"),
-        (dict(truth_offset=np.array([0, 2, 4, 4])), "truth_offset has shape [4], must be [3]"),
-        (dict(features=lambda a: a.astype(np.float32)), "features is float32, must be float16"),
-        (dict(features=lambda a: a[:, :1]), "features has shape [2, 1, 3, 64, 64], must be [n, drones, C, H, W] with n = 2, drones = 2"),
-        (dict(confidence=np.zeros((2, 2, 32, 64))), "confidence has a grid of 32 × 64, must be the features' 64 × 64"),
-        (dict(confidence=np.zeros((2, 2, 64, 64), int)), "confidence is int64, must be floating"),
-    ],
-)  # fmt: skip
-def test_a_broken_recording_is_told(changes: dict[str, Any], message: str, path: Path) -> None:
-    with pytest.raises(RecordingError, match=f"^{re.escape(f'{path}: {message}')}$"):
-        open_recording(spoiled(path, **changes))
+FIELDS = "format, cell_m, t_s, pose, boxes, boxes_offset, truth, truth_offset"
+BROKEN = [
+    ("t_s", None, f"t_s is missing, a recording must hold {FIELDS}"),
+    (
+        "speed",
+        np.zeros(2),
+        "speed is unknown, beside what it must hold a recording may hold scene, est_pose, features, con",
+    ),
+    ("format", np.array(2), "format is 2, must be 1"),
+    ("cell_m", np.array(0.0), "cell_m is 0, must be 0.001 to 1000 m"),
+    ("cell_m", np.array("a"), "cell_m is <U1, must be numbers"),
+    ("t_s", np.array([0.1, 0.1]), "t_s is 0.1 in frame 1, must be above 0.1, the frame before"),
+    ("t_s", np.array([0.0, np.nan]), "t_s [1] is nan, must be finite"),
+    ("t_s", np.zeros((2, 1)), "t_s has shape [2, 1], must be [any]"),
+    ("scene", np.array([0.0, 1.0]), "scene is float64, must be whole numbers"),
+    ("pose", np.zeros((3, 2, 3)), "pose has shape [3, 2, 3], must be [2, any, 3]"),
+    ("pose", put((0, 1, 2), np.inf), "pose [0, 1, 2] is inf, must be finite"),
+    ("pose", put((1, 0, 2), 180), "pose [1, 0, 2] is 180, must be within ±12.57 rad, not degrees"),
+    ("pose", np.zeros((2, 0, 3)), "pose has no drones, must be at least one"),
+    ("est_pose", np.zeros((2, 1, 3)), "est_pose has shape [2, 1, 3], must be [2, 2, 3]"),
+    ("boxes", np.ones((4, 7)), "boxes has shape [4, 7], must be [any, 6]"),
+    ("boxes", put((2, 3), 0.0), "boxes: width in row 2 (from 0) is 0, must be 0.001 to 1000 m"),
+    ("boxes", put((1, 2), -4.5), "boxes: length in row 1 (from 0) is -4.5, must be 0.001 to 1000 m"),
+    ("boxes", put((0, 3), np.nan), "boxes [0, 3] is nan, must be finite"),
+    ("boxes", put((3, 5), 1.5), "boxes: score in row 3 (from 0) is 1.5, must be 0 to 1"),
+    ("boxes", put((3, 5), -0.1), "boxes: score in row 3 (from 0) is -0.1, must be 0 to 1"),
+    ("boxes", put((3, 4), 90), "boxes: yaw in row 3 (from 0) is 90, must be within ±12.57 rad, not degrees"),
+    ("truth", put((1, 4), -90), "truth: yaw in row 1 (from 0) is -90, must be within ±12.57 rad, not degrees"),
+    ("truth", put((1, 2), 0), "truth: length in row 1 (from 0) is 0, must be 0.001 to 1000 m"),
+    ("boxes_offset", np.array([0, 1, 2, 3, 5]), "boxes_offset runs from 0 to 5, must be 0 to 4, the rows of boxes"),
+    ("boxes_offset", np.array([0, 3, 2, 3, 4]), "boxes_offset falls, must be ascending"),
+    ("boxes_offset", np.array([0, 4]), "boxes_offset has shape [2], must be [5]"),
+    ("truth_offset", np.array([0, 2, 4, 4]), "truth_offset has shape [4], must be [3]"),
+    ("features", np.zeros((2, 2, 3, 64, 64), np.float32), "features is float32, must be float16"),
+    (
+        "features",
+        np.zeros((2, 1, 3, 64, 64), np.float16),
+        "features has shape [2, 1, 3, 64, 64], must be [n, drones, C, H",
+    ),
+    ("confidence", np.zeros((2, 2, 32, 64)), "confidence has a grid of 32 × 64, must be the features' 64 × 64"),
+    ("confidence", np.zeros((2, 2, 64, 64), int), "confidence is int64, must be floating"),
+]
+
+
+def test_a_broken_recording_is_told(tmp_path: Path) -> None:
+    def check(field: str, value: Any, message: str) -> None:
+        path = small(tmp_path / "small.npz")
+        with pytest.raises(RecordingError, match=f"^{re.escape(f'{path}: {message}')}"):
+            open_recording(spoiled(path, **{field: value}))
+
+    assert wrong_rows(BROKEN, check) == {}
 
 
 def test_scenes_come_in_runs_and_have_clocks_of_their_own(tmp_path: Path) -> None:
     frames = dict(pose=np.zeros((3, 1, 3)), boxes=[[np.zeros((0, 6))]] * 3, truth=[np.zeros((0, 5))] * 3, cell_m=3.2)
-    write_recording(tmp_path / "a.npz", t_s=[5, 6, 0], scene=[1, 1, 0], **frames)  # type: ignore[arg-type]
+    write_recording(tmp_path / "a.npz", t_s=[5, 6, 0], scene=[1, 1, 0], **frames)
     with pytest.raises(RecordingError, match="scene comes back to a scene it left, must be one run of frames a scene"):
-        write_recording(tmp_path / "b.npz", t_s=[5, 0, 6], scene=[1, 0, 1], **frames)  # type: ignore[arg-type]
+        write_recording(tmp_path / "b.npz", t_s=[5, 0, 6], scene=[1, 0, 1], **frames)
     assert not (tmp_path / "b.npz").exists()
 
 
 def test_large_arrays_are_checked_when_they_are_read(path: Path) -> None:
     rec = open_recording(spoiled(path, features=put((1, 0, 2, 3, 4), np.nan)))
     assert rec.features(0, 0).shape == (3, 64, 64)
-    with pytest.raises(
-        RecordingError, match=r"small\.npz: features frame 1, drone 0 is not finite, must be finite every"
-    ):
+    with pytest.raises(RecordingError, match=r"features frame 1, drone 0 is not finite, must be finite every"):
         rec.features(1, 0)
 
 
@@ -185,29 +202,26 @@ def test_writing_zarr_is_whole_or_not_at_all(tmp_path: Path) -> None:
         small(tmp_path / "r")
 
 
-@pytest.mark.parametrize("name", ["r", "r.npz"])
-def test_what_would_be_refused_when_it_is_read_is_not_written(name: str, tmp_path: Path) -> None:
-    """1e5 is infinite in float16, as which features and confidences are kept."""
-    for values in (np.full((2, 3, 64, 64), 1e5), np.full((2, 3, 64, 64), np.nan)):
-        message = f"{tmp_path / name}: features of frame 1 are not finite as float16, must be within ±65504"
-        with pytest.raises(RecordingError, match=f"^{re.escape(message)}$"):
-            small(tmp_path / name, features=[np.full((2, 3, 64, 64), 65504.0), values])
-    with pytest.raises(RecordingError, match=r"confidence are not finite as float16, must be within ±65504"):
-        small(tmp_path / name, confidence=np.full((2, 2, 64, 64), -1e5))
-    assert not list(tmp_path.iterdir())
+def test_what_would_be_refused_when_it_is_read_is_not_written(tmp_path: Path) -> None:
+    """1e5 is infinite in float16. Six rows of seven numbers are as many numbers as seven of six."""
+    fits, box, cars = np.full((2, 3, 64, 64), 65504.0), np.array([(8, 0, 4.5, 1.9, 0.1, 0.9)]), np.ones((5, 6))
+    infinite = "are not finite as float16, must be within ±65504"
+    maps = [({"features": [fits, np.full_like(fits, v)]}, f"features of frame 1 {infinite}") for v in (1e5, np.nan)]
+    rows = [
+        *maps,
+        ({"confidence": np.full((2, 2, 64, 64), -1e5)}, f"confidence {infinite}"),
+        ({"boxes": [[box, np.full((6, 7), 0.5)], [box, box]]}, "boxes of frame 0 have shape [6, 7], must be [any, 6]"),
+        ({"boxes": [[box, box], [box, box[0]]]}, "boxes of frame 1 have shape [6], must be [any, 6]"),
+        ({"truth": [cars[:, :5], cars]}, "truth of frame 1 have shape [5, 6], must be [any, 5]"),
+        ({"boxes": [[box], [box, box, box]]}, "boxes of frame 0 are of 1 drones, must be of 2"),
+    ]
 
+    def check(changes: dict[str, Any], message: str) -> None:
+        for name in ("r", "r.npz"):
+            with pytest.raises(RecordingError, match=re.escape(message)):
+                small(tmp_path / name, **({"features": None} | changes))
 
-def test_rows_of_another_width_or_of_another_drone_are_not_written(tmp_path: Path) -> None:
-    """Six rows of seven numbers are as many numbers as seven of six; one drone's boxes and three are as many as two and two."""
-    box, cars = np.array([(8, 0, 4.5, 1.9, 0.1, 0.9)]), np.ones((5, 6))
-    for changes, message in (
-        (dict(boxes=[[box, np.full((6, 7), 0.5)], [box, box]]), "boxes of frame 0 have shape [6, 7], must be [any, 6]"),
-        (dict(boxes=[[box, box], [box, box[0]]]), "boxes of frame 1 have shape [6], must be [any, 6]"),
-        (dict(truth=[cars[:, :5], cars]), "truth of frame 1 have shape [5, 6], must be [any, 5]"),
-        (dict(boxes=[[box], [box, box, box]]), "boxes of frame 0 are of 1 drones, must be of 2"),
-    ):
-        with pytest.raises(RecordingError, match=f"^{re.escape(f'{tmp_path}/x.npz: {message}')}$"):
-            small(tmp_path / "x.npz", features=None, **changes)
+    assert wrong_rows(rows, check) == {}
     assert not list(tmp_path.iterdir())
     small(tmp_path / "x.npz", features=None, boxes=[[box, []], [[], box]])
 
@@ -231,30 +245,6 @@ def test_moved_is_its_own_inverse_and_cells_follow_the_grid() -> None:
     assert (row[0], column[0], inside.tolist()) == (0, 63, [True, False])
 
 
-@pytest.mark.parametrize("damage", ["stream", "encrypted", "method"])
-def test_a_damaged_archive_is_one_line(damage: str, tmp_path: Path) -> None:
-    """A deflate stream that is no longer one, and flags in the directory that other archives have."""
-    path = tmp_path / "a.npz"
-    np.savez_compressed(path, t_s=np.arange(1000.0))
-    raw = bytearray(path.read_bytes())
-    with zipfile.ZipFile(path) as archive:
-        begin = archive.infolist()[0].header_offset
-    for signature, at in ((b"PK\x03\x04", begin), (b"PK\x01\x02", raw.rindex(b"PK\x01\x02"))):
-        flags, method = (6, 8) if signature == b"PK\x03\x04" else (8, 10)
-        assert raw[at : at + 4] == signature
-        if damage == "encrypted":
-            raw[at + flags] |= 1
-        if damage == "method":
-            raw[at + method] = 99
-    if damage == "stream":
-        name, extra = (int.from_bytes(raw[begin + k : begin + k + 2], "little") for k in (26, 28))
-        data = begin + 30 + name + extra
-        raw[data : data + 40] = b"\xff" * 40
-    path.write_bytes(raw)
-    with pytest.raises(RecordingError, match=rf"^{re.escape(str(path))}: cannot be read[^\n]*$"):
-        open_recording(path)
-
-
 def rewritten(path: Path, **members: bytes) -> None:
     """Put other bytes in place of arrays of an npz file."""
     with zipfile.ZipFile(path) as archive:
@@ -264,41 +254,14 @@ def rewritten(path: Path, **members: bytes) -> None:
             archive.writestr(name, content)
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
+def test_a_member_that_is_no_array_or_claims_too_much_is_one_line(path: Path) -> None:
+    """Eighty gigabytes are missed before they are asked for."""
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000,), }".ljust(69)
+    for content, said in (
         (b"no array", "cannot be read as npz (the magic string is not correct"),
         (b"", "cannot be read as npz (EOF: reading magic string, expected 8 bytes got 0)"),
-        (
-            b"\x93NUMPY\x01\x00\x46\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000,), }".ljust(69) + b"\n",
-            "cannot be read as npz (t_s.npy is of 80000000000 B, its",
-        ),
-    ],
-    ids=["bytes", "nothing", "80 GB"],
-)  # fmt: skip
-def test_a_member_that_is_no_array_or_claims_too_much_is_one_line(content: bytes, said: str, path: Path) -> None:
-    """Bytes in place of an array ended in AttributeError; eighty gigabytes were asked for before they were missed."""
-    rewritten(path, t_s=content)
-    with pytest.raises(RecordingError) as caught:
-        open_recording(path)
-    assert str(caught.value).startswith(f"{path}: {said}")
-    assert len(str(caught.value).splitlines()) == 1
-
-
-def test_an_archive_of_another_method_is_one_line(path: Path) -> None:
-    with zipfile.ZipFile(path) as archive:
-        contents = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
-        for name, content in contents.items():
-            archive.writestr(name, content)
-    with pytest.raises(RecordingError, match=r"compressed by method 14, must be 0 or 8\)$"):
-        open_recording(path)
-
-
-def test_a_box_may_be_anywhere(path: Path) -> None:
-    """Of 1e300 m: it lies in no cell, and nothing warns."""
-    arrays = dict(np.load(path))
-    arrays["boxes"][:, :2] = 1e300
-    del arrays["features"]
-    np.savez(path, **arrays)
-    assert not open_recording(path).rank(0, 0).any()
+        (b"\x93NUMPY\x01\x00\x46\x00" + header + b"\n", "cannot be read as npz (t_s.npy is of 80000000000 B, its"),
+    ):
+        rewritten(path, t_s=content)
+        with pytest.raises(RecordingError, match=f"^{re.escape(f'{path}: {said}')}[^\n]*$"):
+            open_recording(path)

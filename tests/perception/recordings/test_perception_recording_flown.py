@@ -1,241 +1,106 @@
-"""A recording in the harness and as a sortie's detector: what reaches whom, by which bytes, and what is refused."""
+"""A recording as a sortie's detector, where true and believed poses, times, weights and ages all differ."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from perception_examples import capture, only_target
-from places import ROOT
-from recording_examples import small
+from recording_examples import score_map, small
+from wrong_rows import wrong_rows
 
 from sortie.perception.detectors import DETECTORS, make_detector
-from sortie.perception.evaluation import SINGLE, Settings, Sharing, evaluate, evaluate_recording
-from sortie.perception.evaluation.recorded import RecordedInstrument, frames_of
-from sortie.perception.evaluation.sharing import Exchange
+from sortie.perception.lateness import map_weight, reach_m, still_right
+from sortie.perception.motion import Tracks
 from sortie.perception.recordings.detector import RecordedDetector
-from sortie.perception.recordings.recording import RecordingError, open_recording
-from sortie.perception.types import Share
-from sortie.scenarios.plugins.reference import PluginError, resolve
+from sortie.perception.recordings.recording import RecordingError
+from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.schema import Perception
 from sortie.scenarios.schema.base import ModelName
 
-GREEDY = """
+NONE = np.zeros((0, 6))
+
+
+POSE = np.array([[(0, 0, 0), (20, 0, 0), (0, 30, 0)]] * 3, float)
+
+
+EST = POSE + np.array([(3.0, 0.0, 0.0), (0.0, 2.0, 0.0), (-2.0, 0.0, 0.0)])
+
+
+TELLS = """
 import numpy as np
 
-def peaks(agents, takes_part, weight):
-    best = (agents[:, 0] * takes_part * weight[:, None, None]).max(axis=0)
-    row, column = np.nonzero(best)
-    x, y = (row + 0.5) * 3.2 - 102.4, (column + 0.5) * 3.2 - 102.4
-    return np.stack([x, y, *(np.full(len(x), v) for v in (4.5, 1.9, 0.0)), best[row, column]], axis=1)
+def tell(agents, takes_part, weight):
+    rows = [(10.0 * k, 0, 4.5, 1.9, 0, w) for k, w in enumerate(weight)]
+    rows.append((-50.0, 0, 4.5, 1.9, 0, takes_part[1:].mean()))
+    return np.array(rows)
 
-def wrong(agents, takes_part, weight):
-    return np.zeros((3, 5))
-
-def degrees(agents, takes_part, weight):
-    return np.array([(0, 0, 4.5, 1.9, 90, 0.5)])
-
-def raises(agents, takes_part, weight):
-    raise ValueError("no such layer")
-
-def torn(agents, takes_part, weight):
-    import torch
-    return torch.from_numpy(agents) @ torch.zeros(3, 3)
+def other(agents, takes_part, weight):
+    return tell(agents, takes_part, weight)
 """
-WHOLE = dict(features=None)
-"""Features left out: the radio's own grid is taken."""
 
 
-@pytest.fixture
-def fusion(tmp_path: Path) -> str:
-    (tmp_path / "fusion.py").write_text(GREEDY)
-    return f"{tmp_path / 'fusion.py'}:peaks"
+def box(x: float, y: float = 0.0, score: float = 0.8) -> np.ndarray:
+    return np.array([(x, y, 4.5, 1.9, 0.1, score)])
 
 
-def cells(*at: tuple[int, int]) -> np.ndarray:
-    out = np.zeros((1, 64, 64), bool)
-    for row, column in at:
-        out[0, row, column] = True
-    return out
+def recorded(path: Path, frames: Any, **changes: Any) -> Path:
+    """Three frames, a tenth of a second apart, of three drones that stand still and believe that they are elsewhere."""
+    arrays = {"t_s": [0.0, 0.1, 0.2], "pose": POSE, "est_pose": EST, "truth": [np.zeros((0, 5))] * 3, "features": None}
+    return small(path, boxes=frames, **(arrays | changes))
 
 
-def test_a_peers_box_arrives_with_the_cell_of_its_centre(tmp_path: Path) -> None:
-    """Drone 1's car lies in its cell (32, 38), 10 m ahead and 20 m to the left of drone 0."""
-    rec = open_recording(small(tmp_path / "r.npz"))
-    view = RecordedInstrument(rec).look(frames_of(rec), 0)
-    asked = [
-        Exchange(0, (1,), cells((32, 38))),
-        Exchange(0, (1,), cells((32, 37), (31, 38))),
-        Exchange(0, (), cells()[:0]),
-    ]
-    with_it, without, alone = view.detect(asked, 0.0)
-    np.testing.assert_allclose(with_it, [(8, 0, 4.5, 1.9, 0.1, 0.9), (10, 20, 4.5, 1.9, 0.2, 0.8)])
-    np.testing.assert_allclose(without, alone)
-    assert len(view.detect(asked[:1], 0.85)[0]) == 1
+def flown(path: Path, **settings: Any) -> RecordedDetector:
+    settings = {"score_threshold": 0.05, "join": "nms"} | settings
+    return RecordedDetector(Perception(detector="recorded", recording=str(path), **settings))
 
 
-def test_the_harness_evaluates_a_recording_with_its_own_bytes(tmp_path: Path) -> None:
-    """Each drone knows one of two cars: alone AP is 1/2, a single cell of the right peer makes it 1."""
-    path = small(tmp_path / "r.npz")
-    found = evaluate_recording(path, [SINGLE, Sharing(1 / 4096, "all-1"), Sharing(1.0, "all-1")])
-    few, full = found.conditions[1:]
-    assert found.ap(SINGLE) == pytest.approx(0.5)
-    assert found.ap(few) == pytest.approx(1.0)
-    assert found.ap(full) == pytest.approx(1.0)
-    assert found.payload_bytes[few].tolist() == [1 * 3 * 2] * 4
-    assert found.payload_bytes[full].tolist() == [4096 * 3 * 2] * 4
-    assert found.index_bytes[few].tolist() == [2] * 4
-    assert evaluate_recording(path).conditions[-1] == full
-
-
-def test_frames_that_stand_still_are_told_apart_where_they_are_kept(tmp_path: Path) -> None:
-    """Of two frames with the same poses and cars the second finds nothing; each is evaluated alone, into one store."""
-    pose, car = np.zeros((2, 1, 3)), np.array([(8, 0, 4.5, 1.9, 0.1)])
-    boxes = [[np.append(car, [[0.9]], axis=1)], [np.zeros((0, 6))]]
-    rec = open_recording(small(tmp_path / "r.npz", pose=pose, boxes=boxes, truth=[car, car], features=None))
-    aps = [
-        evaluate(RecordedInstrument(rec), frames_of(rec, [f]), [SINGLE], Settings(1), store=tmp_path / "store").ap(
-            SINGLE
-        )
-        for f in (0, 1, 0)
-    ]
-    assert aps == [1.0, 0.0, 1.0]
-
-
-def test_one_drone_alone_is_evaluated(tmp_path: Path) -> None:
-    car = np.array([(8, 0, 4.5, 1.9, 0.1)])
-    box = np.append(car, [[0.9]], axis=1)
-    one = dict(pose=np.zeros((2, 1, 3)), boxes=[[box], [box]], truth=[car, car], features=None)
-    found = evaluate_recording(small(tmp_path / "r.npz", **one))
-    assert (found.conditions, found.ap(SINGLE)) == ((SINGLE,), 1.0)
-
-
-def test_a_users_fusion_gets_warped_features_and_says_what_is_there(tmp_path: Path, fusion: str) -> None:
-    """Poses a whole number of cells apart, so that warping is exact: peaks come back in their cells."""
-    pose = np.array([[(0, 0, 0), (9.6, 0, 0)]] * 2)
-    rec = open_recording(small(tmp_path / "r.npz", pose=pose))
-    view = RecordedInstrument(rec, fusion).look(frames_of(rec), 0)
-    found, without = view.detect([Exchange(0, (1,), cells((32, 38))), Exchange(0, (1,), cells((0, 0)))], 0.0)
-    np.testing.assert_allclose(found[:, :2], [(8.0, 1.6), (11.2, 20.8)], atol=1e-4)  # centres of the cells
-    np.testing.assert_allclose(found[:, 5], (0.9, 0.8), atol=1e-3)
-    assert len(without) == 1
-    stand_in = RecordedInstrument(rec)
-    assert stand_in.fingerprint != RecordedInstrument(rec, fusion).fingerprint != ""
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("wrong", r"the fusion gave shape \[3, 5\], must be boxes \[m, 6\]"),
-        ("degrees", r"the fusion gave boxes: yaw in row 0 \(from 0\) is 90, must be within ±12.57 rad, not degrees"),
-        ("raises", "the fusion failed, ValueError: no such layer"),
-        ("torn", "the fusion failed, RuntimeError: "),
-    ],
-)
-def test_a_fusion_that_fails_is_told(name: str, message: str, tmp_path: Path, fusion: str) -> None:
-    rec = open_recording(small(tmp_path / "r.npz"))
-    with pytest.raises(RecordingError, match=message):
-        RecordedInstrument(rec, fusion.replace("peaks", name)).look(frames_of(rec), 0).detect(
-            [Exchange(0, (1,), cells((1, 1)))], 0
-        )
-
-
-def test_a_fusion_that_is_not_in_its_file_is_told(tmp_path: Path, fusion: str) -> None:
-    rec = open_recording(small(tmp_path / "r.npz"))
-    with pytest.raises(PluginError, match="has no function or class 'missing'"):
-        RecordedInstrument(rec, fusion.replace("peaks", "missing"))
-
-
-def test_a_fusion_file_that_does_not_load_is_told(tmp_path: Path) -> None:
-    (tmp_path / "f.py").write_text("1 / 0")
-    with pytest.raises(
-        PluginError, match=r"recorded_fusion file '.*f\.py' does not load: ZeroDivisionError: division by zero"
-    ):
-        resolve("recorded_fusion", f"{tmp_path / 'f.py'}:f")
-    with pytest.raises(PluginError, match=r"recorded_fusion file '.*g\.py' not found"):
-        resolve("recorded_fusion", f"{tmp_path / 'g.py'}:f")
-
-
-def flown(tmp_path: Path, boxes: Any = None, **settings: Any) -> RecordedDetector:
-    path = small(tmp_path / "flown.npz", features=None, **({} if boxes is None else {"boxes": boxes}))
-    config = Perception(detector="recorded", recording=str(path), **settings)
-    detector = make_detector(only_target(0, 0), config, 1)
-    assert isinstance(detector, RecordedDetector)
-    return detector
-
-
-def looks(t_s: float = 0.0) -> list[Any]:
-    return [capture(10.0 * i + t_s * 10, 0, drone=i, t_s=t_s) for i in range(2)]
-
-
-def share(of: Any, representation: str = "features", rho: float = 1.0, weight: float = 1.0) -> Share:
-    return Share(of, representation, rho, None, weight)
+def at(drone: int, t_s: float = 0.0, **changes: Any) -> Capture:
+    x, y, _ = POSE[0, drone]
+    return capture(x, y, drone=drone, t_s=t_s)._replace(**changes)
 
 
 def test_what_was_delivered_decides_what_an_ego_sees(tmp_path: Path) -> None:
-    detector, (a, b) = flown(tmp_path), looks()
-    counts = {
-        name: len(detector.detect([(a, shares)])[0])
-        for name, shares in {
-            "alone": [], "full": [share(b)], "one cell": [share(b, rho=1 / 4096)], "starved": [share(b, rho=1e-6)],
-            "distrusted": [share(b, weight=0.0)], "raw": [share(b, "raw")], "detections": [share(b, "detections")],
-            "tracks": [share(b, "tracks")],
-        }.items()
-    }  # fmt: skip
-    assert counts == {
-        "alone": 1, "full": 2, "one cell": 2, "starved": 1, "distrusted": 1, "raw": 2, "detections": 2, "tracks": 2,
-    }  # fmt: skip
-    found = detector.detect([(a, [share(b)])])[0]
-    np.testing.assert_allclose(found.xy_m, [(8, 0), (10, 20)], atol=1e-5)
-    assert len(flown(tmp_path, fusion="none").detect([(a, [share(b)])])[0]) == 1
-    assert len(flown(tmp_path, score_threshold=0.85).detect([(a, [share(b)])])[0]) == 1
-    assert len(detector.truth(0.0, a)) == 2
-    assert detector.count_boxes(a, None) == 1
-    assert detector.count_boxes(a, (50.0, 0.0, 10.0)) == 0
-    unsure = flown(tmp_path, fusion="late", score_threshold=0.1, boxes=[[[(8, 0, 4.5, 1.9, 0.1, 0.2)], []]] * 2)
-    assert (len(unsure.detect([(a, [])])[0]), unsure.count_boxes(a, None)) == (1, 0)  # late fusion does not send it
+    path = small(tmp_path / "r.npz", features=None)
+    a, b = (capture(10.0 * i, 0.0, drone=i, t_s=0.0) for i in range(2))
+
+    def count(representation: str = "features", rho: float = 1.0, weight: float = 1.0, **settings: Any) -> int:
+        return len(flown(path, **settings).detect([(a, [Share(b, representation, rho, None, weight)])])[0])
+
+    assert len(flown(path).detect([(a, [])])[0]) == 1
+    assert [count(), count(rho=1 / 4096), count("raw"), count("detections"), count("tracks")] == [2] * 5
+    alone = [count(rho=1e-6), count(weight=0.0), count(fusion="none"), count(score_threshold=0.85)]
+    assert alone == [1] * 4
+    for missing, comes in (((), True), ((0,), False), ((1, 2, 3), True), (tuple(range(4096)), False)):
+        (found,) = flown(path).detect([(a, [Share(b, "features", 1.0, None, 1.0, missing)])])
+        assert len(found) == 1 + comes, "the cells that went missing are those of their rank"
     with pytest.raises(ValueError, match="a recording holds no images"):
-        detector.camera_views(a)
+        flown(path).camera_views(a)
 
 
-def test_the_nearest_frame_is_taken_within_a_step(tmp_path: Path) -> None:
-    detector = flown(tmp_path)
-    xs = [float(detector.detect([(looks(t_s)[0], [])])[0].xy_m[0, 0]) for t_s in (0.0, 0.04, 0.06, 0.19)]
-    assert xs == pytest.approx([8.0] * 4, abs=1e-5)
-    assert [detector._frame(looks(t)[0]) for t in (0.0, 0.04, 0.06, 0.19)] == [0, 0, 1, 1]
-    with pytest.raises(
-        RecordingError,
-        match=r"flown\.npz: drone 0 is needed at 0\.3 s, must be within 0\.1 s of a frame \(0 … 0\.1 s\)",
-    ):
-        detector.detect([(looks(0.3)[0], [])])
-    with pytest.raises(RecordingError, match=r"truth is needed at 9 s, must be within 0\.1 s"):
-        detector.truth(9.0, looks()[0])
-    with pytest.raises(RecordingError, match="drone 2 is not in it, must be one of 0 … 1"):
-        detector.count_boxes(capture(drone=2, t_s=0.0), None)
-    with pytest.raises(
-        RecordingError, match=r"drone 0 at 0 s flies 40\.0 m from where it was recorded, must be within 5 m"
-    ):
-        detector.detect([(capture(40.0, drone=0, t_s=0.0), [])])
+def test_what_cannot_be_flown_is_told(tmp_path: Path) -> None:
+    (tmp_path / "f.py").write_text(TELLS)
+    fusion = {"recorded_fusion": f"{tmp_path / 'f.py'}:tell"}
+    rows = [
+        (
+            {},
+            {},
+            r"features are 3 × 64 × 64 of 3\.2 m, must be 80 × 64 × 64 of 3\.2 m, as a sortie's radio carries them",
+        ),
+        ({"features": None, "cell_m": 1.6}, {}, r"features are 80 × 64 × 64 of 1\.6 m, must be"),
+        ({"features": None, "scene": [0, 1]}, {}, "scene names 2 scenes, must be one to be flown"),
+        ({"features": None}, fusion, "features are missing, must be there for perception.recorded_fusion"),
+    ]
 
+    def check(changes: dict[str, Any], settings: dict[str, Any], message: str) -> None:
+        with pytest.raises(RecordingError, match=message):
+            flown(small(tmp_path / "r.npz", **changes), **settings)
 
-@pytest.mark.parametrize(
-    ("changes", "settings", "message"),
-    [
-        ({}, {}, r"features are 3 × 64 × 64 of 3\.2 m, must be 80 × 64 × 64 of 3\.2 m, as a sortie's radio carries them"),
-        (dict(features=None, cell_m=1.6), {}, r"features are 80 × 64 × 64 of 1\.6 m, must be"),
-        (dict(features=None, scene=[0, 1]), {}, "scene names 2 scenes, must be one to be flown"),
-        (dict(features=None), dict(recorded_fusion="FUSION"), "features are missing, must be there for perception.recorded_fusion"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_flown_is_told(changes: Any, settings: Any, message: str, tmp_path: Path, fusion: str) -> None:
-    path = small(tmp_path / "r.npz", **changes)
-    settings = dict.fromkeys(settings, fusion)
-    with pytest.raises(RecordingError, match=message):
-        RecordedDetector(Perception(detector="recorded", recording=str(path), **settings))
+    assert wrong_rows(rows, check) == {}
 
 
 def test_every_detector_of_the_schema_is_in_the_table() -> None:
@@ -244,24 +109,183 @@ def test_every_detector_of_the_schema_is_in_the_table() -> None:
     assert make_detector(only_target(0, 0), Perception(detector="none"), 1) is None
 
 
-def test_a_recording_flies_without_torch(tmp_path: Path) -> None:
-    path = small(tmp_path / "r.npz", features=None)
-    code = f"""
-import sys
-from sortie.perception.detectors import make_detector
-from sortie.perception.evaluation import SINGLE, evaluate_recording
-from sortie.scenarios.schema import Perception
-make_detector(None, Perception(detector="recorded", recording={str(path)!r}), 1)
-evaluate_recording({str(path)!r} and __import__("pathlib").Path({str(path)!r}), [SINGLE])
-assert "torch" not in sys.modules
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
+def test_truth_is_about_the_true_pose_and_of_the_time_that_is_asked_for(tmp_path: Path) -> None:
+    """At the square's edge of one pose, 3 m from the other's; in the second frame the cars have driven on by 4 m."""
+    cars = np.array([(104.0, 0, 4.5, 1.9, 0), (-101.0, 5, 4.5, 1.9, 0)])
+    detector = flown(recorded(tmp_path / "r.npz", [[NONE] * 3] * 3, truth=[cars, cars - [4.0, 0, 0, 0, 0], cars]))
+    for now_s, seen in ((0.0, [-101.0]), (0.1, [100.0])):
+        for look_s in (0.0, 0.1):
+            assert detector.truth(now_s, at(0, look_s)).xy_m[:, 0] == pytest.approx(seen)
 
 
-def test_the_readmes_example_runs(tmp_path: Path) -> None:
-    """As it stands there: alone each drone finds one of two cars, with sharing both find both."""
-    readme = ROOT / "perception" / "recordings" / "README.md"
-    code = readme.read_text("utf-8").split("```python\n")[1].split("```")[0]
-    done = subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, capture_output=True, text=True)
-    aps = eval(done.stdout)  # noqa: S307 (our own dict)
-    assert (aps["single"], aps["all-1@1"]) == (0.5, 1.0)
+def test_boxes_stand_by_the_believed_pose_of_the_recording(tmp_path: Path) -> None:
+    """Own and received ones. A drone of the sortie may believe something else and fly where the recorded one was."""
+    path = recorded(tmp_path / "r.npz", [[box(8.0), box(5.0), NONE]] * 3)
+    ego, peer = at(0, est_position_m=(90.0, 0.0, 60.0)), at(1)
+    for kind in ("features", "detections"):
+        found = flown(path).detect([(ego, [Share(peer, kind, 1.0, None, 1.0)])])[0]
+        np.testing.assert_allclose(sorted(found.xy_m.tolist()), [(11.0, 0.0), (25.0, 2.0)], atol=1e-5)
+    far = recorded(tmp_path / "f.npz", [[box(8.0), NONE, NONE]] * 3, est_pose=POSE + np.array([30.0, 0.0, 0.0]))
+    np.testing.assert_allclose(flown(far).detect([(at(0), [])])[0].xy_m, [(38.0, 0.0)], atol=1e-5)
+
+
+def test_received_boxes_are_dropped_beyond_the_recorded_square(tmp_path: Path) -> None:
+    """The recorded drone believes that it is at x = 3, the sortie's at x = 0: its square ends at 105.4 m."""
+    detector = flown(recorded(tmp_path / "r.npz", [[box(8.0), np.concatenate([box(84.0), box(86.0, 9.0)]), NONE]] * 3))
+    found = detector.detect([(at(0), [Share(at(1), "detections", 0.0, None, 1.0)])])[0]
+    assert sorted(found.xy_m[:, 0].tolist()) == pytest.approx([11.0, 104.0])
+
+
+@pytest.mark.parametrize(
+    ("of_peer", "score"),
+    [
+        ({"representation": "detections"}, 0.8),
+        ({"representation": "tracks", "tracks": Tracks.empty()}, 0.8),
+        ({"representation": "detections", "boxes": Boxes.empty()}, 0.4),  # of another network: it flies as the sortie
+    ],
+)
+def test_a_peer_that_sees_nothing_votes_in_the_square_about_its_recorded_pose(
+    of_peer: dict[str, Any], score: float, tmp_path: Path
+) -> None:
+    """The car lies a metre beyond the peer's recorded square, and a metre within the one about the sortie's."""
+    path = recorded(tmp_path / "r.npz", [[box(8.0, -101.4), NONE, NONE]] * 3)
+    share = Share(at(1), "detections", 0.0, None, 1.0)._replace(**of_peer)
+    found = flown(path, join="average").detect([(at(0), [share])])[0]
+    assert found.score.tolist() == pytest.approx([score])
+
+
+def test_only_boxes_above_the_threshold_and_one_of_each_car_are_found_or_sent(tmp_path: Path) -> None:
+    several = np.concatenate([box(8.0, score=0.9), box(8.2, score=0.7), box(30.0, score=0.2), box(50.0, score=0.15)])
+    path = recorded(tmp_path / "r.npz", [[several, several, NONE]] * 3)
+    for threshold, count in ((0.05, 3), (0.18, 2), (0.25, 1)):
+        detector = flown(path, score_threshold=threshold)
+        assert len(detector.detect([(at(0), [])])[0]) == count
+        assert detector.count_boxes(at(1), None) == count
+        assert detector.count_boxes(at(1), Disc(20.0, 2.0, 35.0)) == min(count, 2)
+        assert len(detector.detect([(at(2), [Share(at(1), "detections", 0.0, None, 1.0)])])[0]) == count
+    late = flown(path, score_threshold=0.05, fusion="late")
+    assert (late.count_boxes(at(1), None), flown(path).count_boxes(at(1), None)) == (1, 3)
+
+
+def test_the_join_is_the_one_that_is_asked_for_and_a_fused_look_counts_twice(tmp_path: Path) -> None:
+    """One car by two boxes a metre apart: the best box, their mean, or a mean nearer to what a map took part in."""
+    frames = [[box(10.0, score=0.8), box(-9.0, 0.0, 0.8), NONE]] * 3
+    path = recorded(tmp_path / "r.npz", frames, est_pose=POSE)
+    boxes, empty = Share(at(1), "detections", 0.0, None, 1.0), Share(at(2), "features", 1.0, None, 1.0)
+    x = [
+        float(flown(path, join="average").detect([(at(0), shares)])[0].xy_m[0, 0])
+        for shares in ([boxes], [boxes, empty])
+    ]
+    sure = recorded(tmp_path / "s.npz", [[box(10.0, score=0.8), box(-9.0, 0.0, 0.9), NONE]] * 3, est_pose=POSE)
+    assert flown(sure, join="nms").detect([(at(0), [boxes])])[0].xy_m.tolist() == [pytest.approx([11.0, 0.0])]
+    assert x == [pytest.approx(10.5), pytest.approx(10.0 + 1 / 3, abs=1e-4)]
+
+
+def test_without_a_look_of_its_own_a_drone_has_what_its_peers_sent(tmp_path: Path) -> None:
+    (tmp_path / "f.py").write_text(TELLS)
+    maps = [np.stack([score_map(NONE)] * 3)] * 3
+    path = recorded(tmp_path / "r.npz", [[box(8.0), box(5.0), NONE]] * 3, features=maps)
+    blind, shares = at(0, looked=False), [Share(at(1), "features", 1.0, None, 1.0)]
+    for settings in ({}, {"recorded_fusion": f"{tmp_path / 'f.py'}:tell"}):
+        assert flown(path, **settings).detect([(blind, shares)])[0].xy_m.tolist() == [pytest.approx((25.0, 2.0))]
+        assert len(flown(path, **settings).detect([(blind, [])])[0]) == 0
+
+
+@pytest.mark.parametrize("own_fusion", [False, True])
+def test_without_a_look_of_its_own_what_a_late_map_brings_loses_by_its_age_once(
+    own_fusion: bool, tmp_path: Path
+) -> None:
+    """A fusion of one's own has no part in it, as there is no own map."""
+    (tmp_path / "f.py").write_text(TELLS)
+    maps = [np.stack([score_map(NONE)] * 3)] * 3
+    path = recorded(tmp_path / "r.npz", [[NONE, box(5.0), box(9.0)]] * 3, features=maps)
+    shares = [
+        Share(at(1, 0.2), "features", 1.0, None, 1.0, age_s=0.0),
+        Share(at(2, 0.0), "features", 1.0, None, 0.5, age_s=0.2),
+    ]
+    settings = {"recorded_fusion": f"{tmp_path / 'f.py'}:tell"} if own_fusion else {}
+    found = flown(path, **settings).detect([(at(0, 0.2, looked=False), shares)])[0]
+    left = float(still_right(reach_m(np.array([[4.5, 1.9]])), 0.2)[0])
+    assert found.score.tolist() == pytest.approx([0.8, 0.8 * 0.5 * left])
+    shares.append(Share(at(1, 0.2), "detections", 0.0, None, 1.0))
+    beside = flown(path, **settings).detect([(at(0, 0.2, looked=False), shares[1:])])[0]
+    assert beside.score.tolist() == pytest.approx([0.8, 0.8 * 0.5 * left]), "nor once more beside fresh boxes"
+
+
+def test_a_late_map_s_boxes_lose_what_their_age_leaves_once(tmp_path: Path) -> None:
+    """Drone 0 sees nothing: the box of drone 1's map keeps its score times weight and what is left."""
+    path = recorded(tmp_path / "r.npz", [[NONE, box(5.0), NONE]] * 3, t_s=[0.0, 0.5, 1.0])
+    for join, age_s, weight in product(("nms", "average"), (0.0, 0.1, 0.3, 0.8), (1.0, 0.5)):
+        share = Share(at(1, 1.0 - age_s), "features", 1.0, None, weight, age_s=age_s)
+        (out,) = flown(path, join=join, score_threshold=0.01).detect([(at(0, 1.0), [share])])
+        left = float(still_right(reach_m(np.array([[4.5, 1.9]])), age_s)[0])
+        assert out.score.tolist() == [pytest.approx(0.8 * weight * left, rel=1e-5)], (join, age_s, weight)
+
+
+def test_a_late_map_weighs_less_in_a_fusion_of_one_s_own_beside_the_own_look(tmp_path: Path) -> None:
+    """Weights arrive in order, the ego's first; what was not sent takes part as zeros or not, as asked."""
+    (tmp_path / "f.py").write_text(TELLS)
+    maps = [np.stack([score_map(NONE)] * 3)] * 3
+    path = recorded(tmp_path / "r.npz", [[NONE] * 3] * 3, features=maps)
+    shares = [
+        Share(at(1, 0.0), "features", 0.25, None, 0.8, age_s=0.2),
+        Share(at(2, 0.2), "features", 0.25, None, 0.6, age_s=0.0),
+    ]
+    part = {}
+    for unsent in ("masked", "zero"):
+        detector = flown(path, recorded_fusion=f"{tmp_path / 'f.py'}:tell", unsent_cells=unsent)
+        for age_s in (0.0, 0.1):
+            both = [s._replace(age_s=s.age_s + age_s) for s in shares]
+            found = detector.detect([(at(0, 0.2), both)])[0]
+            score = {round(x): s for x, s in zip(found.xy_m[:, 0].tolist(), found.score.tolist(), strict=True)}
+            late = 0.8 * map_weight(0.2 + age_s, age_s)
+            assert [score[3], score[13], score[23]] == pytest.approx([1.0, late, 0.6], rel=1e-5)
+            part[unsent] = score[-47]
+    assert part["masked"] < 0.25 < part["zero"]
+
+
+def test_ages_count_beside_the_own_look_s(tmp_path: Path) -> None:
+    """The ego looked 0.2 s ago: a map as old as its look loses nothing, one that is 0.4 s old by the ratio, a newer one
+    nothing either."""
+    path = recorded(tmp_path / "r.npz", [[NONE, box(5.0, score=0.9), NONE]] * 3, t_s=[0.0, 0.2, 0.4], est_pose=POSE)
+    reach = reach_m(np.array([[4.5, 1.9]]))
+    newest = Share(at(2, 0.4), "features", 1.0, None, 1.0, age_s=0.0)
+    for age_s, left in ((0.0, 1.0), (0.2, 1.0), (0.4, still_right(reach, 0.4) / still_right(reach, 0.2))):
+        share = Share(at(1, 0.4 - age_s), "features", 1.0, None, 1.0, age_s=age_s)
+        found = flown(path).detect([(at(0, 0.2), [share, newest])])[0]
+        assert found.score == pytest.approx(0.9 * np.reshape(left, -1), rel=1e-5)
+
+
+def test_without_compensation_a_late_map_lies_where_its_sender_is_now(tmp_path: Path) -> None:
+    """The sender has moved on by 2 m a frame; cells that arrive lie where it was, or, uncompensated, where it is."""
+    moves = np.array([0.0, 2.0, 4.0])[:, None, None] * np.array([1.0, 0.0, 0.0])
+    path = recorded(tmp_path / "r.npz", [[NONE, box(5.0), NONE]] * 3, pose=POSE + moves, est_pose=EST + moves)
+    ego, now = at(0, 0.2, position_m=(4.0, 0.0, 60.0)), at(1, 0.2, position_m=(24.0, 0.0, 60.0))
+    share = Share(at(1, 0.0), "features", 1.0, None, 1.0)
+    for compensated, x in ((True, 25.0), (False, 29.0)):
+        detector = flown(path, motion_compensation=compensated)
+        found = detector.detect([(ego, [share]), (now, [])])[0]
+        assert found.xy_m.tolist() == [pytest.approx((x, 2.0), abs=1e-5)]
+        assert detector.detect([(ego, [share])])[0].xy_m[0, 0] == pytest.approx(25.0)  # nobody knows where it is
+
+
+def test_of_two_frames_as_near_the_earlier_is_taken_and_a_gap_is_not_flown_over(tmp_path: Path) -> None:
+    boxes = [[box(10.0 * k), NONE, NONE] for k in range(4)]
+    still = dict(pose=POSE[[0] * 4], est_pose=POSE[[0] * 4], truth=[np.zeros((0, 5))] * 4)
+    path = recorded(tmp_path / "r.npz", boxes, t_s=[0.0, 0.25, 0.5, 2.0], **still)
+    detector = flown(path)
+    for t_s, x in ((0.0, 0.0), (0.125, 0.0), (0.13, 10.0), (0.375, 10.0), (0.75, 20.0), (1.75, 30.0)):
+        assert detector.detect([(at(0, t_s), [])])[0].xy_m[0, 0] == pytest.approx(x, abs=1e-5)
+    for t_s in (0.8, 1.7, 2.3):
+        with pytest.raises(RecordingError, match=r"must be within 0\.25 s of a frame"):
+            detector.detect([(at(0, t_s), [])])
+    for call, message in (
+        (lambda: detector.detect([(at(0)._replace(drone=3), [])]), r"drone 3 is not in it, must be one of 0 … 2"),
+        (lambda: detector.truth(9.0, at(0)), r"truth is needed at 9 s, must be within 0\.25 s"),
+        (
+            lambda: detector.detect([(capture(40.0, t_s=0.0), [])]),
+            r"drone 0 at 0 s flies 40\.0 m from where it was rec",
+        ),
+    ):
+        with pytest.raises(RecordingError, match=message):
+            call()

@@ -1,30 +1,43 @@
-"""The tracker against a filter written with matrices, an assignment by trying everything, and cases worked out by hand."""
+"""The tracker: a filter written with matrices, the best assignment, and a track's life number by number."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from track_examples import tracks
+from wrong_rows import wrong_rows
 
-from sortie.perception import budget
-from sortie.perception.lateness import SIGMA0_M
+from sortie.perception.classes import CAR, PERSON, TRUCK
 from sortie.perception.metrics.assignment import least_cost
-from sortie.perception.motion import ACCELERATION_DENSITY, MOVES_AT, Tracks, grown, predicted
+from sortie.perception.motion import ACCELERATION_DENSITY, Tracks, grown
 from sortie.perception.tracking import association
-from sortie.perception.tracking.following import followed, motion_of, motion_of_boxes
-from sortie.perception.tracking.tracker import BOX_VARIANCE_M2, COAST_S, SPEED_VARIANCE, step
-from sortie.perception.tracking.wire import TRACK, content, packed, unpacked
+from sortie.perception.tracking.association import GATE, assigned
+from sortie.perception.tracking.tracker import (
+    BOX_VARIANCE_M2,
+    COAST_S,
+    FIRST_SPEED_VARIANCE,
+    PLACE_VARIANCE_M2,
+    SPEED_VARIANCE,
+    step,
+)
 from sortie.perception.types import Boxes
 
 Floats = NDArray[np.float64]
 
 
-def boxes(*xy_m: tuple[float, float], score: float = 0.8) -> Boxes:
+def boxes(*xy_m: tuple[float, float], kind: int = CAR, score: float = 0.8) -> Boxes:
     n = len(xy_m)
-    return Boxes(np.array(xy_m).reshape(n, 2), np.tile([4.6, 1.9], (n, 1)), np.zeros(n), np.full(n, score))
+    return Boxes(
+        np.array(xy_m).reshape(n, 2),
+        np.tile([4.6, 1.9], (n, 1)),
+        np.zeros(n),
+        np.full(n, score),
+        kind=np.full(n, kind, np.int8),
+    )
 
 
 class One:
@@ -68,10 +81,10 @@ def test_the_filter_is_the_one_with_matrices() -> None:
 def test_a_box_that_shows_a_car_the_other_way_round_does_not_turn_its_track() -> None:
     """Front and back look alike: what is left of its turn is taken in by its weight, a half, a third, a quarter."""
     tracker, yaw_rad = One(), 0.1
-    for k, (t_s, turn_rad, off_rad) in enumerate([(0.0, 0.0, 0.0), (0.5, np.pi, 0.2), (1.0, -np.pi, 0.0), (1.5, 2 * np.pi, -0.3)]):  # fmt: skip
+    for k, (turn_rad, off_rad) in enumerate([(0.0, 0.0), (np.pi, 0.2), (-np.pi, 0.0), (2 * np.pi, -0.3)]):
         seen = boxes((0.0, 0.0))
         seen.yaw_rad[:] = yaw_rad + turn_rad + off_rad
-        tracker.look(t_s, seen)
+        tracker.look(0.5 * k, seen)
         yaw_rad += off_rad / (k + 1)
         assert tracker.tracks.yaw_rad == pytest.approx([yaw_rad])
 
@@ -84,16 +97,39 @@ def test_a_track_told_for_an_earlier_time_is_no_more_certain_than_for_a_later_on
     assert vv == pytest.approx(4.0 + 0.6 * ACCELERATION_DENSITY)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_the_assignment_is_the_best_of_all(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    cost, free = rng.uniform(0, 12, (4, 5)), 9.0
-    i, j = np.nonzero(cost < free)
-    taken = least_cost(i, j, cost[i, j], np.zeros(len(i), np.int64), free)
-    capped = np.minimum(cost, free)
-    best = min(sum(capped[r, c] for r, c in enumerate(p)) for p in permutations(range(5), 4))
-    assert len(set(i[taken])) == len(set(j[taken])) == taken.sum()
-    assert cost[i, j][taken].sum() + free * (4 - taken.sum()) == pytest.approx(best)
+def test_the_assignment_is_the_best_of_all() -> None:
+    def check(seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        cost, free = rng.uniform(0, 12, (4, 5)), 9.0
+        i, j = np.nonzero(cost < free)
+        taken = least_cost(i, j, cost[i, j], np.zeros(len(i), np.int64), free)
+        capped = np.minimum(cost, free)
+        best = min(sum(capped[r, c] for r, c in enumerate(p)) for p in permutations(range(5), 4))
+        assert len(set(i[taken])) == len(set(j[taken])) == taken.sum()
+        assert cost[i, j][taken].sum() + free * (4 - taken.sum()) == pytest.approx(best)
+
+    assert wrong_rows(range(20), check) == {}
+
+
+def test_two_far_pairs_are_taken_before_one_near_pair() -> None:
+    """Something expected that gets no place costs the whole gate: 8 + 1.5 is less than 1 + 9.21."""
+    expected, places = np.zeros((2, 2)), np.zeros((2, 2))
+    expected[1, 0] = 1.0 + np.sqrt(1.5)
+    places[:, 0] = 1.0, -np.sqrt(8.0)
+    one = np.zeros(2, np.int64)
+    i, j = assigned(expected, np.ones(2), one, places, one)
+    assert (i.tolist(), j.tolist()) == ([0, 1], [1, 0])
+
+
+def test_pairs_of_many_tracks_are_those_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    xy, places = rng.uniform(0, 60, (80, 2)), rng.uniform(0, 60, (90, 2))
+    owner, whose = rng.integers(0, 3, 80), rng.integers(0, 3, 90)
+    few = association.gated(xy, np.full(80, 2.0), owner, places, whose, association.GATE)
+    monkeypatch.setattr(association, "FEW", 0)
+    many = association.gated(xy, np.full(80, 2.0), owner, places, whose, association.GATE)
+    assert len(few[0]) > 20
+    assert sorted(zip(*(v.tolist() for v in few), strict=True)) == sorted(zip(*(v.tolist() for v in many), strict=True))
 
 
 def test_two_cars_that_pass_keep_their_identities() -> None:
@@ -122,15 +158,6 @@ def test_a_track_is_tentative_then_confirmed_coasts_and_is_lost_and_its_number_i
     assert tracker.look(t_s + 1.0, boxes((0.0, 0.0))) == [1]
 
 
-def test_false_positives_that_do_not_come_again_are_never_confirmed_and_weak_boxes_begin_nothing() -> None:
-    tracker = One()
-    for k in range(12):
-        tracker.look(0.5 * k, boxes((40.0 * k, 0.0)))
-        assert not tracker.tracks.confirmed.any()
-        assert len(tracker.tracks) <= 3
-    assert One().look(0.0, boxes((0.0, 0.0), score=0.25)) == [-1]
-
-
 def test_drones_keep_apart_and_one_that_does_not_look_keeps_its_tracks() -> None:
     """Two drones at once are each alone; a NaN leaves a drone as it is."""
     places = [(5.0, 5.0), (30.0, 0.0)]
@@ -146,113 +173,100 @@ def test_drones_keep_apart_and_one_that_does_not_look_keeps_its_tracks() -> None
     np.testing.assert_array_equal(tracks.take(tracks.owner == 1).xy_m, alone.tracks.xy_m)
 
 
-def driving(speed_mps: float = 8.0, looks: int = 8) -> Tracks:
-    """A car that drives east from x = 0 at t = 0, one that stands at (0, 20), seen twice a second."""
-    tracker = One()
-    for k in range(looks):
-        tracker.look(0.5 * k, boxes((speed_mps * 0.5 * k, 0.0), (0.0, 20.0)))
-    return tracker.tracks
+# --- number by number -----------------------------------------------------------------------------------
 
 
-def test_twenty_bytes_hold_a_track() -> None:
-    tracks = driving()
-    data = packed(tracks, (-50.0, 30.0))
-    assert len(data) == len(tracks) * budget.TRACK_BYTES == len(tracks) * TRACK.itemsize
-    read = unpacked(data, 0, (-50.0, 30.0), float(tracks.t_s[0]))
-    for name, step_ in {"xy_m": 0.01, "velocity_mps": 0.01, "size_m": 0.05, "yaw_rad": 1e-4, "score": 1 / 255}.items():
-        np.testing.assert_allclose(getattr(read, name), getattr(tracks, name), atol=step_ / 2 + 1e-9)
-    np.testing.assert_allclose(np.sqrt(read.covariance[:, [0, 2]]), np.sqrt(tracks.covariance[:, [0, 2]]), atol=0.025)
-    assert read.id.tolist() == tracks.id.tolist()
-    with pytest.raises(ValueError, match="tracks are 21 B, must be a multiple of 20 B"):
-        unpacked(data[:21], 0, (0.0, 0.0), 0.0)
+def box(x_m: float = 0.0, y_m: float = 0.0, size: tuple[float, float] = (4.6, 1.9), score: float = 0.8) -> Boxes:
+    return Boxes(np.array([[x_m, y_m]]), np.array([size]), np.zeros(1), np.array([score]))
 
 
-def test_what_is_sent_are_the_best_twelve_confirmed_tracks_of_the_region_at_the_capture() -> None:
-    tracker = One()
-    row = [(10.0 * k, 0.0) for k in range(16)]
-    for t_s in (0.0, 0.5, 1.0):
-        tracker.look(t_s, boxes(*row))
-    tracker.look(1.5, boxes(*row, (0.0, 80.0)))  # the last is tentative
-    assert len(content(tracker.tracks, None, (0.0, 0.0), 1.5)) == budget.MAX_TRACKS == 12
-    near = content(tracker.tracks, (0.0, 0.0, 25.0), (0.0, 0.0), 1.5)
-    assert sorted(near.xy_m[:, 0].round().tolist()) == [0.0, 10.0, 20.0]
-    assert len(content(tracker.tracks, (0.0, 80.0, 5.0), (0.0, 0.0), 1.5)) == 0
-    moved = content(driving(), None, (0.0, 0.0), 4.0)
-    assert moved.xy_m[moved.xy_m[:, 1] < 10.0, 0] == pytest.approx(32.0, abs=0.3)
+def tracked(*looks: tuple[float, Boxes | None]) -> Tracks:
+    """One drone's tracks after looks at some times; None is a look that finds nothing."""
+    tracks, next_id = Tracks.empty(), np.zeros(1, np.int64)
+    for t_s, seen in looks:
+        boxes = Boxes.empty() if seen is None else seen
+        tracks, next_id, _ = step(tracks, boxes, np.zeros(len(boxes), np.int64), np.array([t_s]), next_id)
+    return tracks
 
 
-def test_of_more_than_twelve_tracks_the_surest_are_sent_the_surest_first() -> None:
-    tracker = One()
-    row = [(10.0 * k, 0.0) for k in range(16)]
-    for t_s in (0.0, 0.5, 1.0):
-        tracker.look(t_s, boxes(*row))
-    score = np.linspace(0.3, 0.9, 16)[np.arange(16) * 5 % 16]
-    sent = content(replace(tracker.tracks, score=score), None, (0.0, 0.0), 1.0)
-    assert sent.score == pytest.approx(np.sort(score)[:3:-1], abs=0.003)
+def test_size_and_score_are_means_at_first_and_then_follow_the_newest_box_by_a_fifth() -> None:
+    """A size is the mean of the boxes, a score that of the looks, in which a look without a box is 0."""
+    looks: list[tuple[float, Boxes | None]] = []
+    for seen, size, score, confirmed in (
+        (box(size=(4.0, 2.0), score=0.9), (4.0, 2.0), 0.9, False),
+        (box(size=(5.0, 1.6), score=0.6), (4.5, 1.8), 0.75, False),
+        (None, (4.5, 1.8), 0.5, False),
+        (box(size=(4.5, 2.4), score=0.8), (4.5, 2.0), 0.575, True),
+        (box(size=(4.1, 2.0), score=0.4), (4.4, 2.0), 0.54, True),
+        (box(size=(4.9, 2.5), score=0.9), (4.5, 2.1), 0.612, True),
+        (box(size=(5.5, 2.1), score=0.612), (4.7, 2.1), 0.612, True),
+        (None, (4.7, 2.1), 0.4896, True),
+    ):
+        looks.append((0.5 * len(looks), seen))
+        tracks = tracked(*looks)
+        np.testing.assert_allclose(tracks.size_m, [size])
+        assert tracks.score == pytest.approx([score])
+        assert tracks.confirmed.tolist() == [confirmed]
+        boxes = [t_s for t_s, b in looks if b is not None]
+        assert (tracks.hits.tolist(), tracks.looks.tolist()) == ([len(boxes)], [len(looks)])
+        assert (tracks.t_s.tolist(), tracks.seen_s.tolist()) == ([looks[-1][0]], [boxes[-1]])
 
 
-def test_received_tracks_go_on_and_what_stands_stays() -> None:
-    tracks = driving()
-    velocity, variance = motion_of(tracks, 1.0)
-    np.testing.assert_allclose(velocity, [[8.0, 0.0], [0.0, 0.0]], atol=0.1)
-    assert variance[0] > 1.5 * variance[1]
-    assert variance[1] == SIGMA0_M**2
-    assert (tracks.moves == (np.hypot(*tracks.velocity_mps.T) > MOVES_AT * np.sqrt(tracks.covariance[:, 2]))).all()
+@pytest.mark.parametrize(
+    ("score", "missed", "lives"), [(0.3, 2, True), (0.3, 3, False), (0.9, 3, True), (0.9, 9, False)]
+)
+def test_a_track_is_lost_once_its_score_is_too_low(score: float, missed: int, lives: bool) -> None:
+    """Long before it has coasted for two seconds: 0.3 becomes 0.225, 0.18, 0.144."""
+    looks = [(0.1 * k, box(score=score)) for k in range(3)]
+    assert len(tracked(*looks, *[(0.1 * (3 + k), None) for k in range(missed)])) == lives
 
 
-@pytest.mark.parametrize("coasts_s", [0.0, 0.4, 1.2])
-@pytest.mark.parametrize("age_s", [0.0, 0.3, 0.8])
-def test_a_received_track_is_as_certain_as_the_time_since_its_last_box_leaves_it(coasts_s: float, age_s: float) -> None:
-    """Coasting at its sender and travelling count alike; and so after its bytes were written and read."""
-    n, at = 2, np.full(2, 5.0)
-    velocity = np.array([[9.0, -4.0], [0.01, 0.0]])  # one drives, one stands
-    sent = Tracks(
-        np.zeros(n, np.int64), np.arange(n), at, np.array([[3.0, 4.0], [-8.0, 1.0]]), velocity,
-        np.tile([0.16, 0.0, 0.25], (n, 1)), np.tile([4.5, 1.9], (n, 1)), np.zeros(n), np.full(n, 0.8), np.full(n, 5),
-        np.full(n, 5), at - coasts_s, np.ones(n, bool),
-    )  # fmt: skip
-    late_s = coasts_s + age_s
-    for tracks in (sent, unpacked(packed(sent, (0.0, 0.0)), 0, (0.0, 0.0), 5.0)):
-        moved, variance = motion_of(tracks, age_s)
-        assert moved == pytest.approx(np.array([[9.0, -4.0], [0.0, 0.0]]), abs=0.01)
-        drives_m2 = SIGMA0_M**2 + 0.25 * late_s**2 + ACCELERATION_DENSITY * late_s**3 / 3
-        assert variance == pytest.approx([drives_m2, SIGMA0_M**2], rel=0.03)
+def test_a_second_false_positive_ends_a_track_that_nobody_confirmed() -> None:
+    """Of the first four looks at most one may find nothing."""
+    assert len(tracked((0.0, box()), (0.1, None))) == 1
+    assert len(tracked((0.0, box()), (0.1, None), (0.2, None))) == 0
+    assert tracked((0.0, box()), (0.1, None), (0.2, box()), (0.3, box())).confirmed.tolist() == [True]
+    assert len(tracked((0.0, box()), (0.1, None), (0.2, box()), (0.3, None))) == 0
 
 
-def test_late_boxes_take_the_velocity_of_the_receivers_own_track_where_it_was_then() -> None:
-    """The car was at 20 m a second before its track's state of 28 m; a box near no track has none."""
-    tracks = driving()
-    late = boxes((20.3, 0.1), (0.0, 20.2), (-60.0, 0.0))
-    velocity, variance = motion_of_boxes(late, 2.5, 1.0, tracks)
-    np.testing.assert_allclose(velocity[:2], [[8.0, 0.0], [0.0, 0.0]], atol=0.1)
-    assert np.isnan(velocity[2]).all()
-    assert np.isnan(variance[2])
-    assert variance[0] > variance[1]
+def look(before: Tracks, seen: Boxes, owner: list[int], looks_s: list[float], next_id: list[int]) -> Any:
+    return step(before, seen, np.array(owner, np.int64), np.array(looks_s), np.array(next_id, np.int64))
 
 
-def test_a_target_is_followed_while_a_confirmed_track_agrees_with_its_cue() -> None:
-    tracks = driving()
-    now_s = 3.5
-    cue = (28.0, 0.0, 8.0, 0.0)
-    assert followed(tracks, {7: cue}, {}, now_s) == {7: 0}
-    assert followed(tracks, {7: (28.0, 12.0, 8.0, 0.0)}, {}, now_s) == {}  # the cue is elsewhere
-    assert followed(tracks, {7: (0.0, 20.0, 8.0, 0.0)}, {}, now_s) == {}  # a parked car that the target passes
-    tentative = driving(looks=2)
-    assert followed(tentative, {7: (4.0, 0.0, 8.0, 0.0)}, {}, 0.5) == {}
-    # in a bend the place still agrees, so that the track stays the target's; another target does not get it
-    bend = (29.0, 1.0, 0.0, 8.0)
-    assert followed(tracks, {7: bend}, {}, now_s) == {}
-    assert followed(tracks, {3: cue, 7: bend}, {7: 0}, now_s) == {7: 0}
-    assert predicted(tracks, 5.5).t_s.tolist() == [5.5, 5.5]
-    assert followed(Tracks.empty(), {7: cue}, {7: 0}, now_s) == {}
+def test_the_first_box_of_a_class_begins_with_the_uncertainty_of_that_class() -> None:
+    for kind in (CAR, TRUCK, PERSON):
+        begun, _, _ = look(Tracks.empty(), boxes((3.0, 4.0), kind=kind), [0], [1.0], [0])
+        np.testing.assert_array_equal(begun.covariance, [[PLACE_VARIANCE_M2[kind], 0.0, FIRST_SPEED_VARIANCE[kind]]])
+    assert PLACE_VARIANCE_M2[PERSON] != PLACE_VARIANCE_M2[CAR]
 
 
-def test_pairs_of_many_tracks_are_those_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(0)
-    xy, places = rng.uniform(0, 60, (80, 2)), rng.uniform(0, 60, (90, 2))
-    owner, whose = rng.integers(0, 3, 80), rng.integers(0, 3, 90)
-    few = association.gated(xy, np.full(80, 2.0), owner, places, whose, association.GATE)
-    monkeypatch.setattr(association, "FEW", 0)
-    many = association.gated(xy, np.full(80, 2.0), owner, places, whose, association.GATE)
-    assert len(few[0]) > 20
-    assert sorted(zip(*(v.tolist() for v in few), strict=True)) == sorted(zip(*(v.tolist() for v in many), strict=True))
+@pytest.mark.parametrize("kind", [CAR, TRUCK, PERSON])
+def test_a_box_counts_and_is_gated_by_the_variance_of_its_class(kind: int) -> None:
+    own = tracks(kind=np.array([kind], np.int8), velocity_mps=np.zeros((1, 2)))
+    total = 0.3 + PLACE_VARIANCE_M2[kind]
+    for square, same in ((0.98 * GATE, True), (1.02 * GATE, False)):
+        off_m = float(np.sqrt(square * total))
+        after, _, of_box = look(own, boxes((off_m, 0.0), kind=kind), [0], [10.0], [1])
+        assert of_box.tolist() == [0 if same else 1]
+        if same:
+            assert after.xy_m[0, 0] == pytest.approx(0.3 / total * off_m)
+            assert after.covariance[0, 0] == pytest.approx(0.3 * PLACE_VARIANCE_M2[kind] / total)
+
+
+def test_a_box_is_never_of_another_drones_track_nor_of_another_class() -> None:
+    """All in one place: only owner and class tell the three tracks and the boxes apart."""
+    walk = dict(kind=np.array([PERSON, PERSON], np.int8), velocity_mps=np.zeros((2, 2)))
+    own = tracks(2, owner=np.array([0, 1]), id=np.array([0, 0]), **walk)
+    for drone in (0, 1):
+        for kind in (CAR, TRUCK, PERSON):
+            _, _, of_box = look(own, boxes((0.0, 0.0), kind=kind), [drone], [10.0, 10.0], [5, 6])
+            assert of_box.tolist() == [0 if kind == PERSON else 5 + drone]
+
+
+def test_every_drone_counts_its_own_tracks() -> None:
+    """Numbers ascend in the order of a drone's boxes, whoever else has boxes between; a weak box takes no number."""
+    seen = Boxes.join([boxes((0.0, 0.0), (50.0, 0.0), (90.0, 0.0)), boxes((0.0, 70.0), score=0.2), boxes((0.0, 30.0))])
+    begun, after, of_box = look(Tracks.empty(), seen, [1, 0, 1, 0, 0], [1.0, 1.0, np.nan], [4, 8, 2])
+    assert of_box.tolist() == [8, 4, 9, -1, 5]
+    assert after.tolist() == [6, 10, 2]
+    assert begun.owner.tolist() == [1, 0, 1, 0]

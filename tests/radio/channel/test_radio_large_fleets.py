@@ -18,7 +18,6 @@ from sortie.radio import Air
 from sortie.radio.channel.bursts import PairStates
 from sortie.radio.channel.draws import StreamShadowing
 from sortie.radio.channel.earshot import both_ways, near_pairs
-from sortie.radio.channel.large_fleet import EPOCH
 from sortie.radio.channel.shadowing import ShadowField
 from sortie.radio.channel.snr import OUT_OF_RANGE_DB, SQUARE, Channel, earshot_m
 from sortie.radio.settings import AirSettings, BurstSettings
@@ -136,17 +135,6 @@ def test_a_large_fleet_works_out_just_the_links_within_earshot() -> None:
         assert listed.sum() < 1.3 * near.sum()
         assert 0.02 < near.mean() < 0.5
         np.testing.assert_allclose(channel.shadow_db, channel.shadow_db.T, equal_nan=True)
-
-
-def test_links_of_a_large_fleet_do_not_depend_on_how_many_more_there_are() -> None:
-    few, many = (Channel(NEAR, _wide_fleet(n), 5, 1, 0.1) for n in (90, 130))
-    small = Channel(NEAR, _wide_fleet(SQUARE), 5, 1, 0.1)
-    for _ in range(2 * EPOCH + 3):
-        for channel in (few, many, small):
-            channel.advance()
-        np.testing.assert_array_equal(few.snr_db, many.snr_db[:90, :90])
-        both = few.snr_db[:SQUARE, :SQUARE] > OUT_OF_RANGE_DB
-        np.testing.assert_allclose(few.snr_db[:SQUARE, :SQUARE][both], small.snr_db[both], atol=1e-4)
 
 
 def test_nothing_out_of_earshot_is_heard() -> None:

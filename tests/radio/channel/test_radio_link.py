@@ -56,11 +56,7 @@ def test_every_frame_is_the_link_budget_of_that_frame(antenna: Any, path_loss: A
     n, frames = 4, 40
     own = {1: "isotropic"} if antenna == "dipole" else {2: "dipole"}
     config = AirSettings(
-        shadowing_sigma_db=0.0,
-        antenna=antenna,
-        own_antennas=own,
-        path_loss=path_loss,
-        ground_roughness_m=0.0,
+        shadowing_sigma_db=0.0, antenna=antenna, own_antennas=own, path_loss=path_loss, ground_roughness_m=0.0
     )
     at, up = moving(frames, n), tilting(frames, n)
     channel = Channel(config, at, 1, 0, 0.1, up)
@@ -162,16 +158,6 @@ def test_a_sixth_drone_leaves_the_links_of_the_first_five_as_they_were() -> None
     off = ~np.eye(5, dtype=bool)
     np.testing.assert_array_equal(fades[:, off], fades_db(AirSettings(), 6, 50, seed=9)[:, :5, :5][:, off])
     assert (fades != fades_db(AirSettings(), 5, 50, seed=10))[:, off].mean() > 0.99
-
-
-def test_what_interferes_in_one_frame_leaves_the_others_as_they_were() -> None:
-    clear, disturbed = (Channel(AirSettings(), still(CROSS_M), 4, 0, 0.1) for _ in range(2))
-    for frame in range(30):
-        expected = step(clear)
-        if frame % 3 == 1:
-            assert np.nanmax(step(disturbed, np.full((6, 6), 10.0)) - expected) == pytest.approx(-10.0)
-        else:
-            np.testing.assert_array_equal(step(disturbed), expected)
 
 
 def test_a_flight_of_many_blocks_is_one_flight() -> None:

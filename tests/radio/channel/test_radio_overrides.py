@@ -157,21 +157,6 @@ def test_good_pairs_that_lose_are_bursts_too(bursts: dict[str, float], wanted: b
 # --- flown ---------------------------------------------------------------------------------------------
 
 
-def test_a_traced_snr_replaces_the_models_and_events_act_on_it(tmp_path: Path) -> None:
-    flight = Hover(AirSettings(trace=trace(tmp_path, "0,0,1,12,,", "10,0,1,22,,")), n=3)
-    seen = []
-
-    def tick(frame: int) -> None:
-        flight.extra = np.full((3, 3), 5.0) if frame == 49 else None  # felt in frame 50
-        seen.append(flight.air.snr_db.copy())
-
-    flight.fly(10.0, tick)
-    assert [s[0, 1] for s in seen[::25]] == pytest.approx([12.0, 14.5, 17.0 - 5.0, 19.5])
-    plain = Hover(AirSettings(), n=3)
-    plain.fly(10.0, lambda frame: None)
-    assert seen[-1][1, 0] == plain.air.snr_db[1, 0]  # nobody traced the way back
-
-
 def test_a_traced_goodput_is_what_a_link_carries(tmp_path: Path) -> None:
     flight = Hover(AirSettings(trace=trace(tmp_path, "0,0,1,,,24")))
     flight.fly(10.0, lambda frame: flight.send(0, 1, 150_000, kind=f"{frame}"))

@@ -1,4 +1,4 @@
-"""The fine network: exchanged cells spread over four, corrected for how they lie, fused and found in the head's cells."""
+"""Codes of cells: a codebook by brute force and its file; and the fine network's cells, spread, corrected and fused."""
 
 from __future__ import annotations
 
@@ -13,21 +13,125 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from perception_examples import cross
+from perception_examples import cross, same
+from safetensors.torch import save_file
 from torch import Tensor
 
+from sortie.perception.errors import InputError
+from sortie.perception.files import codebook_digest
 from sortie.perception.network import warp
-from sortie.perception.network.checkpoint import save_weights
+from sortie.perception.network.checkpoint import load_weights, save_weights
+from sortie.perception.network.codebook import ENTRIES, Codebook, encoder_digest, load_codebook, save_codebook
 from sortie.perception.network.decode import decode
-from sortie.perception.network.detector import TorchDetector
+from sortie.perception.network.detector import SHIPPED_WEIGHTS, TorchDetector
 from sortie.perception.network.fusion.base import takes_part
 from sortie.perception.network.model import Align, CarNet, ModelConfig
 from sortie.perception.network.warp import arriving, moved, support
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Share
 from sortie.scenarios.schema import Perception, Scene, Target
+from sortie.scenarios.shipped import CODEBOOK, beside
 
 pytestmark = pytest.mark.slow
+
+
+def drawn(stages: int = 3, seed: int = 0) -> Codebook:
+    made = torch.from_numpy(np.random.default_rng(seed).normal(size=(stages, ENTRIES, 80))).float()
+    made = made * torch.tensor([1.0, 0.5, 0.25, 0.1])[:stages, None, None]
+    return Codebook(made.half().float(), "of none")  # as a file has them
+
+
+def test_each_byte_names_the_entry_nearest_to_what_is_left() -> None:
+    codebook, cells = drawn(), torch.from_numpy(np.random.default_rng(1).normal(size=(40, 80))).float().relu()
+    codes = codebook.encode(cells, 3)
+    assert codes.shape == (40, 3)
+    assert codes.dtype == torch.uint8
+    for cell, code in zip(cells.double(), codes.tolist(), strict=True):
+        left = cell.clone()
+        for entries, found in zip(codebook.stages.double(), code, strict=True):
+            far = ((left - entries) ** 2).sum(dim=1)
+            assert far[found] <= far.min() + 1e-5
+            left = left - entries[found]
+    torch.testing.assert_close(codebook.encode(cells, 2), codes[:, :2])  # the beginning of a longer one
+    read = [codebook.decode(codebook.encode(cells, k)) for k in (1, 2, 3)]
+    lost = [float(((cells - r) ** 2).sum()) for r in read]
+    assert lost[0] > lost[1] > lost[2] > 0.0
+    summed = torch.stack([s[c.long()] for s, c in zip(codebook.stages, codes.T, strict=True)]).sum(dim=0)
+    torch.testing.assert_close(read[2], summed.clamp_min(0.0).half().float())
+
+
+def test_a_map_is_read_where_it_was_sent_and_features_stay_0_or_above() -> None:
+    codebook = drawn()
+    features = torch.from_numpy(np.random.default_rng(4).normal(size=(80, 4, 4))).float().relu()
+    whole = codebook.read(features, 2)
+    assert float(whole.min()) == 0.0
+    assert torch.equal(whole, whole.half().float())
+    sent = torch.zeros(4, 4, dtype=torch.bool)
+    sent[1, 2] = sent[3, 0] = True
+    part = codebook.read(features, 2, sent)
+    assert torch.equal(part[:, sent], whole[:, sent])
+    assert not part[:, ~sent].any()
+    assert torch.equal(whole[:, 1, 2], codebook.decode(codebook.encode(features[:, 1, 2][None], 2))[0])
+    with pytest.raises(ValueError, match="length is 4, must be 1 to 3"):
+        codebook.encode(features.flatten(1).T, 4)
+
+
+def test_the_file_is_read_as_it_was_written_and_belongs_to_its_network(tmp_path: Path) -> None:
+    net = load_weights(SHIPPED_WEIGHTS)
+    path = beside(tmp_path / "net.safetensors", CODEBOOK)
+    made = drawn()
+    codebook = Codebook(made.stages, encoder_digest(net))
+    save_codebook(codebook, path, {})
+    read = load_codebook(path, net)
+    torch.testing.assert_close(read.stages, codebook.stages)
+    assert (read.encoder, read.longest) == (codebook.encoder, 3)
+    other = CarNet(ModelConfig()).eval()
+    with pytest.raises(InputError, match="fitted to another encoder than the weights'"):
+        load_codebook(path, other)
+    save_file({"stages": torch.zeros(2, 5, 80)}, path, metadata={"codebook": '{"encoder": ""}'})
+    with pytest.raises(InputError, match=r"stages have shape \[2, 5, 80\], must be \[1 to 20, 256, 80\]"):
+        load_codebook(path, net)
+    save_weights(other, path)
+    with pytest.raises(InputError, match="not a codebook of this project"):
+        load_codebook(path, net)
+    with pytest.raises(InputError, match="no such codebook; `python -m research fit codebook` makes one"):
+        load_codebook(tmp_path / "none", net)
+
+
+def test_the_shipped_codebook_has_every_length_and_longer_codes_come_nearer_to_features() -> None:
+    net = load_weights(SHIPPED_WEIGHTS)
+    book = load_codebook(beside(SHIPPED_WEIGHTS, CODEBOOK), net)
+    assert (book.longest, len(codebook_digest(beside(SHIPPED_WEIGHTS, CODEBOOK)))) == (20, 14)
+    ego = cross(10.0, 20.0, 0.3)[0]
+    features = TorchDetector(town(), Perception(), 1)._encode([ego])[ego].features.result()
+    lost = [float(((features - book.read(features, k)) ** 2).mean() / features.var()) for k in (1, 5, 20)]
+    assert 0.6 > lost[0] > lost[1] > lost[2] > 0.0
+    assert lost[2] < 0.1
+
+
+def town() -> SceneModel:
+    return SceneModel(Scene(), None, (-50, -50, 50, 50))
+
+
+def test_late_fusion_detects_in_what_is_read() -> None:
+    ego, peer = cross(10.0, 20.0, 0.3)[:2]
+    detector = TorchDetector(town(), Perception(fusion="late", code_bytes=2), 1)
+    jobs = [(ego, [Share(peer, what, 1.0, None, 1.0)]) for what in ("codes", "features")]
+    assert not same(*detector.detect(jobs))
+
+
+def test_a_codebook_that_is_missing_too_short_or_another_networks_is_one_error(tmp_path: Path) -> None:
+    ego, peer = cross(10.0, 20.0, 0.3)[:2]
+    short = tmp_path / "short.safetensors"
+    save_codebook(Codebook(drawn().stages, encoder_digest(load_weights(SHIPPED_WEIGHTS))), short, {})
+    for name, message in (
+        (str(tmp_path / "none.safetensors"), r"none\.safetensors: no such codebook"),
+        (str(short), r"perception.code_bytes is 10, must be at most 3, the stages of .*short"),
+        ("disconet.codebook.safetensors", r"disconet\.codebook\.safetensors: fitted to another encoder"),
+    ):
+        with pytest.raises(InputError, match=message):
+            TorchDetector(town(), Perception(codebook=name), 1).detect([(ego, [Share(peer, "codes", 0.05, None, 1.0)])])
+
 
 FINE = ModelConfig(grid="fine")
 
@@ -152,10 +256,3 @@ def test_a_score_is_the_mean_of_heat_and_fit() -> None:
     (box,) = decode(out, 0.1)
     assert float(box[5]) == pytest.approx(math.sqrt(0.9 * 0.4))
     assert float(decode(out[:7], 0.1)[0, 5]) == pytest.approx(0.9)
-
-
-def test_a_fusion_for_maps_of_eighty_channels_is_refused() -> None:
-    with pytest.raises(
-        ValueError, match="fusion is 'v2vnet' of a fine network, must be one of disconet, fcooper, none, late"
-    ):
-        CarNet(ModelConfig(grid="fine", fusion="v2vnet"))
