@@ -89,9 +89,13 @@ def test_the_egos_answer_counts_twice_where_maps_are_in_it_and_a_peers_by_its_we
 
 
 def test_headings_are_averaged_as_axes_and_point_where_the_best_box_does() -> None:
-    out = joined(HERE, boxes_at((0, 0, 0.6, np.pi - 0.1)), False, [source((0, 0, 0.3, 0.05))], "average")
-    twice = (0.6 * np.exp(-0.2j) + 0.3 * np.exp(0.1j)) / 0.9
-    assert out.yaw_rad[0] == pytest.approx(np.pi + np.angle(twice) / 2, abs=1e-6)
+    for best, other in ((np.pi - 0.1, 0.05), (2.0, 2.1 - np.pi), (-1.2, -1.0)):
+        own, peer = boxes_at((0, 0, 0.6, best)), source((0, 0, 0.3, other))
+        (yaw,) = joined(HERE, own, False, [peer], "average").yaw_rad
+        twice = (0.6 * np.exp(2j * best) + 0.3 * np.exp(2j * other)) / 0.9
+        wanted = np.exp(0.5j * np.angle(twice))
+        wanted *= np.sign((wanted * np.exp(-1j * best)).real)
+        assert abs(np.exp(1j * yaw) - wanted) < 1e-6, (best, other)
 
 
 def test_who_could_not_see_a_place_or_left_weak_boxes_out_does_not_vote_it_down() -> None:

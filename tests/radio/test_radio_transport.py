@@ -1,4 +1,4 @@
-"""Samples and pieces on a lossy link, what their rows say; the clock that may skip an event; settings as plain values."""
+"""Samples and pieces on a lossy link, and what their rows say; the clock that may skip an event; settings as values."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def boxes(*xy: tuple[float, float], kind: int = CAR, score: float = 0.8) -> Boxe
 
 
 def test_a_target_is_taken_up_by_place_and_velocity_together() -> None:
-    """By the inverse of the whole covariance, the cue's included: ahead and faster agrees better than ahead and slower."""
+    """By the inverse of the whole covariance, with the cue's: ahead and faster agrees better than ahead and slower."""
     own = tracks()
     spread = np.array([[0.3 + 1.0, 0.2], [0.2, 1.0 + 1.0]])
     for direction in (np.array([1.0, 1.0]), np.array([1.0, -1.0]), np.array([1.0, 0.0]), np.array([0.0, 1.0])):
