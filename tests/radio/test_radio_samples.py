@@ -137,6 +137,8 @@ def test_what_a_link_is_used_at_follows_what_stands_beside_the_models() -> None:
     assert use(50.0, None, gone=True).unreachable == "receiver_gone"
     assert use(50.0, LinkNow(0.1, nan, nan)).link.burst_loss == 0.1
     assert math.isnan(use(50.0, None).link.loss)
+    lossless = service.link_mbps(np.array([[-50.0]]), np.array([[0.0]]))
+    assert 25.0 < float(lossless[0, 0]) < STANDARDS["ax"].rates_mbps[80][0], "payload at the lowest rate"
 
 
 def test_a_measurement_begins_anew_with_another_rate_alone() -> None:
