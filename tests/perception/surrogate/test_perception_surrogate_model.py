@@ -29,6 +29,7 @@ from sortie.perception.surrogate.model import (
     Net,
     Parameters,
     load,
+    rank_covariates,
     save,
 )
 from sortie.scenarios.schema import Scene
@@ -130,6 +131,14 @@ def test_sums_of_the_shipped_nets_stay_where_they_are_exact(parameters: Paramete
             reach = reach + np.abs(bias)
 
     assert wrong_rows(sorted(NETS), check) == {}
+
+
+def test_cells_rank_by_five_of_a_look_s_covariates_its_confidence_and_how_many_cars_there_are() -> None:
+    look, confidence = RNG.normal(size=(4, len(LOOK_COVARIATES))).astype(np.float32), np.arange(4, dtype=np.float32)
+    columns = {name: look[:, k] for k, name in enumerate(LOOK_COVARIATES)}
+    columns |= {"confidence": confidence, "cars": np.log([1, 4, 36, 101]) - 3.6}  # usually 35.6 and the one itself
+    x = rank_covariates(look, confidence, np.array([0, 3, 35, 100]))
+    np.testing.assert_allclose(x, np.stack([columns[name] for name in RANK_COVARIATES], axis=1), atol=1e-6)
 
 
 def test_higher_draws_and_surer_drones_rank_higher(parameters: Parameters) -> None:
