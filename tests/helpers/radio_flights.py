@@ -17,9 +17,15 @@ class Hover:
     """Drones that stand still; `tick` is called in every frame after the links have moved on."""
 
     def __init__(
-        self, config: AirSettings, positions_m: np.ndarray | None = None, *, n: int = 2, seed: int = 1, spread: float = 0.8,
+        self,
+        config: AirSettings,
+        positions_m: np.ndarray | None = None,
+        *,
+        n: int = 2,
+        seed: int = 1,
+        spread: float = 0.8,
         replication: int = 0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         at = CROSS_M[:n] if positions_m is None else positions_m
         self.n = len(at)
         self.env = simpy.Environment()
