@@ -1,4 +1,4 @@
-"""Coverage: what cameras show, what the scene hides, and what is new to the fleet."""
+"""Coverage: what cameras show, what the scene hides, where a drone believes it is, and what is new to the fleet."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from agent_rig import descriptor
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -19,21 +20,23 @@ from sortie.fleet.coverage import (
     View,
     attitude,
     camera_states,
+    footprint_radius_m,
     pack_grid,
     placed,
     unpack_grid,
     views,
 )
-from sortie.perception.geometry import FOCAL_PX, FULL, HALF_H, HALF_V, USUAL, Cameras
+from sortie.perception.geometry import FOCAL_PX, FULL, USUAL, Cameras
 from sortie.perception.scene import height_field, sight_loops
 from sortie.perception.scene.height_field import CAR_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.types import Capture
 from sortie.policies.catalogue.coverage_cells import Cells, seen_well, well_cells
-from sortie.policies.contract import COVERAGE_CELLS, Coverage, Descriptor, TaskPhase
+from sortie.policies.contract import COVERAGE_CELLS, Coverage, Descriptor
 from sortie.scenarios.schema import Scene
 
 BOUNDS = (-100.0, -100.0, 100.0, 100.0)
+
+
 PLAIN = SceneModel(Scene(building_density=0.0, tree_density=0.0), None, BOUNDS)
 DENSE = SceneModel(Scene(style="old_town", building_density=1.0, building_height_m=18.0), None, BOUNDS)
 RNG = np.random.default_rng(21)
@@ -52,43 +55,45 @@ def seen(scene: SceneModel, position_m: object, tilt_deg: float = 0.0) -> np.nda
     return unpack_grid(view.grid)
 
 
-def test_houses_hide_ground() -> None:
-    """The old grids were a disc, whatever stood below."""
-    free, hidden = seen(PLAIN, (5.0, 3.0, 60.0)), seen(DENSE, (5.0, 3.0, 60.0))
-    assert (hidden <= free).all()
-    assert (hidden > 0).sum() < 0.6 * (free > 0).sum()
+# --- what cameras show ------------------------------------------------------------------------------------
 
 
-def test_a_tilted_camera_looks_elsewhere() -> None:
-    level, tilted = seen(PLAIN, (5.0, 3.0, 60.0)), seen(PLAIN, (5.0, 3.0, 60.0), 28.0)
-    assert (level > 0).sum() == pytest.approx(math.pi * RANGE_M**2 / CELL_M**2, rel=0.05), (
-        "level, nearly all in range is in a picture"
-    )
-    ahead, behind = tilted[:, 8:] > 0, tilted[:, :8] > 0
-    assert ahead.sum() < 0.7 * behind.sum(), "nose down, the cameras that look ahead see the ground below"
-
-
-@pytest.mark.parametrize("cameras", [USUAL, Cameras(50.0), Cameras(pitch_deg=30.0), Cameras(60.0, 60.0, 320)])
-def test_cells_are_as_five_pinholes_show_them(cameras: Cameras) -> None:
-    at = RNG.uniform((-6.0, -6.0, 20.0), (6.0, 6.0, 60.0), (50, 3))
-    turn = Rotation.from_euler("zyx", RNG.uniform(-1.0, 1.0, (50, 3)) * (180.0, 20.0, 20.0), degrees=True)
-    middle = (np.arange(16) - 7.5) * CELL_M
-    off = np.stack(np.broadcast_arrays(middle, middle[:, None], 0.0), axis=-1) - at[:, None, None]
-    body = off @ turn.as_matrix()[:, None]
+def depth_in_cameras(body: np.ndarray, cameras: Cameras) -> np.ndarray:
+    """How far along the axis of a camera a point [..., 3] of the body's frame lies: the nearest of five pinholes."""
     pitch, half = np.radians(cameras.pitch_deg), np.tan(np.radians(cameras.field_of_view_deg / 2))
     axes = [(np.cos(a) * np.cos(pitch), np.sin(a) * np.cos(pitch), -np.sin(pitch)) for a in np.arange(4) * np.pi / 2]
+    sides = [(0, 1, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0), (0, 1, 0)]
     depth = np.full(body.shape[:-1], np.inf)
-    for ahead, side in zip([*axes, (0, 0, -1)], [(0, 1, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0), (0, 1, 0)], strict=True):
+    for ahead, side in zip([*axes, (0, 0, -1)], sides, strict=True):
         away, right, up = body @ ahead, body @ side, body @ np.cross(ahead, side)
         shown = (away > 0.1) & (np.abs(right) < half * away) & (np.abs(up) < half * 9 / 16 * away)
         depth = np.where(shown, np.minimum(depth, away), depth)
-    pixel_m2 = depth**3 / (cameras.width_px / 2 / half) ** 2 / at[:, 2, None, None]
-    near = np.hypot(off[..., 0], off[..., 1]) <= RANGE_M
-    expected = near * (np.isfinite(depth).astype(int) + (pixel_m2 <= FULL.image_m**2))
-    found = camera_states(*at.T, attitude(turn.as_quat()), cameras)
-    assert (found == expected).mean() > 0.995
-    assert 0.05 < (expected > 0).mean() < 0.95
-    assert (expected == Coverage.WELL).any()
+    return depth
+
+
+def test_cells_are_as_five_pinholes_show_them() -> None:
+    for cameras in (USUAL, Cameras(50.0), Cameras(pitch_deg=30.0), Cameras(60.0, 60.0, 320)):
+        at = RNG.uniform((-6.0, -6.0, 20.0), (6.0, 6.0, 60.0), (50, 3))
+        turn = Rotation.from_euler("zyx", RNG.uniform(-1.0, 1.0, (50, 3)) * (180.0, 20.0, 20.0), degrees=True)
+        middle = (np.arange(16) - 7.5) * CELL_M
+        off = np.stack(np.broadcast_arrays(middle, middle[:, None], 0.0), axis=-1) - at[:, None, None]
+        depth = depth_in_cameras(off @ turn.as_matrix()[:, None], cameras)
+        focal_px = cameras.width_px / 2 / np.tan(np.radians(cameras.field_of_view_deg / 2))
+        pixel_m2 = depth**3 / focal_px**2 / at[:, 2, None, None]
+        near = np.hypot(off[..., 0], off[..., 1]) <= RANGE_M
+        expected = near * (np.isfinite(depth).astype(int) + (pixel_m2 <= FULL.image_m**2))
+        found = camera_states(*at.T, attitude(turn.as_quat()), cameras)
+        assert (found == expected).mean() > 0.995, cameras
+        assert 0.05 < (expected > 0).mean() < 0.95
+        assert (expected == Coverage.WELL).any()
+
+
+def test_a_tilted_camera_looks_elsewhere() -> None:
+    """Level, nearly all in range is in a picture. Nose down, the cameras that look ahead see the ground below."""
+    level, tilted = seen(PLAIN, (5.0, 3.0, 60.0)), seen(PLAIN, (5.0, 3.0, 60.0), 28.0)
+    assert (level > 0).sum() == pytest.approx(math.pi * RANGE_M**2 / CELL_M**2, rel=0.05)
+    ahead, behind = tilted[:, 8:] > 0, tilted[:, :8] > 0
+    assert ahead.sum() < 0.7 * behind.sum()
 
 
 def test_pixels_on_the_ground_decide_how_well() -> None:
@@ -99,20 +104,26 @@ def test_pixels_on_the_ground_decide_how_well() -> None:
     assert (seen(PLAIN, (5.0, 3.0, 1.2 * finest_m)) == Coverage.POOR).any()
 
 
-def in_a_camera(capture: Capture, point: np.ndarray) -> bool:
-    """Whether one of the drone's five pinholes, four around it and one downwards, shows a point."""
-    body = Rotation.from_quat(capture.orientation_xyzw).inv().apply(point - np.array(capture.position_m))
-    pitch, shown = math.radians(USUAL.pitch_deg), False
-    for turn in (*np.arange(4) * np.pi / 2, None):
-        ahead = (
-            np.array([0, 0, -1.0])
-            if turn is None
-            else np.array([math.cos(turn) * math.cos(pitch), math.sin(turn) * math.cos(pitch), -math.sin(pitch)])
-        )
-        side = np.array([0, 1.0, 0]) if turn is None else np.array([-math.sin(turn), math.cos(turn), 0])
-        away, right, up = body @ ahead, body @ side, body @ np.cross(ahead, side)
-        shown |= bool(away > 0 and abs(right) < HALF_H * away and abs(up) < HALF_V * away)
-    return shown
+def test_footprint_of_the_paper() -> None:
+    assert footprint_radius_m(60.0) == pytest.approx(42.0, abs=0.02)
+    assert footprint_radius_m(-1.0) == 0.0
+
+
+@given(st.lists(st.integers(0, 3), min_size=256, max_size=256))
+def test_grid_packs_into_64_bytes_and_back(states: list[int]) -> None:
+    grid = np.array(states, np.uint8).reshape(16, 16)
+    packed = pack_grid(grid)
+    assert len(packed) == 64
+    assert np.array_equal(unpack_grid(packed), grid)
+
+
+# --- what the scene hides ---------------------------------------------------------------------------------
+
+
+def test_houses_hide_ground() -> None:
+    free, hidden = seen(PLAIN, (5.0, 3.0, 60.0)), seen(DENSE, (5.0, 3.0, 60.0))
+    assert (hidden <= free).all()
+    assert (hidden > 0).sum() < 0.6 * (free > 0).sum()
 
 
 def past_something(at: np.ndarray, eye: np.ndarray, houses: np.ndarray, trees: np.ndarray) -> np.ndarray:
@@ -131,6 +142,12 @@ def past_something(at: np.ndarray, eye: np.ndarray, houses: np.ndarray, trees: n
     return hit
 
 
+def quarters(corner: tuple[float, float], z_m: float) -> np.ndarray:
+    """[4, 3]: the middles of a cell's quarters at this height."""
+    east, north = corner
+    return np.array([(east + a * CELL_M, north + b * CELL_M, z_m) for a in (0.25, 0.75) for b in (0.25, 0.75)])
+
+
 def test_against_single_rays() -> None:
     """Each cell by points on lines: boxes and domes for the scene, pinholes for the cameras. No code is shared."""
     scene = SceneModel(Scene(), None, BOUNDS)
@@ -141,49 +158,68 @@ def test_against_single_rays() -> None:
         x, y, tilt = *RNG.uniform(-80, 80, 2), RNG.uniform(0, 20)
         eye = np.array([x, y, 60.0])
         where = poses(eye, tilt, heading_deg=30.0)
+        body = Rotation.from_quat(where.orientation_xyzw[0, 0]).inv()
         ((view,),) = views(where, scene.height_field)
-        capture = Capture(0, 0.0, tuple(eye), tuple(where.orientation_xyzw[0, 0]), tuple(eye), math.radians(30.0))
         expected = np.zeros((16, 16), bool)
-        for row in range(16):
-            for column in range(16):
-                east, north = (view.column + column) * CELL_M, (view.row + row) * CELL_M
-                middle = np.array([[east + CELL_M / 2, north + CELL_M / 2, 0.0]])
-                if np.hypot(*(middle[0, :2] - eye[:2])) > RANGE_M or not in_a_camera(capture, middle[0]):
-                    continue
-                at = np.array(
-                    [(east + a * CELL_M, north + b * CELL_M, CAR_TOP_M) for a in (0.25, 0.75) for b in (0.25, 0.75)]
-                )
-                px, py = at[:, :1], at[:, 1:2]
-                roofed = ((px > houses[:, 0]) & (px < houses[:, 2]) & (py > houses[:, 1]) & (py < houses[:, 3])).any(
-                    axis=1
-                )
-                free = ~roofed & ~past_something(at, eye, houses, trees)
-                expected[row, column] = (~roofed).any() and 2 * free.sum() >= (~roofed).sum()
+        for row, column in np.ndindex(16, 16):
+            corner = (view.column + column) * CELL_M, (view.row + row) * CELL_M
+            away = quarters(corner, 0.0).mean(axis=0) - eye
+            if np.hypot(*away[:2]) > RANGE_M or not np.isfinite(depth_in_cameras(body.apply(away), USUAL)):
+                continue
+            at = quarters(corner, CAR_TOP_M)
+            px, py = at[:, :1], at[:, 1:2]
+            within = (px > houses[:, 0]) & (px < houses[:, 2]) & (py > houses[:, 1]) & (py < houses[:, 3])
+            roofed = within.any(axis=1)
+            free = ~roofed & ~past_something(at, eye, houses, trees)
+            expected[row, column] = (~roofed).any() and 2 * free.sum() >= (~roofed).sum()
         agree += int(((unpack_grid(view.grid) > 0) == expected).sum())
         cells += 256
         assert 60 < expected.sum() < 230
     assert agree / cells > 0.96  # the field is a raster of 0.8 m
 
 
+# --- where a drone believes it is -------------------------------------------------------------------------
+
+
 def test_cells_are_those_of_the_believed_place_and_the_scene_is_that_of_the_true_one() -> None:
     true = poses(np.array([5.0, 3.0, 60.0]))
-    off = true._replace(est_position_m=true.est_position_m + np.array([2 * CELL_M, 0.0, 0.0]))
+    off = true._replace(est_position_m=true.est_position_m + np.array([2 * CELL_M, -CELL_M, 0.0]))
     ((view,),), ((shifted,),) = (views(p, DENSE.height_field) for p in (true, off))
-    assert shifted.grid == view.grid
-    assert (shifted.row, shifted.column) == (view.row, view.column + 2)
+    assert shifted == View(view.row - 1, view.column + 2, view.grid)
+    elsewhere = true._replace(position_m=true.position_m + np.array([3.0, -3.0, 0.0]))
+    on_a_plain = [views(p, PLAIN.height_field) for p in (true, elsewhere)]
+    assert on_a_plain[0] == on_a_plain[1], "where it truly is does not matter there"
 
 
-@pytest.mark.parametrize("off_deg", [90.0, -90.0, 180.0])
-def test_a_wrong_heading_turns_what_is_seen_of_the_scene_with_it(off_deg: float) -> None:
-    """In the middle of a cell, and by quarters: what lies north of a drone that believes itself a quarter to the left lies west."""
+def test_how_well_cells_are_seen_follows_from_the_true_height() -> None:
+    def grid(true_z: float, believed_z: float) -> bytes:
+        where = poses(np.array([3.0, 4.0, true_z]))
+        ((view,),) = views(where._replace(est_position_m=np.array([[[3.0, 4.0, believed_z]]])), PLAIN.height_field)
+        return view.grid
+
+    assert grid(30.0, 30.0) == grid(30.0, 90.0) != grid(90.0, 90.0)
+
+
+def test_a_wrong_heading_turns_what_is_seen_of_the_scene_with_it() -> None:
+    """In the middle of a cell, by quarters: what lies north of a drone that believes itself a quarter left lies west."""
     middle = CELL_M / 2
     true = poses(np.array([middle, middle, 60.0]))
-    wrong = true._replace(est_yaw_rad=true.yaw_rad + math.radians(off_deg))
-    ((view,),), ((turned,),) = (views(p, DENSE.height_field) for p in (true, wrong))
-    grid = unpack_grid(view.grid)[1:, 1:]  # 15 × 15 about the drone's own cell
-    expected = np.rot90(grid, -round(off_deg / 90))
-    assert (unpack_grid(turned.grid)[1:, 1:] == expected).mean() > 0.95
-    assert (grid == expected).mean() < 0.9
+    for off_deg in (90.0, -90.0, 180.0):
+        wrong = true._replace(est_yaw_rad=true.yaw_rad + math.radians(off_deg))
+        ((view,),), ((turned,),) = (views(p, DENSE.height_field) for p in (true, wrong))
+        grid = unpack_grid(view.grid)[1:, 1:]  # 15 × 15 about the drone's own cell
+        expected = np.rot90(grid, -round(off_deg / 90))
+        assert (unpack_grid(turned.grid)[1:, 1:] == expected).mean() > 0.95
+        assert (grid == expected).mean() < 0.9
+
+
+def test_a_drone_that_believes_to_fly_north_claims_what_one_that_flies_north_sees() -> None:
+    def view(true_deg: float, believed_deg: float) -> View:
+        where = poses(np.array([3.0, 4.0, 60.0]), heading_deg=true_deg)
+        ((seen,),) = views(where._replace(est_yaw_rad=np.array([[math.radians(believed_deg)]])), PLAIN.height_field)
+        return seen
+
+    assert view(0.0, 57.0) == view(57.0, 57.0) != view(0.0, 0.0)
 
 
 def test_frames_between_rays_keep_their_lines_of_sight() -> None:
@@ -204,13 +240,11 @@ def test_a_moved_grid_keeps_its_cells(north: int, east: int) -> None:
     assert kept == {c for c in well_cells(seen_grid, 3, -7) if 0 <= c[0] - row < 16 and 0 <= c[1] - column < 16}
 
 
-# --- what is new -----------------------------------------------------------------------------------
+# --- what is new ------------------------------------------------------------------------------------------
 
 
 def claim(grid: bytes, x_m: float, y_m: float) -> Descriptor:
-    return Descriptor(
-        0, 1, (x_m, y_m, 60.0), (0, 0, 0, 1), (0, 0, 0), 42.0, 0.9, 1, 1, (), grid, 0, TaskPhase.SEARCH, None
-    )  # fmt: skip
+    return descriptor(1, position_m=(x_m, y_m, 60.0), coverage_grid=grid)
 
 
 def moved(cells: Cells, columns: int) -> Cells:

@@ -1,10 +1,10 @@
-"""The arrays of what drones heard of each other: as the words say, bit by bit, and untouched where nothing was heard."""
+"""What drones heard of each other, as arrays: as the words say, bit by bit, and untouched where nothing was heard."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from agent_rig import descriptor
+from agent_rig import descriptor, memory
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +15,8 @@ from sortie.fleet.plane import DroneStatus, FleetRules
 from sortie.policies.contract import FleetView
 from sortie.policies.geometry import note_circles, peers_by_overlap
 from sortie.policies.staleness import LinkHealth, health
-from sortie.scenarios.link_state import probed_mbps
+from sortie.radio.goodput import Goodput
+from sortie.scenarios.link_state import MEASURED_FOR_S, SILENT_MBPS, LinkState, heard_share, probed_mbps, state_of
 
 PERIOD_S = 0.1
 
@@ -44,6 +45,59 @@ def test_probes_are_a_row_of_bits_however_far_they_look_back(
     now_s = (frame + later + 0.6) * PERIOD_S
     arrived = (bits << min(later, periods) & ((1 << periods) - 1)).bit_count()
     assert mine.probes.fill(np.array([1]), (0.0,), now_s) == (probed_mbps(arrived / periods),)
+
+
+def filled(mine: PeerMemory, goodput_mbps: tuple[float, ...], now_s: float) -> tuple[float, ...]:
+    peers = [i for i in range(len(goodput_mbps) + 1) if i != mine.drone]
+    return mine.probes.fill(np.array(peers), goodput_mbps, now_s)
+
+
+def heard(mine: PeerMemory, peer: int, t_s: float) -> None:
+    """A descriptor of this time arrives at once."""
+    assert mine.hear(Opened(descriptor(peer, t_s), None, 0), t_s) is None
+
+
+def test_probes_count_the_descriptors_heard_and_missed() -> None:
+    mine = memory()
+    for k in range(30):
+        if k % 5:  # every fifth is missed
+            heard(mine, 1, 0.003 * (k % 2) + 0.1 * k)
+
+    def share(now_s: float) -> float | None:
+        return heard_share(filled(mine, (0.0, 0.0), now_s)[0])
+
+    assert share(2.93) == pytest.approx(0.8)
+    assert share(3.42) == pytest.approx(0.5)  # 3.0 and four more are missed by now
+    assert filled(mine, (0.0, 0.0), 3.98) == (SILENT_MBPS, 0.0) == filled(mine, (0.0, 0.0), 1e6)
+
+
+def test_probes_stand_where_nothing_was_measured_and_have_no_rate() -> None:
+    """Whoever one is: a slot is of the peer that it is of."""
+    for me in range(5):
+        often, seldom, measured = ((me + k) % 5 for k in (1, 2, 3))
+        mine = memory(me)
+        for k in range(10):
+            heard(mine, often, 0.1 * k)
+            if k < 5:
+                heard(mine, seldom, 0.1 * k)
+        peers = [i for i in range(5) if i != me]
+        links = tuple(40.0 * (i == measured) for i in peers)
+        known = dict(zip(peers, filled(mine, links, 0.95), strict=True))
+        states = {often: LinkState.PROBED, seldom: LinkState.PROBED, measured: LinkState.MEASURED}
+        assert {i: state_of(mbps) for i, mbps in known.items()} == dict.fromkeys(peers, LinkState.UNKNOWN) | states
+        shares = {i: heard_share(mbps) for i, mbps in known.items()}
+        assert shares == dict.fromkeys(peers) | {often: pytest.approx(1.0), seldom: pytest.approx(0.5)}
+        later = dict(zip(peers, filled(mine, links, 3.0), strict=True))
+        assert later == dict.fromkeys(peers, 0.0) | {often: SILENT_MBPS, seldom: SILENT_MBPS, measured: 40.0}
+
+
+def test_a_measurement_expires_and_the_next_one_is_taken_as_it_is() -> None:
+    links = Goodput(2)
+    links.measured(0, 1, 70.0, 1.0)
+    assert links.read(0, 1.0 + MEASURED_FOR_S) == {1: 70.0}
+    assert links.read(0, 1.01 + MEASURED_FOR_S) == {}
+    links.measured(0, 1, 90.0, 10.0)
+    assert links.read(0, 10.0) == {1: 90.0}
 
 
 def test_one_datagram_is_one_object_at_all_that_hear_it() -> None:

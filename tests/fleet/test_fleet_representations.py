@@ -1,28 +1,20 @@
-"""Boxes with uncertainty and codes on the plane: their order, bytes, messages, gates and receivers."""
+"""Representations: their order, their numbers in messages, who reads them, and how invariants use the order."""
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
-from agent_rig import RULES, capture
 from fleet_examples import DESCRIPTOR
 
-from sortie.fleet.gate import HEADER_BYTES, make_payload
-from sortie.fleet.memory import PeerMemory, Received
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.wire import (
-    DIRECTIVE_BYTES,
     decode_descriptor,
     decode_directive,
     encode_descriptor,
     encode_directive,
 )
-from sortie.fleet.plane import DroneStatus
 from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, FleetView, PolicyError, Representation, boxes_across_networks
 from sortie.policies.damping import DampedLink, damp, lower_of
-from sortie.policies.staleness import LinkHealth, cap_by_age
 from sortie.policies.verification.invariants.language import parse, violations
 from sortie.policies.verification.shield import shield
 from sortie.scenarios.representation import MAPS, NAME_OF, REPRESENTATION_OF
@@ -30,7 +22,6 @@ from sortie.scenarios.representation import MAPS, NAME_OF, REPRESENTATION_OF
 R = Representation
 CODES = Directive(0, 1, R.CODES, 0.05, None, 10.0)
 BOXES = Directive(0, 1, R.UNCERTAIN_BOXES, 0.0, None, 10.0)
-ORIGIN = (0.0, 0.0, 0.0)
 
 
 def test_the_order_is_by_fidelity_and_older_numbers_stay() -> None:
@@ -51,11 +42,11 @@ def test_the_order_is_by_fidelity_and_older_numbers_stay() -> None:
         R.CODES < "features"  # type: ignore[operator]  # noqa: B015
 
 
-@pytest.mark.parametrize(("rung", "number"), [(R.UNCERTAIN_BOXES, 5), (R.CODES, 6), (R.FEATURES, 3)])
-def test_directives_carry_their_number(rung: Representation, number: int) -> None:
-    data = encode_directive(CODES._replace(representation=rung))
-    assert data[6] == number
-    assert decode_directive(data).representation is rung
+def test_directives_carry_their_number() -> None:
+    for rung, number in ((R.UNCERTAIN_BOXES, 5), (R.CODES, 6), (R.FEATURES, 3)):
+        data = encode_directive(CODES._replace(representation=rung))
+        assert data[6] == number
+        assert decode_directive(data).representation is rung
     with pytest.raises(MalformedDatagram, match=r"representation is 7, must be in \[0, 6\]"):
         decode_directive(data[:6] + b"\7" + data[7:])
 
@@ -70,43 +61,6 @@ def test_a_descriptor_names_a_codebook_of_its_own_and_only_then() -> None:
         decode_descriptor(plain + b"\2" + b"\3\6\0" + bytes(6))
     with pytest.raises(ValueError, match="codebook is 'mine', must be 14 digits"):
         encode_descriptor(DESCRIPTOR._replace(codebook="mine"))
-
-
-def test_payloads_have_their_exact_bytes() -> None:
-    front = HEADER_BYTES + DIRECTIVE_BYTES
-    codes = make_payload(CODES, *ORIGIN, lambda roi: 3, 1344, code_bytes=5)
-    assert codes is not None
-    assert (codes.cells, codes.boxes, codes.index_bytes, codes.code_bytes, codes.tile_bytes) == (204, 0, 306, 5, None)
-    assert codes.size_bytes == front + 8 + 204 * 5 + 306
-    assert not codes.reliable
-    assert make_payload(CODES._replace(rho=0.0001), *ORIGIN, lambda roi: 3) is None
-    boxes = make_payload(BOXES, *ORIGIN, lambda roi: 30)
-    assert boxes is not None
-    assert (boxes.cells, boxes.boxes, boxes.size_bytes, boxes.code_bytes) == (0, 30, front + 30 * 36, 0)
-    assert boxes.reliable
-    features = make_payload(CODES._replace(representation=R.FEATURES), *ORIGIN, lambda roi: 3, code_bytes=5)
-    assert features is not None
-    assert (features.size_bytes, features.code_bytes) == (front + 204 * 160 + 306, 0)
-
-
-def test_codes_of_another_codebook_or_network_cannot_be_read() -> None:
-    payload = make_payload(CODES, *ORIGIN, lambda roi: 3)
-    assert payload is not None
-    memory = PeerMemory(0, RULES, DroneStatus(codebook="0" * 14))
-    foreign, own = payload, payload._replace(codebook="0" * 14)
-    assert not memory.can_fuse(foreign)
-    assert memory.can_fuse(own)
-    assert not memory.can_fuse(own._replace(feature_space="other"))
-    assert memory.can_fuse(foreign._replace(representation=R.FEATURES))  # whose codebook says nothing of features
-    memory.receive(Received(capture(1, 0.0), foreign, 0.1, 0.0))
-    assert not memory.held
-    memory.receive(Received(capture(1, 0.0), own, 0.1, 0.0))
-    assert memory.held[1].payload is own
-    blind = PeerMemory(0, RULES, DroneStatus(looks=False))
-    assert not blind.can_fuse(payload)
-    boxes = make_payload(BOXES, *ORIGIN, lambda roi: 3)
-    assert boxes is not None
-    assert blind.can_fuse(boxes)
 
 
 def view(**of_peer: str) -> FleetView:
@@ -128,15 +82,6 @@ def test_a_policy_can_ask_who_reads_its_codes_and_have_boxes_sent_to_others() ->
     assert features(other)[0].representation is R.FEATURES
 
 
-def test_old_age_leaves_detections_of_both() -> None:
-    for directive in (CODES, BOXES):
-        kept = cap_by_age(directive, LinkHealth.DEGRADED, 0.5)
-        assert (kept.representation, kept.rho, kept.rate_hz) == (R.DETECTIONS, 0.0, 2.0)
-        slow = directive._replace(rate_hz=1.0)
-        assert cap_by_age(slow, LinkHealth.DEGRADED, 0.5).representation is R.DETECTIONS
-        assert cap_by_age(directive, LinkHealth.FRESH, 0.1) is directive
-
-
 def test_damping_takes_steps_down_at_once_and_lets_steps_up_wait() -> None:
     features = CODES._replace(representation=R.FEATURES, rho=0.02)
     assert lower_of(features, CODES) == CODES  # another rung's share of cells does not bound this one's
@@ -149,28 +94,28 @@ def test_damping_takes_steps_down_at_once_and_lets_steps_up_wait() -> None:
     assert damp(waiting, BOXES, 1.0, 1.0).enforced == BOXES
 
 
-@pytest.mark.parametrize(
-    ("line", "holds"),
-    [
-        ("representation >= detections", {R.DETECTIONS, R.UNCERTAIN_BOXES, R.CODES, R.FEATURES, R.RAW}),
-        ("representation <= detections", {R.NONE, R.TRACKS, R.DETECTIONS}),
-        ("representation < features", {R.NONE, R.TRACKS, R.DETECTIONS, R.UNCERTAIN_BOXES, R.CODES}),
-        ("representation == codes", {R.CODES}),
-        ("representation >= uncertain_boxes", {R.UNCERTAIN_BOXES, R.CODES, R.FEATURES, R.RAW}),
-        ("representation != features", set(R) - {R.FEATURES}),
-    ],
-)
-def test_safety_lines_read_the_order(line: str, holds: set[Representation]) -> None:
-    (rule,) = parse(line)
-    kept = {r for r in R for d in [CODES._replace(representation=r)] if not violations(rule, view(), [d], [d])}
-    assert kept == holds
-    # a shield moves what breaks the line to the nearest of the first five, or of those that the line names
-    named = {R.NONE, R.TRACKS, R.DETECTIONS, R.FEATURES, R.RAW} | {r for r in R if NAME_OF[r] in line.split()}
-    for r in R:
-        (after,) = shield(lambda _, r=r: [CODES._replace(representation=r)], [rule])(view())  # type: ignore[misc]
-        best = min(sorted(holds & named), key=lambda h, r=r: abs(h.level - r.level))  # type: ignore[misc]
-        assert after.representation in holds & {*named, r}
-        assert abs(after.representation.level - r.level) == (0.0 if r in holds else abs(best.level - r.level))
+INVARIANTS: list[tuple[str, set[Representation]]] = [
+    ("representation >= detections", {R.DETECTIONS, R.UNCERTAIN_BOXES, R.CODES, R.FEATURES, R.RAW}),
+    ("representation <= detections", {R.NONE, R.TRACKS, R.DETECTIONS}),
+    ("representation < features", {R.NONE, R.TRACKS, R.DETECTIONS, R.UNCERTAIN_BOXES, R.CODES}),
+    ("representation == codes", {R.CODES}),
+    ("representation >= uncertain_boxes", {R.UNCERTAIN_BOXES, R.CODES, R.FEATURES, R.RAW}),
+    ("representation != features", set(R) - {R.FEATURES}),
+]
+
+
+def test_invariants_read_the_order_and_a_shield_moves_to_the_nearest_that_holds() -> None:
+    """To the nearest of the first five, or of those that the rule names."""
+    for line, holds in INVARIANTS:
+        (rule,) = parse(line)
+        asked = {r: CODES._replace(representation=r) for r in R}
+        assert {r for r, d in asked.items() if not violations(rule, view(), [d], [d])} == holds, line
+        named = {R.NONE, R.TRACKS, R.DETECTIONS, R.FEATURES, R.RAW} | {r for r in R if NAME_OF[r] in line.split()}
+        for r in R:
+            (after,) = shield(lambda _, d=asked[r]: [d], [rule])(view())  # type: ignore[misc]
+            best = min(sorted(holds & named), key=lambda h, r=r: abs(h.level - r.level))  # type: ignore[misc]
+            assert after.representation in holds & {*named, r}
+            assert abs(after.representation.level - r.level) == (0.0 if r in holds else abs(best.level - r.level))
 
 
 def test_only_the_first_five_may_be_given_as_plain_numbers() -> None:
@@ -178,7 +123,3 @@ def test_only_the_first_five_may_be_given_as_plain_numbers() -> None:
     check_directives([CODES], view())
     with pytest.raises(PolicyError, match=r"representation is 6, must be in \[0, 4\]"):
         check_directives([CODES._replace(representation=6)], view())  # type: ignore[arg-type]
-
-
-def test_rules_have_the_length_of_codes() -> None:
-    assert {f.name: f.default for f in dataclasses.fields(RULES)}["code_bytes"] == 10

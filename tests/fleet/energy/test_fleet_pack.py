@@ -1,8 +1,9 @@
-"""What polarisation, temperature, age, cut-off and lost cells do to a pack; the ledger with all of them on."""
+"""What polarisation, temperature, age, cut-off, lost cells and traces do to a pack; the ledger with all of them on."""
 
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from sortie.fleet.energy.battery import CAUSES, RECORDED, FleetBatteries
 from sortie.fleet.energy.cell import (
+    COOLING_TIME_S,
     MEAN_CELL_V,
     ageing,
     energy_fraction,
@@ -20,10 +22,12 @@ from sortie.fleet.energy.cell import (
     terminal_voltage_v,
 )
 from sortie.fleet.energy.recorded import BatteryTrace
-from sortie.scenarios.schema import Battery, DroneOverride, Polarisation
+from sortie.scenarios.schema import Battery, Polarisation
+
+LOAD = ([170.0], [1.0], [0.1])
+
 
 HOVER_W = 168.48
-ELECTRIC_W = HOVER_W / 0.8 + 8 + 25 + 2.4  # of steady()
 
 
 def steady(batteries: FleetBatteries, seconds: float, rotor_w: float = HOVER_W, dt_s: float = 0.1) -> None:
@@ -32,7 +36,7 @@ def steady(batteries: FleetBatteries, seconds: float, rotor_w: float = HOVER_W, 
         batteries.step(dt_s, [rotor_w] * n, [0.5] * n, [0.1] * n)
 
 
-# --- one effect at a time ------------------------------------------------------------------------
+# --- one effect at a time ---------------------------------------------------------------------------------
 
 
 def test_polarisation_builds_up_with_its_time_constant() -> None:
@@ -77,12 +81,6 @@ def test_a_pack_on_the_ground_cools_to_the_air_while_one_in_flight_stays_warm() 
     assert b.spent_j[0] == spent
 
 
-def test_without_a_temperature_packs_stay_at_25_degrees() -> None:
-    b = FleetBatteries(Battery(), (), 1)
-    steady(b, 60.0)
-    assert b.temperature_c == [25.0]
-
-
 def test_age_takes_capacity_and_adds_resistance() -> None:
     assert ageing(0, 300) == (1.0, 1.0)
     assert ageing(300, 300) == (pytest.approx(0.8), pytest.approx(2.0))
@@ -93,10 +91,36 @@ def test_age_takes_capacity_and_adds_resistance() -> None:
     assert (old.energy_j["ohmic"][0] / 0.1) == pytest.approx(old.current_a[0] ** 2 * 0.104, rel=1e-6)
 
 
-def test_one_old_pack_among_new_ones() -> None:
-    b = FleetBatteries(Battery(), (DroneOverride(drone=1, cycles=200),), 3)
-    steady(b, 120.0)
-    assert b.soc[0] == b.soc[2] > b.soc[1]
+def test_cold_and_age_act_on_both_parts_of_the_resistance() -> None:
+    """Voltage of a loaded pack once polarisation has settled: both resistances times the factors of cold and of age."""
+    for cold, cycles, polarised in product([None, -10.0], [0.0, 150.0], [0.0, 4.0]):
+        slow = Polarisation(resistance_mohm=polarised, time_s=0.05)
+        pack = Battery(cell_resistance_mohm=6, ambient_c=cold, cycles=cycles, capacity_wh=5000, polarisation=slow)
+        packs = FleetBatteries(pack, (), 1)
+        for _ in range(12):
+            packs.step(0.1, [170.0], [0.0], [0.0])
+        factor = resistance_factor(packs.temperature_c[0] if cold is not None else 25.0)
+        open_v = 4 * float(open_circuit_cell_v(packs.soc[0]))
+        drop_v = packs.current_a[0] * 4 * (6 + polarised) / 1000 * (1 + cycles / 300) * factor
+        assert packs.voltage_v[0] == pytest.approx(open_v - drop_v, abs=2e-3), (cold, cycles, polarised)
+        assert drop_v > 0.3
+
+
+def test_all_that_is_lost_in_a_pack_warms_its_mass() -> None:
+    """Old packs hold less and weigh as much; what polarisation takes is lost in the pack as well."""
+    for cycles, polarised in product((0.0, 300.0), (0.0, 6.0)):
+        slow = Polarisation(resistance_mohm=polarised, time_s=0.5)
+        pack = Battery(ambient_c=10.0, cycles=cycles, polarisation=slow)
+        packs = FleetBatteries(pack, (), 1)
+        for _ in range(30):
+            before_c, before_j = packs.temperature_c[0], packs.energy_j["ohmic"][0]
+            packs.step(1.0, *LOAD)
+        lost_w = packs.energy_j["ohmic"][0] - before_j
+        warmed_c = lost_w * COOLING_TIME_S / heat_capacity_jpk(pack.capacity_wh)
+        fades = math.exp(-1.0 / COOLING_TIME_S)
+        wanted_c = 10.0 + warmed_c + (before_c - 10.0 - warmed_c) * fades
+        assert packs.temperature_c[0] == pytest.approx(wanted_c, rel=1e-12)
+        assert packs.temperature_c[0] > 10.05
 
 
 def test_it_lands_when_its_cells_fall_below_the_cut_off() -> None:
@@ -113,34 +137,57 @@ def test_it_lands_when_its_cells_fall_below_the_cut_off() -> None:
     assert sum(b.energy_j[c][0] for c in CAUSES) == spent
 
 
-def test_cold_and_age_bring_the_cut_off_forward() -> None:
-    def endurance(**changes: float) -> float:
-        b = FleetBatteries(Battery(cutoff_cell_v=3.5, **changes), (), 1)
-        while not b.landed[0]:
-            steady(b, 1.0, dt_s=1.0)
-        return b._now_s
+def test_a_pack_that_takes_off_again_is_one_of_its_charge_that_never_flew() -> None:
+    """What was polarised is gone at rest; voltage, current and what is spent go on from the charge alone."""
+    of = Battery(capacity_wh=120, polarisation=Polarisation(resistance_mohm=8, time_s=30))
+    flew = FleetBatteries(of, (), 1)
+    for _ in range(60):
+        flew.step(1.0, [170.0], [1.0], [0.1])
+    flew.land(0, "told to")
+    flew.take_off(0)
+    fresh = FleetBatteries(of.model_copy(update={"initial_soc": flew.soc[0]}), (), 1)
+    for _ in range(5):
+        for packs in (flew, fresh):
+            packs.step(1.0, [170.0], [1.0], [0.1])
+        assert flew.voltage_v[0] == pytest.approx(fresh.voltage_v[0], rel=1e-6)
+        assert flew.current_a[0] == pytest.approx(fresh.current_a[0], rel=1e-6)
 
-    new = endurance(ambient_c=25)
-    assert endurance(ambient_c=-15) < new
-    assert endurance(ambient_c=25, cycles=300) < 0.8 * new
+
+# --- a cell drops out -------------------------------------------------------------------------------------
 
 
-# --- a cell drops out ----------------------------------------------------------------------------
+def test_a_lost_cell_takes_its_voltage_energy_and_both_resistances() -> None:
+    """A pack of four that loses one is a pack of three in the same state."""
+    of = Battery(cell_resistance_mohm=15, capacity_wh=120, polarisation=Polarisation(resistance_mohm=5, time_s=1))
+    four = FleetBatteries(of, (), 2)
+    before_j = four.energy_left_j[0]
+    four.drop_cell(0)
+    assert four.cells == [3, 4]
+    assert four.energy_j["fault"] == [pytest.approx(before_j / 4), 0.0]
+    three = FleetBatteries(of.model_copy(update={"cells": 3, "capacity_wh": 90.0}), (), 2)
+    for _ in range(50):
+        for packs in (four, three):
+            packs.step(0.1, [120.0] * 2, [0.5] * 2, [0.1] * 2)
+        assert four.voltage_v[0] == pytest.approx(three.voltage_v[0], rel=1e-9)
+        assert four.current_a[0] == pytest.approx(three.current_a[0], rel=1e-9)
+        assert four.soc[0] == pytest.approx(three.soc[0], rel=1e-9)
+    assert four.energy_left_j[0] == pytest.approx(three.energy_left_j[0])
+    assert four.landed == [False, False]
 
 
-def test_a_lost_cell_takes_its_voltage_and_energy_and_the_rest_work_harder() -> None:
-    b = FleetBatteries(Battery(), (), 2)
-    steady(b, 10.0)
-    before_j, soc, current = b.energy_left_j[0], b.soc[0], b.current_a[0]
-    b.drop_cell(0)
-    assert b.cells == [3, 4]
-    assert b.energy_j["fault"] == [pytest.approx(before_j / 4), 0.0]
-    assert b.energy_left_j[0] == pytest.approx(before_j * 3 / 4)
-    assert b.soc[0] == pytest.approx(soc, abs=1e-6)  # the others keep their charge
-    steady(b, 0.1)
-    assert b.voltage_v[0] == pytest.approx(3 / 4 * b.voltage_v[1], rel=0.02)
-    assert b.current_a[0] == pytest.approx(4 / 3 * current, rel=0.03)
-    assert b.landed == [False, False]
+def test_a_cell_s_mean_voltage_is_over_the_cells_that_work() -> None:
+    """A pack of four that lost one is cut off where a cell is low, not where three cells give less than four would."""
+    of = Battery(cutoff_cell_v=3.3, initial_soc=0.8, capacity_wh=300)
+    packs = FleetBatteries(of, (), 1)
+    packs.drop_cell(0)
+    packs.step(0.1, *LOAD)
+    assert packs.cells == [3]
+    assert packs.voltage_v[0] < 3.3 * 4
+    assert not packs.landed[0]
+    low = FleetBatteries(of.model_copy(update={"cutoff_cell_v": 3.9}), (), 1)
+    low.step(0.1, *LOAD)
+    assert low.landed[0]
+    assert low.landing_reason[0].endswith("cut off below 3.9 V")
 
 
 def test_losing_a_cell_under_a_cut_off_by_the_cell_goes_on_and_the_last_cell_lands() -> None:
@@ -151,13 +198,6 @@ def test_losing_a_cell_under_a_cut_off_by_the_cell_goes_on_and_the_last_cell_lan
     b.drop_cell(0)
     assert b.landed[0]
     assert b.energy_left_j[0] == 0.0
-
-
-def test_charge_falls_faster_on_fewer_cells() -> None:
-    b = FleetBatteries(Battery(), (), 2)
-    b.drop_cell(0)
-    steady(b, 60.0)
-    assert 0.95 - b.soc[0] == pytest.approx(4 / 3 * (0.95 - b.soc[1]), rel=0.05)
 
 
 def test_the_voltage_after_a_fault_is_that_of_the_cold_and_polarised_pack() -> None:
@@ -174,7 +214,7 @@ def test_the_voltage_after_a_fault_is_that_of_the_cold_and_polarised_pack() -> N
     assert b.voltage_v[0] < after_v < before_v
 
 
-# --- a trace in place of the model ---------------------------------------------------------------
+# --- a trace in place of the model ------------------------------------------------------------------------
 
 
 def trace(time_s: list[float], soc: list[float], volts: list[float] | None = None) -> BatteryTrace:
@@ -206,22 +246,62 @@ def test_a_traced_drone_lands_at_landing_soc_too() -> None:
     assert 0.48 < b.soc[0] <= 0.5
 
 
-def test_what_a_fault_took_stays_gone_from_a_trace() -> None:
-    b = FleetBatteries(Battery(), (), 1, {0: trace([0, 10], [0.9, 0.6])})
-    b.fault(0, 0.5)
-    steady(b, 11.0)
-    assert float(energy_fraction(b.soc[0])) == pytest.approx(float(energy_fraction(0.6)) / 2, abs=1e-6)
-    assert b.energy_j["fault"][0] == pytest.approx(float(energy_fraction(0.9)) / 2 * 130 * 3600)
+def test_faults_of_a_traced_pack_stay_and_each_takes_of_what_is_left() -> None:
+    """Half is gone at once, later a fifth; from then on the trace's fall is of the two fifths that are left."""
+    soc = [0.9, 0.8, 0.7]
+    energy = [float(energy_fraction(s)) for s in soc]
+    packs = FleetBatteries(Battery(capacity_wh=100), (), 1, {0: trace([0.0, 10.0, 20.0], soc)})
+    packs.step(5.0, [0.0], [0.0], [0.0])
+    half = packs.energy_left_j[0] / 2
+    packs.fault(0, 0.5)
+    assert packs.energy_left_j[0] == pytest.approx(half)
+    packs.step(5.0, [0.0], [0.0], [0.0])
+    left = 360_000 * energy[1] / 2
+    assert packs.energy_left_j[0] == pytest.approx(left)
+    packs.fault(0, 0.2)
+    assert packs.energy_left_j[0] == pytest.approx(0.8 * left)
+    packs.step(10.0, [0.0], [0.0], [0.0])
+    assert packs.energy_left_j[0] == pytest.approx(360_000 * energy[2] * 0.4)
+    lost = half + 0.2 * left
+    assert packs.energy_j["fault"][0] == pytest.approx(lost)
+    assert packs.spent_j[0] == pytest.approx(360_000 * (energy[0] - 0.4 * energy[2]))
+    assert packs.energy_j[RECORDED][0] == pytest.approx(packs.spent_j[0] - lost)
 
 
-# --- the ledger, everything on -------------------------------------------------------------------
+def test_what_a_trace_says_was_spent_on_the_ground_is_spent_at_take_off() -> None:
+    packs = FleetBatteries(Battery(capacity_wh=100), (), 1, {0: trace([0, 10, 20, 30], [0.9, 0.8, 0.7, 0.6])})
+    packs.step(10.0, *LOAD)
+    packs.land(0, "told to")
+    packs.step(10.0, *LOAD)
+    assert packs.soc[0] == pytest.approx(0.8, abs=1e-3)
+    packs.take_off(0)
+    assert packs.soc[0] == pytest.approx(0.7, abs=1e-3)
+    assert packs.spent_j[0] == pytest.approx(360_000 * float(energy_fraction(0.9) - energy_fraction(0.7)))
+    before_j = packs.energy_j[RECORDED][0]
+    packs.step(10.0, *LOAD)
+    spent_j = packs.energy_j[RECORDED][0] - before_j
+    assert packs.current_a[0] == pytest.approx(spent_j / 10.0 / packs.voltage_v[0])
+    assert packs.voltage_v[0] == pytest.approx(4 * float(open_circuit_cell_v(0.6)), abs=1e-2)
+
+
+def test_a_trace_of_no_voltage_has_no_current() -> None:
+    packs = FleetBatteries(Battery(), (), 1, {0: trace([0.0, 10.0], [0.9, 0.8], [16.0, 0.0])})
+    packs.step(5.0, *LOAD)
+    assert packs.current_a[0] > 0.0
+    packs.step(5.0, *LOAD)
+    assert (packs.voltage_v[0], packs.current_a[0]) == (0.0, 0.0)
+    assert packs.soc[0] == pytest.approx(0.8, abs=1e-3)
+
+
+# --- the ledger, everything on ----------------------------------------------------------------------------
 
 packs = st.builds(
     Battery,
     capacity_wh=st.floats(0.05, 200),
-    cells=st.integers(1, 8),
+    cells=st.integers(1, 12),
     initial_soc=st.floats(0.01, 1),
-    cell_resistance_mohm=st.floats(0, 60),
+    cell_resistance_mohm=st.floats(0, 100),
+    drivetrain_efficiency=st.floats(0.3, 1),
     polarisation=st.builds(Polarisation, resistance_mohm=st.floats(0, 40), time_s=st.floats(0.1, 100)),
     ambient_c=st.none() | st.floats(-30, 50),
     cycles=st.floats(0, 500),
@@ -263,7 +343,7 @@ def test_the_ledger_holds_with_every_effect_on(
         charge = list(b.soc)
 
 
-# --- the same cell, driven by current ------------------------------------------------------------
+# --- the same cell, driven by current ---------------------------------------------------------------------
 
 
 def test_a_packs_voltage_under_its_own_current_is_the_fleets() -> None:

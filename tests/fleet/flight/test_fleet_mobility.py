@@ -1,4 +1,4 @@
-"""The random models against their closed forms, within their fence; and what of a model of one's own is refused."""
+"""The random models against their closed forms, within their fence; and which plug-in models are refused."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ def test_random_waypoint_has_its_mean_speed_over_time() -> None:
     """Slow ways last longer: the density of speed over time is ∝ 1/v, so its mean is (b − a) / ln(b / a)."""
     area = {"west_m": -1000, "south_m": -1000, "east_m": 1000, "north_m": 1000}
     times_s = np.arange(10_000, 30_000, 50.0)
-    way = [random_waypoint(times_s + dt, starts(60), rng(), **area, slowest_mps=2, fastest_mps=12, turn_time_s=0.1) for dt in (0, 0.2)]  # fmt: skip
+    options = {**area, "slowest_mps": 2, "fastest_mps": 12, "turn_time_s": 0.1}
+    way = [random_waypoint(times_s + dt, starts(60), rng(), **options) for dt in (0, 0.2)]
     speed = np.linalg.norm(way[1] - way[0], axis=-1) / 0.2
     assert speed.mean() == pytest.approx(10 / math.log(6), rel=0.015)
     # and each speed's share of time is logarithmic in it: half the time below the geometric mean
@@ -53,63 +54,76 @@ def test_random_waypoint_keeps_to_the_middle() -> None:
     assert (np.abs(way[..., :2]).max(), way[..., 2].min(), way[..., 2].max()) <= (500.0, 60.0, 60.0)
 
 
-def test_random_waypoint_rests_as_long_as_it_is_told() -> None:
-    """Far places at one speed: share of time at rest = mean pause / (mean pause + mean way)."""
-    area = {"west_m": -500, "south_m": -500, "east_m": 500, "north_m": 500}
-    options = {**area, "slowest_mps": 10, "fastest_mps": 10, "pause_s": 80, "turn_time_s": 0.1}
-    times_s = np.arange(5_000, 30_000, 20.0)
-    way = [random_waypoint(times_s + dt, starts(60), rng(), **options) for dt in (0, 0.2)]
-    resting = (np.linalg.norm(way[1] - way[0], axis=-1) < 0.2).mean()
-    mean_way_s = 0.5214054 * 1000 / 10  # the mean distance of two even places in a unit square
-    assert resting == pytest.approx(40 / (40 + mean_way_s), rel=0.03)
+def test_random_waypoint_rests_evenly_up_to_the_longest() -> None:
+    """Of many rests the mean is half of it, and some are short. Heights lie about the start."""
+    options = {"pause_s": 40.0, "slowest_mps": 10.0, "turn_time_s": 0.01, "height_range_m": 20.0}
+    way = random_waypoint(np.arange(0.0, 4000.0, 0.5), starts(8), rng(2), **options)
+    still = (np.abs(np.diff(way, axis=0)).max(axis=-1) < 1e-9).T
+    runs = [run for drone in still for run in np.split(drone, np.flatnonzero(np.diff(drone.astype(int)) != 0) + 1)]
+    lasts_s = [0.5 * len(run) for run in runs if run[0]]
+    assert np.mean(lasts_s) == pytest.approx(20.0, abs=2.0)
+    assert max(lasts_s) <= 40.5
+    assert min(lasts_s) < 8.0
+    assert np.ptp(way[..., 2]) > 18.0
 
 
-@pytest.mark.parametrize("alpha", [0.0, 0.5, 0.85])
-def test_gauss_markov_has_its_mean_spread_and_memory(alpha: float) -> None:
+def velocities(drones: int, steps: int, **options: float) -> np.ndarray:
+    """Of Gauss-Markov ways, within each step and far from the changes."""
+    times_s = (np.arange(steps)[:, None] + (0.45, 0.65)).ravel()
+    options = {**WIDE, "turn_time_s": 0.1, "height_range_m": 90} | options
+    way = gauss_markov(times_s, starts(drones), rng(), **options)
+    return (way[1::2] - way[::2]) / 0.2
+
+
+def test_gauss_markov_has_its_mean_spread_and_memory() -> None:
     """Speed is an AR(1) process: its correlation over k steps is α^k. It is stationary from the first step on."""
-    times_s = np.arange(400) + 0.55  # within each step, far from the changes
-    options = {**WIDE, "speed_mps": 9, "speed_sigma_mps": 1.5, "alpha": alpha, "turn_time_s": 0.1, "height_range_m": 90}
-    way = [gauss_markov(times_s + dt, starts(150), rng(), **options, climb_sigma_mps=0.1) for dt in (-0.1, 0.1)]
-    velocity = (way[1] - way[0]) / 0.2
-    speed = np.hypot(velocity[..., 0], velocity[..., 1])
-    assert speed.mean() == pytest.approx(9, abs=0.05)
-    assert speed.std() == pytest.approx(1.5, rel=0.03)
-    assert speed[0].std() == pytest.approx(1.5, rel=0.2)
-    for k in (1, 3):
-        over_k = np.mean((speed[k:] - 9) * (speed[:-k] - 9)) / 1.5**2
-        assert over_k == pytest.approx(alpha**k, abs=0.03)
-    assert velocity[..., 2].std() == pytest.approx(0.1, rel=0.05)
+    for alpha in (0.0, 0.85):
+        velocity = velocities(150, 400, speed_mps=9, speed_sigma_mps=1.5, alpha=alpha, climb_sigma_mps=0.1)
+        speed = np.hypot(velocity[..., 0], velocity[..., 1])
+        assert speed.mean() == pytest.approx(9, abs=0.05)
+        assert speed.std() == pytest.approx(1.5, rel=0.03)
+        assert speed[0].std() == pytest.approx(1.5, rel=0.2)
+        for k in (1, 3):
+            over_k = np.mean((speed[k:] - 9) * (speed[:-k] - 9)) / 1.5**2
+            assert over_k == pytest.approx(alpha**k, abs=0.03)
+        assert velocity[..., 2].std() == pytest.approx(0.1, rel=0.05)
 
 
-def test_gauss_markov_heads_about_its_mean_heading() -> None:
-    times_s = np.arange(300) + 0.55
-    options = {**WIDE, "heading_sigma_deg": 20, "turn_time_s": 0.1, "speed_sigma_mps": 0}
-    way = [gauss_markov(times_s + dt, starts(200), rng(), **options) for dt in (-0.1, 0.1)]
-    velocity = (way[1] - way[0]) / 0.2
+def test_gauss_markov_draws_speed_heading_and_climb_apart_and_heads_about_its_mean_heading() -> None:
+    velocity = velocities(120, 300, heading_sigma_deg=20, speed_sigma_mps=1.0, climb_sigma_mps=0.1)
     course = np.exp(1j * np.arctan2(velocity[..., 1], velocity[..., 0]))
     mean = course.mean(axis=0)
     off = np.angle(course / (mean / np.abs(mean)))
     assert np.degrees(off.std()) == pytest.approx(20, rel=0.05)
     assert np.abs(mean.mean()) < 0.15  # mean headings are drawn evenly
-
-
-def test_gauss_markov_draws_speed_heading_and_climb_apart() -> None:
-    times_s = np.arange(300) + 0.55
-    options = {
-        **WIDE,
-        "speed_sigma_mps": 1.0,
-        "heading_sigma_deg": 20,
-        "climb_sigma_mps": 0.1,
-        "height_range_m": 90,
-        "turn_time_s": 0.1,
-    }
-    way = [gauss_markov(times_s + dt, starts(100), rng(), **options) for dt in (-0.1, 0.1)]
-    velocity = (way[1] - way[0]) / 0.2
-    course = np.exp(1j * np.arctan2(velocity[..., 1], velocity[..., 0]))
-    off = np.angle(course / course.mean(axis=0))
     drawn = np.stack([np.hypot(velocity[..., 0], velocity[..., 1]).ravel(), off.ravel(), velocity[..., 2].ravel()])
-    together = np.corrcoef(drawn)[np.triu_indices(3, 1)]
-    assert np.abs(together).max() < 0.08
+    assert np.abs(np.corrcoef(drawn)[np.triu_indices(3, 1)]).max() < 0.08
+
+
+def test_a_drone_that_is_reflected_keeps_its_new_heading() -> None:
+    """Without noise and without memory it flies level and straight from edge to edge, like a ball."""
+    times_s = np.arange(0.5, 400.0)
+    ball = {"alpha": 0.0, "heading_sigma_deg": 0.0, "speed_mps": 8.0, "speed_sigma_mps": 0.0}
+    begin_m = np.tile([10.0, -5.0, 60.0], (6, 1))
+    way = gauss_markov(times_s, begin_m, rng(5), **ball, margin_m=0.0, turn_time_s=1e-3)
+    assert np.abs(way[..., :2]).max() <= 150.0 + 1e-6
+    assert np.ptp(way[..., 2]) == 0.0
+    velocity, reflected = np.diff(way, axis=0)[2:], 0
+    assert np.hypot(velocity[..., 0], velocity[..., 1]).max() < 8.0 + 1e-6
+    for drone, axis in np.ndindex(6, 2):
+        speed = float(np.median(np.abs(velocity[:, drone, axis])))
+        turns = np.flatnonzero(np.diff(np.sign(velocity[:, drone, axis])) != 0)
+        assert all(gap >= 300 / speed - 3 for gap in np.diff(turns))
+        reflected += len(turns)
+    assert reflected > 20
+
+
+def test_near_the_edge_a_drone_turns_to_the_middle_of_its_own_fence() -> None:
+    """Of a fence that does not hold the origin in its middle."""
+    fence = {"west_m": 0.0, "south_m": -50.0, "east_m": 600.0, "north_m": 550.0}
+    begin_m = np.tile([300.0, 250.0, 60.0], (6, 1))
+    way = gauss_markov(np.arange(60.0, 400.0, 5.0), begin_m, rng(), **fence, margin_m=150.0)
+    np.testing.assert_allclose(way[..., :2].mean(axis=(0, 1)), (300.0, 250.0), atol=60.0)
 
 
 @settings(max_examples=25, deadline=None)
@@ -131,34 +145,32 @@ def test_no_random_model_leaves_its_fence(
     assert push.max() < MAX_ACCELERATION_MPS2
 
 
-@pytest.mark.parametrize("name", ["random_waypoint", "gauss_markov"])
-def test_more_drones_and_more_time_change_nothing(name: str) -> None:
-    fleet = Fleet(drones=3, mobility=name)
-    short, long = fly(fleet, 20.0, 0.1, seed=5), fly(fleet, 40.0, 0.1, seed=5)
-    more = fly(fleet.model_copy(update={"drones": 5}), 20.0, 0.1, seed=5)
-    for field in ("position_m", "velocity_mps", "orientation_xyzw", "est_position_m", "wind_mps"):
-        np.testing.assert_array_equal(getattr(short, field), getattr(long, field)[:200], err_msg=field)
-        np.testing.assert_array_equal(getattr(short, field), getattr(more, field)[:, :3], err_msg=field)
-    other = fly(fleet, 20.0, 0.1, seed=6)
-    assert np.abs(other.position_m - short.position_m).max() > 10
-    assert np.abs(short.position_m[0] - fly(Fleet(drones=3), 1.0, 0.1, seed=5).position_m[0]).max() < 1e-9
+def test_more_drones_and_more_time_change_nothing() -> None:
+    for name in ("random_waypoint", "gauss_markov"):
+        fleet = Fleet(drones=3, mobility=name)
+        short, long = fly(fleet, 20.0, 0.1, seed=5), fly(fleet, 40.0, 0.1, seed=5)
+        more = fly(fleet.model_copy(update={"drones": 5}), 20.0, 0.1, seed=5)
+        for field in ("position_m", "velocity_mps", "orientation_xyzw", "est_position_m", "wind_mps"):
+            np.testing.assert_array_equal(getattr(short, field), getattr(long, field)[:200], err_msg=field)
+            np.testing.assert_array_equal(getattr(short, field), getattr(more, field)[:, :3], err_msg=field)
+        formation = fly(Fleet(drones=3), 1.0, 0.1, seed=5)
+        assert np.abs(short.position_m[0] - formation.position_m[0]).max() < 1e-9
 
 
-def test_a_group_moves_at_random_beside_a_formation() -> None:
-    group = {"drones": [1, 3], "mobility": "random_waypoint", "mobility_params": {"slowest_mps": 9}}
-    mixed, plain = fly(Fleet(drones=4, groups=[group]), 20.0, 0.1, seed=5), fly(Fleet(drones=2), 20.0, 0.1, seed=5)
-    np.testing.assert_array_equal(mixed.position_m[:, 0], plain.position_m[:, 0])
-    assert (np.ptp(mixed.position_m[:, [1, 3], :2], axis=0).max(axis=-1) > 40).all()
-
-
-def test_groups_of_one_model_move_apart_and_apart_from_the_fleet() -> None:
-    """All three begin at one place; each draws its own way."""
-    group = {"mobility": "random_waypoint", "mobility_params": {"slowest_mps": 9}}
-    fleet = Fleet(drones=3, groups=[{"drones": [1], **group}, {"drones": [2], **group}], **group)
-    place = fly(fleet, 20.0, 0.1, seed=5).position_m
-    assert np.ptp(place[0], axis=0).max() < 5
-    for a, b in ((0, 1), (0, 2), (1, 2)):
-        assert np.linalg.norm(place[-1, a] - place[-1, b]) > 20
+def test_groups_that_move_at_random_have_ways_of_their_own() -> None:
+    """Each group, the fleet, another seed and another replication: the same start, other places."""
+    alone = [{"drones": [i], "mobility": "random_waypoint"} for i in (1, 2)]
+    fleet = Fleet(drones=3, mobility="random_waypoint", groups=alone)
+    ways = np.stack(
+        [
+            fly(fleet, 60.0, 0.1, seed, replication).position_m[:, drone, :2]
+            for seed, replication in ((5, 0), (6, 0), (5, 1))
+            for drone in range(3)
+        ]
+    )
+    assert np.ptp(ways[:, 0], axis=0).max() < 4.0  # but for their jitter they begin in one place
+    apart = np.linalg.norm(ways[:, None] - ways[None], axis=-1).max(axis=-1)
+    assert apart[~np.eye(len(ways), dtype=bool)].min() > 20.0
 
 
 def test_headings_follow_the_course_and_read_no_future() -> None:
@@ -190,48 +202,42 @@ def flat(times_s: Any, starts_m: Any, rng: Any) -> Any:
 TIMES_S = np.arange(0, 5, 0.1)
 
 
-@pytest.mark.parametrize(
-    ("model", "said"),
-    [
-        (jump, "mobility jump: drone 0 of its drones accelerates by 100 m/s² at 3 s, must be at most 20"),
-        (
-            below,
-            "mobility below: drone 0 of its drones is at (0.0, 0.0, -1.0) at 0 s, must be within ±20000 m, at or above the ground",
-        ),
-        (flat, "mobility flat: returns shape (50, 2, 2), must be (50, 2, 3)"),
-    ],
-)
-def test_what_cannot_be_flown_is_refused(model: Any, said: str) -> None:
+def test_what_cannot_be_flown_is_refused() -> None:
     assert positions_m(hover, TIMES_S, starts(2), rng()).shape == (50, 2, 3)
-    with pytest.raises(PluginError) as refused:
-        positions_m(model, TIMES_S, starts(2), rng())
-    assert str(refused.value) == said
+    place = "is at (0.0, 0.0, -1.0) at 0 s, must be within ±20000 m, at or above the ground"
+    for model, said in (
+        (jump, "mobility jump: drone 0 of its drones accelerates by 100 m/s² at 3 s, must be at most 20"),
+        (below, f"mobility below: drone 0 of its drones {place}"),
+        (flat, "mobility flat: returns shape (50, 2, 2), must be (50, 2, 3)"),
+    ):
+        with pytest.raises(PluginError) as refused:
+            positions_m(model, TIMES_S, starts(2), rng())
+        assert str(refused.value) == said
 
 
-@pytest.mark.parametrize(
-    ("model", "options", "said"),
-    [
-        (
-            random_waypoint,
-            {"west_m": 200},
-            "(200, -150.0, 150.0, 150.0), must be west_m < east_m and south_m < north_m",
-        ),
-        (random_waypoint, {"west_m": 20}, "a drone begins at (0, 0), must be within (20, -150.0, 150.0, 150.0)"),
-        (random_waypoint, {"slowest_mps": 0}, "slowest_mps 0, fastest_mps 10"),
-        (random_waypoint, {"turn_time_s": 0}, "turn_time_s 0, must be 0 < slowest_mps ≤ fastest_mps, turn_time_s > 0"),
-        (
-            gauss_markov,
-            {"alpha": 1},
-            "alpha 1, speed_mps 8, speed_sigma_mps 1.5, step_s 1, turn_time_s 5, must be 0 ≤ alpha < 1",
-        ),
-        (gauss_markov, {"speed_sigma_mps": -5}, "speed_sigma_mps -5, step_s 1, turn_time_s 5, must be 0 ≤ alpha < 1"),
-        (gauss_markov, {"step_s": 60}, "steps of 1200 m are too long for (-150.0, -150.0, 150.0, 150.0)"),
-    ],
-)
-def test_parameters_that_mean_nothing_are_refused(model: Any, options: dict[str, float], said: str) -> None:
-    with pytest.raises(PluginError) as refused:
-        model(TIMES_S, starts(2), rng(), **options)
-    assert said in str(refused.value)
+MEANINGLESS: list[tuple[Any, dict[str, float], str]] = [
+    (random_waypoint, {"west_m": 200}, "(200, -150.0, 150.0, 150.0), must be west_m < east_m and south_m < north_m"),
+    (random_waypoint, {"west_m": 20}, "a drone begins at (0, 0), must be within (20, -150.0, 150.0, 150.0)"),
+    (random_waypoint, {"slowest_mps": 0}, "slowest_mps 0, fastest_mps 10"),
+    (random_waypoint, {"turn_time_s": 0}, "turn_time_s 0, must be 0 < slowest_mps ≤ fastest_mps, turn_time_s > 0"),
+    (
+        gauss_markov,
+        {"alpha": 1},
+        "alpha 1, speed_mps 8, speed_sigma_mps 1.5, step_s 1, turn_time_s 5, must be 0 ≤ alpha",
+    ),
+    (gauss_markov, {"speed_sigma_mps": -5}, "speed_sigma_mps -5, step_s 1, turn_time_s 5, must be 0 ≤ alpha < 1"),
+    (gauss_markov, {"step_s": 60}, "steps of 1200 m are too long for (-150.0, -150.0, 150.0, 150.0)"),
+]
+
+
+def test_parameters_that_mean_nothing_are_refused() -> None:
+    wrong = {}
+    for model, options, said in MEANINGLESS:
+        with pytest.raises(PluginError) as refused:
+            model(TIMES_S, starts(2), rng(), **options)
+        if said not in str(refused.value):
+            wrong[model.__name__, *options] = str(refused.value)
+    assert wrong == {}
 
 
 def test_a_class_plans_in_flight_and_a_function_does_not() -> None:

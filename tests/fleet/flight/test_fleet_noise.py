@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.signal import lfilter
 
-from sortie.fleet.flight import noise
 from sortie.fleet.flight.noise import gauss_markov, smooth
 
 steps = st.floats(0.001, 2.0)
@@ -68,8 +66,3 @@ def test_zero_sigma_is_silence_and_longer_series_begin_alike() -> None:
     assert not smooth(normals, 0.0, 2.0, 0.1)[0].any()
     np.testing.assert_array_equal(smooth(normals, 1.0, 2.0, 0.1)[0][:20], smooth(normals[:20], 1.0, 2.0, 0.1)[0])
     np.testing.assert_array_equal(gauss_markov(normals, 1.0, 2.0, 0.1)[:20], gauss_markov(normals[:20], 1.0, 2.0, 0.1))
-
-
-def test_a_lag_is_the_recursive_filter() -> None:
-    driven = np.random.default_rng(1).standard_normal((50, 3, 2))
-    np.testing.assert_allclose(noise._Lag(0.9).block(driven), lfilter([1.0], [1.0, -0.9], driven, axis=0), rtol=1e-14)

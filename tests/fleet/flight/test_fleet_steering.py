@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+from sortie.fleet.flight.displaced import steered
+from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, attitude, fly
 from sortie.fleet.flight.steering import (
     VELOCITY_LASTS_S,
     GoTo,
@@ -26,24 +30,13 @@ from sortie.scenarios.schema import Fleet, Steering
 STILL = SteeredWay(0.0, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0))
 LIMITS = Steering()
 
+
 places = st.tuples(st.floats(-150, 150), st.floats(-150, 150), st.floats(20, 110))
 commands = st.one_of(
     st.builds(lambda p, v: GoTo(*p, v), places, st.none() | st.floats(0.5, 20)),
     st.builds(Velocity, st.floats(-12, 12), st.floats(-12, 12), st.floats(-6, 6)),
     st.just(Hold()),
 )
-
-
-def test_a_command_of_a_crawl_is_judged_at_few_instants() -> None:
-    """A way of 100,000 s is straight but for its begin and its end; a million instants of it would take 100 MB."""
-    crawl = steer(STILL, GoTo(100.0, 0.0, 60.0, 1e-3), 0.0, LIMITS)
-    assert crawl.rests_s > 99_000.0
-    tracemalloc.start()
-    try:
-        assert refusal(crawl, 0.0, np.array(STILL.place_m), Fleet()) == ""
-        assert tracemalloc.get_traced_memory()[1] < 5e6
-    finally:
-        tracemalloc.stop()
 
 
 @settings(max_examples=50, deadline=None)
@@ -71,18 +64,28 @@ def test_whatever_is_commanded_is_within_the_bounds(given_commands: list[tuple[G
         np.testing.assert_allclose(end[0][1], given_commands[-1][0][:3], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("command", "takes_s"),
-    [
-        (GoTo(200.0, 0.0), 200 / 8 + 2.25 * 8 / 2),  # cruise, and half of each change
-        (GoTo(3.0, 4.0), 2 * math.sqrt(2.25 * 5 / 2)),  # no cruise: twice the root of 2.25 · 5 m / 2 m/s²
+def test_a_command_of_a_crawl_is_judged_at_few_instants() -> None:
+    """A way of 100,000 s is straight but for its begin and its end; a million instants of it would take 100 MB."""
+    crawl = steer(STILL, GoTo(100.0, 0.0, 60.0, 1e-3), 0.0, LIMITS)
+    assert crawl.rests_s > 99_000.0
+    tracemalloc.start()
+    try:
+        assert refusal(crawl, 0.0, np.array(STILL.place_m), Fleet()) == ""
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_place_is_reached_as_fast_as_the_bounds_allow() -> None:
+    """At cruise speed, and half of each change of velocity; where there is no cruise, twice a root."""
+    for command, takes_s in (
+        (GoTo(200.0, 0.0), 200 / 8 + 2.25 * 8 / 2),
+        (GoTo(3.0, 4.0), 2 * math.sqrt(2.25 * 5 / 2)),  # 5 m at 2 m/s²
         (GoTo(0.0, 0.0, 90.0), 30 / 3 + 2.25 * 3 / 2),  # climbs
         (GoTo(80.0, 0.0, None, 4.0), 80 / 4 + 2.25 * 4 / 2),
-    ],
-)
-def test_a_place_is_reached_as_fast_as_the_bounds_allow(command: GoTo, takes_s: float) -> None:
-    last = steer(STILL, command, 0.0, LIMITS).changes[-1]
-    assert last.begin_s + last.width_s == pytest.approx(takes_s, rel=1e-4)
+    ):
+        last = steer(STILL, command, 0.0, LIMITS).changes[-1]
+        assert last.begin_s + last.width_s == pytest.approx(takes_s, rel=1e-4), command
 
 
 def test_a_velocity_lasts_two_seconds_and_ends_at_rest() -> None:
@@ -96,43 +99,107 @@ def test_a_velocity_lasts_two_seconds_and_ends_at_rest() -> None:
     assert fast[0] / fast[1] == pytest.approx(0.75)
 
 
-@pytest.mark.parametrize(
-    ("command", "changes", "said"),
-    [
-        (GoTo(100.0, 0.0), {}, ""),
-        (GoTo(201.0, 0.0), {}, "would leave its reach of 200 m"),
-        (GoTo(0.0, 0.0, 121.0), {}, "would leave the altitudes of 10 to 120 m"),
-        (GoTo(0.0, 0.0, 9.0), {}, "would leave the altitudes of 10 to 120 m"),
-        (GoTo(60.0, 0.0), {"fence_m": [-50, -50, 50, 50]}, "would leave the fence"),
-        (GoTo(49.0, 0.0), {"fence_m": [-50, -50, 50, 50]}, "would leave the fence"),  # the jitter needs room
-        (GoTo(47.0, 0.0), {"fence_m": [-50, -50, 50, 50]}, ""),
-        (Velocity(0.0, 8.0), {"fence_m": [-50, -50, 50, 20]}, "would leave the fence"),
-    ],
-)
-def test_ways_keep_within_reach_altitudes_and_fence(
-    command: GoTo | Velocity, changes: dict[str, list[float]], said: str
-) -> None:
-    fleet = Fleet.model_validate({"steering": changes})
-    way = steer(STILL, command, 0.0, fleet.steering)
-    assert refusal(way, 0.0, np.array(STILL.place_m), fleet) == said
+def test_a_share_of_a_command_is_a_share_of_its_way_or_of_its_velocity() -> None:
+    still = SteeredWay(0.0, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0))
+    for share in (1.0, 0.5):
+        np.testing.assert_allclose(
+            steer(still, GoTo(40.0, 0.0), 0.0, Steering(), share).end_m, (40.0 * share, 0, 60), atol=1e-6
+        )
+        fast = steer(still, Velocity(0.0, 6.0), 0.0, Steering(), share)
+        assert fast.at(np.arange(0.0, 20.0, 0.01))[1][:, 1].max() == pytest.approx(6.0 * share)
+    slow = Steering(acceleration_mps2=0.5)
+    long = steer(still, Velocity(0.0, 6.0), 0.0, slow)  # it takes 27 s to get so fast, and then as long to rest
+    velocity = long.at(np.arange(0.0, 80.0, 0.01))[1][:, 1]
+    assert velocity.max() == pytest.approx(6.0)
+    assert velocity.min() >= -1e-9
+    assert steer(long, Hold(), 5.0, slow).until(5.0)[1] == pytest.approx(27.0)
 
 
-def test_who_is_outside_may_come_back() -> None:
-    fleet = Fleet.model_validate({"steering": {"reach_m": 20, "fence_m": [-9, -9, 9, 9]}})
-    outside = SteeredWay(0.0, (30.0, 0.0, 60.0), (0.0, 0.0, 0.0))
-    start = np.array(STILL.place_m)
-    assert not refusal(steer(outside, GoTo(0.0, 0.0), 0.0, fleet.steering), 0.0, start, fleet)
-    assert refusal(steer(outside, GoTo(31.0, 0.0), 0.0, fleet.steering), 0.0, start, fleet)
+Place = tuple[float, float, float]
+
+
+def refused(place: Place, command: GoTo | Velocity, **limits: Any) -> str:
+    """Why a drone that is at this place may not fly so; it began at (0, 0, 60). Its jitter is half a metre."""
+    fleet = Fleet.model_validate({"steering": limits, "motion": {"pose_jitter_m": 0.5}})
+    way = steer(SteeredWay(0.0, place, (0.0, 0.0, 0.0)), command, 0.0, fleet.steering)
+    return refusal(way, 0.0, np.array((0.0, 0.0, 60.0)), fleet)
+
+
+HERE: Place = (0.0, 0.0, 60.0)
+REACH, FENCE = "would leave its reach of 200 m", "would leave the fence"
+HEIGHTS = "would leave the altitudes of 10 to 120 m"
+BOUNDS: list[tuple[Place, GoTo | Velocity, str]] = [
+    (HERE, GoTo(190, 0), ""),
+    (HERE, GoTo(201, 0), REACH),
+    ((230, 0, 60), GoTo(220, 0), ""),  # who is beyond a bound may come nearer
+    ((230, 0, 60), GoTo(240, 0), REACH),
+    (HERE, GoTo(0, 0, 121), HEIGHTS),
+    (HERE, GoTo(0, 0, 9), HEIGHTS),
+    ((0, 0, 5), GoTo(0, 0, 8), ""),
+    ((0, 0, 5), GoTo(0, 0, 4), HEIGHTS),
+    ((0, 0, 130), GoTo(0, 0, 125), ""),
+    ((0, 0, 130), GoTo(0, 0, 135), HEIGHTS),
+]
+WITHIN_A_FENCE: list[tuple[Place, GoTo | Velocity, str]] = [
+    (HERE, GoTo(47, 0), ""),
+    (HERE, GoTo(48, 0), FENCE),  # five jitters
+    (HERE, GoTo(0, -48), FENCE),
+    (HERE, Velocity(0, 2), ""),
+    (HERE, Velocity(0, 20), FENCE),
+    ((60, 0, 60), GoTo(55, 0), ""),
+    ((60, 0, 60), GoTo(65, 0), FENCE),
+]
+
+
+def test_ways_keep_within_reach_altitudes_and_fence() -> None:
+    fence = {"fence_m": (-50.0, -50.0, 50.0, 50.0)}
+    free = {row[:2]: refused(*row[:2]) for row in BOUNDS}
+    fenced = {row[:2]: refused(*row[:2], **fence) for row in WITHIN_A_FENCE}
+    assert free == {row[:2]: row[2] for row in BOUNDS}
+    assert fenced == {row[:2]: row[2] for row in WITHIN_A_FENCE}
 
 
 def test_the_nearest_approach_is_found_between_frames() -> None:
-    """Two drones cross between two frames: by hand."""
+    """Two drones cross between two frames, by hand; and one flies past that is nearest at any part of a frame."""
     ours = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     others = np.array([[[2.0, 1.0, 0.0], [9.0, 0.0, 0.0]], [[0.0, 1.0, 0.0], [9.0, 0.0, 0.0]]])
     np.testing.assert_allclose(nearest_m(ours, others), [1.0, 7.0])
+    for at in (0.1, 0.5, 0.9):
+        passing = np.zeros((3, 1, 3))
+        passing[:, 0, 0] = np.array([0.0, 10.0, 20.0]) - 10.0 * at
+        passing[:, 0, 1] = 2.0
+        assert nearest_m(np.zeros((3, 3)), passing) == pytest.approx([2.0])
 
 
-def test_the_area_of_planners_is_their_reach_within_the_fence() -> None:
-    fleet = Fleet.model_validate({"drones": 2, "formation": {"spacing_m": 20}, "steering": {"reach_m": 100, "fence_m": [-60, -500, 500, 500]}})  # fmt: skip
-    assert steered_area_m(fleet, lambda group: True) == (-60, -100, 120, 100)
-    assert steered_area_m(fleet, lambda group: False) is None
+def test_planners_may_fly_where_their_reach_and_the_fence_both_allow() -> None:
+    """About where each of them begins: of the formation, of groups, or of both, as they have one."""
+    groups = ({"drones": [2], "route": {"waypoints_m": [[500.0, 0.0]]}},)
+    of = {"drones": 3, "formation": {"shape": "line", "spacing_m": 30.0}, "groups": groups}
+    fleet = Fleet.model_validate({**of, "steering": {"reach_m": 100.0}})
+    fenced = Fleet.model_validate({**of, "steering": {"reach_m": 100.0, "fence_m": (-60.0, -500.0, 700.0, 90.0)}})
+    assert steered_area_m(fleet, lambda each: True) == pytest.approx((-100.0, -100.0, 600.0, 130.0))
+    assert steered_area_m(fleet, lambda each: each is fleet) == pytest.approx((-100.0, -100.0, 100.0, 130.0))
+    assert steered_area_m(fleet, lambda each: each is not fleet) == pytest.approx((400.0, -100.0, 600.0, 100.0))
+    assert steered_area_m(fenced, lambda each: True) == pytest.approx((-60.0, -100.0, 600.0, 90.0))
+    assert steered_area_m(fleet, lambda each: False) is None
+
+
+def test_a_steered_drone_tilts_as_its_motion_and_its_own_wind_ask() -> None:
+    fleet = Fleet.model_validate({"drones": 2, "motion": {"pose_error_m": 2.0, "heading_error_deg": 5.0}})
+    base = fly(fleet, 10.0, 0.1, 3)
+    way = steer(SteeredWay(3.0, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0)), Velocity(6.0, -3.0, 1.0), 3.0, Steering())
+    shift, speed, push = way.at(base.time_s[30:])
+    shift = shift - np.array([0.0, 0.0, 60.0])
+    moved = steered(base, base, {1: (shift, speed, push)}, 30)
+    np.testing.assert_allclose(moved.position_m[30:, 1], base.position_m[30:, 1] + shift)
+    np.testing.assert_allclose(
+        moved.est_position_m - moved.position_m, base.est_position_m - base.position_m, atol=1e-9
+    )
+    thrust = moved.acceleration_mps2[30:, 1] + DRAG_PER_S * (moved.velocity_mps[30:, 1] - base.wind_mps[30:, 1])
+    thrust[:, 2] += GRAVITY_MPS2
+    wanted = Rotation.from_quat(attitude(thrust, np.zeros(len(thrust))))
+    apart = (Rotation.from_quat(moved.orientation_xyzw[30:, 1]).inv() * wanted).magnitude()
+    assert apart.max() < 1e-9
+    turn = [np.mod(m.est_yaw_rad - m.yaw_rad + np.pi, 2 * np.pi) for m in (base, moved)]
+    np.testing.assert_allclose(turn[1], turn[0], atol=1e-9)
+    assert ((moved.orientation_xyzw[1:] * moved.orientation_xyzw[:-1]).sum(axis=-1) > 0).all()

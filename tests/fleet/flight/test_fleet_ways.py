@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from sortie.fleet.flight.steps import Staircase, Step, landing_s
 from sortie.scenarios.schema import Fleet, FlightGroup
 
 CALM = {"wind_mps": [0, 0], "gust_sigma_mps": 0, "pose_jitter_m": 0, "pose_error_m": 0, "heading_error_deg": 0}
+
+
 SCOUT = {
     "drones": [3],
     "formation": {"altitude_m": 30},
@@ -40,15 +43,39 @@ def flown(duration_s: float = 60.0, **changes: Any) -> tuple[Fleet, Trajectories
 def test_legs_are_flown_as_they_are_written() -> None:
     _, motion = flown(drones=4, groups=[SCOUT])
     at = {t: motion.position_m[round(t * 10), 3] for t in (0, 0.1, 6, 12, 18, 24, 26, 29.9)}
-    for t, place in (
-        (0, (0, 40, 0)), (6, (0, 40, 15)), (12, (0, 40, 30)), (18, (30, 40, 30)), (24, (60, 40, 30)), (26, (60, 40, 30)),
-    ):  # fmt: skip
+    places = {0: (0, 40, 0), 6: (0, 40, 15), 12: (0, 40, 30), 18: (30, 40, 30), 24: (60, 40, 30), 26: (60, 40, 30)}
+    for t, place in places.items():
         np.testing.assert_allclose(at[t], place, atol=1e-9)
     np.testing.assert_allclose(motion.position_m[325, 3], (60, 55, 37.5), atol=1e-9)  # half way north and up
     np.testing.assert_allclose(motion.velocity_mps[325, 3], (0, 6, 3), atol=1e-9)  # as fast as its climb allows
     back_s = 35 + np.hypot(60, 30) / 6
     assert landing_s(FlightGroup.model_validate(SCOUT)) == pytest.approx(back_s + 1)
     np.testing.assert_allclose(motion.position_m[round(back_s * 10) + 12, 3], (0, 40, 45), atol=1e-9)
+
+
+def legs(*steps: dict[str, Any]) -> np.ndarray:
+    route = {"waypoints_m": [[0, 0], [40, 0]], "speed_mps": 4, "turn_time_s": 0.2}
+    group = {"drones": [0], "formation": {"altitude_m": 30}, "route": route, "legs": list(steps)}
+    fleet = Fleet.model_validate({"drones": 1, "motion": CALM, "groups": [group]})
+    return np.asarray(fly(fleet, 60.0, 0.1, seed=1).velocity_mps[:, 0])
+
+
+def test_a_leg_is_flown_at_its_own_speed_and_others_at_the_route_s() -> None:
+    """The route 10 s at 4 m/s; 80 m at 8; 30 m north at 4; the way home at 10."""
+    home, rest = {"action": "return", "speed_mps": 10}, {"action": "hold", "for_s": 1}
+    velocity = legs({"to_m": [120, 0], "speed_mps": 8}, {"to_m": [120, 30]}, home, rest)
+    level = np.hypot(velocity[:, 0], velocity[:, 1])
+    home_s = 27.5 + math.hypot(120, 30) / 10
+    np.testing.assert_allclose(
+        level[[50, 150, 230, 320, round(home_s * 10) + 5]], [4.0, 8.0, 4.0, 10.0, 0.0], atol=1e-9
+    )
+
+
+def test_the_way_home_ends_at_its_own_height() -> None:
+    """A return with an altitude climbs to it; one without stays where it is."""
+    for step, climbs in (({"action": "return", "altitude_m": 45}, True), ({"action": "return"}, False)):
+        velocity = legs({"to_m": [100, 0]}, step)
+        assert bool(velocity[:, 2].max() > 0.1) is climbs
 
 
 def test_a_drone_on_the_ground_does_not_sway_and_rises_as_one_piece() -> None:
@@ -60,13 +87,6 @@ def test_a_drone_on_the_ground_does_not_sway_and_rises_as_one_piece() -> None:
     for value, rate in ((motion.position_m, motion.velocity_mps), (motion.velocity_mps, motion.acceleration_mps2)):
         numeric = (value[2:, 3] - value[:-2, 3]) / 0.2
         np.testing.assert_allclose(numeric, rate[1:-1, 3], atol=0.2)  # central differences over 0.2 s
-
-
-def test_climbing_costs_power() -> None:
-    fleet, motion = flown(drones=4, groups=[SCOUT])
-    power_w = fleet_power_w(fleet, motion)
-    weight_n = fleet.airframe.mass_kg * 9.81
-    assert power_w[60, 3] - power_w[120, 3] == pytest.approx(3 * weight_n, rel=0.01)  # the formula adds m·g·v_z
 
 
 def test_drones_of_other_heights_leave_the_ground_together() -> None:
@@ -142,45 +162,42 @@ def test_a_staircase_is_the_polyline_smoothed_by_a_quadratic_b_spline(
     np.testing.assert_allclose(position, brute, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"groups": [{"drones": [7]}]}, "groups.0.drones.0: 7, must be below fleet.drones = 5"),
-        (
-            {"groups": [{"drones": [1]}, {"drones": [2, 1]}]},
-            "groups.1.drones.1: 1, must be named once, it is in groups.0 already",
-        ),
-        (
-            {"groups": [{"drones": [1]}], "ground": [{"drone": 1}]},
-            "ground.0.drone: 1, must be named once, it is in groups.0 already",
-        ),
-        (
-            {"groups": [{"drones": [1], "legs": [{"action": "land"}, {"to_m": [1, 1]}]}]},
-            "legs.0.action: land, must be the last leg",
-        ),
-        ({"groups": [{"drones": [1], "legs": [{"action": "hold"}]}]}, "for_s: missing, must be given for hold"),
-        (
-            {"groups": [{"drones": [1], "legs": [{"action": "land", "speed_mps": 3}]}]},
-            "speed_mps: 3.0, must be left out for land",
-        ),
-        (
-            {
-                "groups": [{"drones": [1], "legs": [{"to_m": [1, 1]}, {"to_m": [2, 2], "altitude_m": 395}]}],
-                "makes": [{"name": "high", "drones": [1], "altitude_offset_m": 10}],
-            },
-            "makes.0.altitude_offset_m: 10, must be such that its drones fly at 10 to 400 m, "
-            "groups.0.legs.1.altitude_m is 395",
-        ),
-        (
-            {
-                "groups": [{"drones": [2]}, {"drones": [1], "formation": {"altitude_m": 399}}],
-                "makes": [{"name": "high", "drones": [1], "altitude_offset_m": 10}],
-            },
-            "fly at 10 to 400 m, groups.1.formation.altitude_m is 399",
-        ),
-    ],
-)
-def test_what_does_not_fit_is_refused(changes: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=r".") as refused:
-        Fleet.model_validate(changes)
-    assert said in str(refused.value)
+LANDS_FIRST = [{"action": "land"}, {"to_m": [1, 1]}]
+CLIMBS = [{"to_m": [1, 1]}, {"to_m": [2, 2], "altitude_m": 395}]
+HIGH = [{"name": "high", "drones": [1], "altitude_offset_m": 10}]
+TOO_HIGH = "must be such that its drones fly at 10 to 400 m"
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"groups": [{"drones": [7]}]}, "groups.0.drones.0: 7, must be below fleet.drones = 5"),
+    (
+        {"groups": [{"drones": [1]}, {"drones": [2, 1]}]},
+        "groups.1.drones.1: 1, must be named once, it is in groups.0 already",
+    ),
+    (
+        {"groups": [{"drones": [1]}], "ground": [{"drone": 1}]},
+        "ground.0.drone: 1, must be named once, it is in groups.0 already",
+    ),
+    ({"groups": [{"drones": [1], "legs": LANDS_FIRST}]}, "legs.0.action: land, must be the last leg"),
+    ({"groups": [{"drones": [1], "legs": [{"action": "hold"}]}]}, "for_s: missing, must be given for hold"),
+    (
+        {"groups": [{"drones": [1], "legs": [{"action": "land", "speed_mps": 3}]}]},
+        "speed_mps: 3.0, must be left out for land",
+    ),
+    (
+        {"groups": [{"drones": [1], "legs": CLIMBS}], "makes": HIGH},
+        f"makes.0.altitude_offset_m: 10, {TOO_HIGH}, groups.0.legs.1.altitude_m is 395",
+    ),
+    (
+        {"groups": [{"drones": [2]}, {"drones": [1], "formation": {"altitude_m": 399}}], "makes": HIGH},
+        f"{TOO_HIGH}, groups.1.formation.altitude_m is 399",
+    ),
+]
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    wrong = {}
+    for changes, said in REFUSED:
+        with pytest.raises(ValueError, match=r".") as refused:
+            Fleet.model_validate(changes)
+        if said not in str(refused.value):
+            wrong[said] = str(refused.value)
+    assert wrong == {}

@@ -17,7 +17,6 @@ from sortie.fleet.logs.mavlink import Transmitter, messages, write_tlog
 from sortie.fleet.logs.telemetry import Telemetry
 
 ZURICH = Origin(47.0, 8.5, 400.0)
-# flies north-west at 5 m/s, nose 10° up, yaws left at 0.2 rad/s, climbs at 1 m/s
 STATE = Telemetry(
     time_s=12.3456,
     position_m=(30.0, 40.0, 60.0),
@@ -31,6 +30,7 @@ STATE = Telemetry(
     cpu_load=0.55,
     landed=False,
 )
+"""Flies north-west at 5 m/s, nose 10° up, yaws left at 0.2 rad/s, climbs at 1 m/s."""
 
 
 def sent(state: Telemetry = STATE) -> dict[str, mavlink2.MAVLink_message]:
@@ -45,19 +45,6 @@ def test_mavlink_2_from_system_drone_plus_one_and_numbered_in_a_row() -> None:
     assert [frame[0] for frame in frames] == [0xFD] * 11
     assert [frame[4] for frame in frames] == list(range(11))
     assert {frame[5] for frame in frames} == {3}
-    assert [m.get_type() for m in messages(STATE, ZURICH)] == [
-        "HEARTBEAT",
-        "ATTITUDE_QUATERNION",
-        "ATTITUDE",
-        "LOCAL_POSITION_NED",
-        "GLOBAL_POSITION_INT",
-        "SYS_STATUS",
-        "EXTENDED_SYS_STATE",
-        "BATTERY_STATUS",
-        "VFR_HUD",
-        "GPS_RAW_INT",
-        "HOME_POSITION",
-    ]
     for _ in range(300):
         last = transmitter.pack(messages(STATE, ZURICH)[0])
     assert last[4] == (10 + 300) % 256
@@ -70,19 +57,16 @@ def test_position_and_velocity_are_ned() -> None:
     assert m.time_boot_ms == 12346
 
 
-def test_attitude_is_frd_in_ned_w_first() -> None:
+def test_attitude_is_frd_in_ned_w_first_and_in_angles() -> None:
+    """North-west and nose up, yawing left, which is negative in NED; and north with the right wing down."""
     m = sent()["ATTITUDE_QUATERNION"]
-    yaw, pitch, roll = Rotation.from_quat([m.q2, m.q3, m.q4, m.q1]).as_euler("ZYX", degrees=True)
-    assert (yaw, pitch, roll) == pytest.approx((-45, 10, 0), abs=1e-4)  # north-west, nose up
-    assert (m.rollspeed, m.pitchspeed, m.yawspeed) == pytest.approx((0.01, -0.02, -0.2))  # left is negative in NED
-
-
-def test_attitude_in_angles() -> None:
-    m = sent()["ATTITUDE"]
-    assert [math.degrees(a) for a in (m.yaw, m.pitch, m.roll)] == pytest.approx((-45, 10, 0), abs=1e-4)
+    angles = Rotation.from_quat([m.q2, m.q3, m.q4, m.q1]).as_euler("ZYX", degrees=True)
+    assert angles == pytest.approx((-45, 10, 0), abs=1e-4)
+    assert (m.rollspeed, m.pitchspeed, m.yawspeed) == pytest.approx((0.01, -0.02, -0.2))
     rolled = tuple(Rotation.from_euler("ZYX", [90, 0, 20], degrees=True).as_quat().tolist())
-    m = sent(replace(STATE, orientation_xyzw=rolled))["ATTITUDE"]  # north, right wing down
-    assert [math.degrees(a) for a in (m.yaw, m.pitch, m.roll)] == pytest.approx((0, 0, 20), abs=1e-4)
+    for state, wanted in ((STATE, (-45, 10, 0)), (replace(STATE, orientation_xyzw=rolled), (0, 0, 20))):
+        m = sent(state)["ATTITUDE"]
+        assert [math.degrees(a) for a in (m.yaw, m.pitch, m.roll)] == pytest.approx(wanted, abs=1e-4)
 
 
 def test_global_position() -> None:
@@ -107,19 +91,22 @@ def test_battery_and_health() -> None:
     assert heartbeat.base_mode & mavlink2.MAV_MODE_FLAG_SAFETY_ARMED
 
 
-def test_landed_is_disarmed_and_large_packs_overflow_into_the_second_slot() -> None:
-    large = sent(replace(STATE, voltage_v=100.0, current_a=500.0, landed=True))
-    assert large["HEARTBEAT"].base_mode == 0
-    assert large["EXTENDED_SYS_STATE"].landed_state == mavlink2.MAV_LANDED_STATE_ON_GROUND
+def test_landed_is_disarmed_and_so_is_a_ground_station_of_the_fleet() -> None:
+    landed, station = (sent(replace(STATE, **{what: True})) for what in ("landed", "ground_station"))
+    assert landed["HEARTBEAT"].base_mode == station["HEARTBEAT"].base_mode == 0
+    assert landed["EXTENDED_SYS_STATE"].landed_state == mavlink2.MAV_LANDED_STATE_ON_GROUND
     assert sent()["EXTENDED_SYS_STATE"].landed_state == mavlink2.MAV_LANDED_STATE_IN_AIR
-    assert large["HEARTBEAT"].system_status == mavlink2.MAV_STATE_STANDBY
-    assert large["BATTERY_STATUS"].voltages == [65534, 34466] + [65535] * 8
-    assert large["SYS_STATUS"].voltage_battery == 65535
-    assert large["SYS_STATUS"].current_battery == 32767
+    assert landed["HEARTBEAT"].system_status == mavlink2.MAV_STATE_STANDBY
+    assert not {"VFR_HUD", "GPS_RAW_INT", "HOME_POSITION"} & station.keys()
+    assert station["HEARTBEAT"].type == mavlink2.MAV_TYPE_GCS
 
 
 def test_what_a_trace_may_tell_fits_the_wire() -> None:
-    """Voltages to 200 V, currents of either sign, a jump of 20 km within a row."""
+    """Voltages to 200 V, which overflow into further slots, currents of either sign, a jump of 20 km within a row."""
+    large = sent(replace(STATE, voltage_v=100.0, current_a=500.0))
+    assert large["BATTERY_STATUS"].voltages == [65534, 34466] + [65535] * 8
+    assert large["SYS_STATUS"].voltage_battery == 65535
+    assert large["SYS_STATUS"].current_battery == 32767
     far = sent(replace(STATE, voltage_v=200.0, current_a=-500.0, velocity_mps=(2e5, -2e5, 0.0)))
     assert far["BATTERY_STATUS"].voltages == [65534, 65534, 65534, 3398] + [65535] * 6
     assert far["SYS_STATUS"].current_battery == far["BATTERY_STATUS"].current_battery == -32767
@@ -138,12 +125,6 @@ def test_what_a_ground_station_s_instruments_show() -> None:
     assert home.latitude / 1e7 == pytest.approx(47 - 20 / 111_177, abs=2e-7)
     hovering = sent(replace(STATE, velocity_mps=(0.0, 0.01, 0.0)))["GPS_RAW_INT"]
     assert hovering.cog == 65535
-
-
-def test_a_ground_station_of_the_fleet_has_no_instruments() -> None:
-    seen = sent(replace(STATE, ground_station=True))
-    assert not {"VFR_HUD", "GPS_RAW_INT", "HOME_POSITION"} & seen.keys()
-    assert seen["HEARTBEAT"].type == mavlink2.MAV_TYPE_GCS
 
 
 def test_health_says_what_fails_and_nothing_else() -> None:
