@@ -7,9 +7,7 @@ from fleet_examples import DESCRIPTOR
 
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.wire import (
-    decode_descriptor,
     decode_directive,
-    encode_descriptor,
     encode_directive,
 )
 from sortie.policies.checks import check_directives
@@ -49,18 +47,6 @@ def test_directives_carry_their_number() -> None:
         assert decode_directive(data).representation is rung
     with pytest.raises(MalformedDatagram, match=r"representation is 7, must be in \[0, 6\]"):
         decode_directive(data[:6] + b"\7" + data[7:])
-
-
-def test_a_descriptor_names_a_codebook_of_its_own_and_only_then() -> None:
-    own = DESCRIPTOR._replace(codebook="0123456789abcd")
-    plain, grown = encode_descriptor(DESCRIPTOR), encode_descriptor(own)
-    assert grown == plain + b"\2" + b"\3\7\0" + bytes.fromhex("0123456789abcd")  # version, type, length, digest
-    assert decode_descriptor(grown) == own
-    assert decode_descriptor(plain).codebook == ""
-    with pytest.raises(MalformedDatagram, match="codebook has 6 B, must have 7"):
-        decode_descriptor(plain + b"\2" + b"\3\6\0" + bytes(6))
-    with pytest.raises(ValueError, match="codebook is 'mine', must be 14 digits"):
-        encode_descriptor(DESCRIPTOR._replace(codebook="mine"))
 
 
 def view(**of_peer: str) -> FleetView:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 
 import pytest
 from fleet_examples import DESCRIPTOR, extended_descriptors
 from hypothesis import given
+from hypothesis import strategies as st
 
 from sortie.fleet.messages import extensions
 from sortie.fleet.messages.auth import Opened, Sealer, open_datagram
@@ -23,7 +25,6 @@ from sortie.policies.damping import apply_hysteresis
 Encode = Callable[[Descriptor], bytes]
 SMALL = Form(8, 1, 16)
 ENCODERS: list[Encode] = [encode_descriptor, partial(encode_compact, form=FULL), partial(encode_compact, form=SMALL)]
-each_form = pytest.mark.parametrize("encode", ENCODERS, ids=["cdr", "compact", "small"])
 MEMBER = DESCRIPTOR._replace(roster=Roster(7, (1, 3, 9)), peer_goodput_mbps=(80.0, 12.5))
 """Drone 3: 80 Mb/s to drone 1, 12.5 Mb/s to drone 9."""
 
@@ -35,9 +36,6 @@ def read_by_an_older_version(data: bytes) -> Descriptor:
         return decode_descriptor.__wrapped__(data)
 
 
-# --- the bytes -----------------------------------------------------------------------------------
-
-
 def test_the_roster_by_hand() -> None:
     """Goodput by ascending id up to drone 9, without drone 3 itself; epoch and a bit for each of 1, 3 and 9 in the block."""
     plain = DESCRIPTOR._replace(peer_goodput_mbps=(0.0, 80.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 12.5))
@@ -46,19 +44,17 @@ def test_the_roster_by_hand() -> None:
         assert encode(MEMBER) == encode(plain) + expected
 
 
-@pytest.mark.parametrize("drones", [1, 2, 5, 64, 200])
-def test_any_fleet_fits_a_kilobyte(drones: int) -> None:
-    d = DESCRIPTOR._replace(agent_id=0, roster=Roster(2**32 - 1, tuple(range(drones))))
-    d = d._replace(
-        peer_goodput_mbps=tuple(float(i) for i in range(1, drones)), feature_space="", priority_target_ids=(1,)
-    )
-    data = encode_descriptor(d)
-    assert len(data) == 164 + 4 * (drones - 1) + 2 + 1 + 3 + 4 + -(-drones // 8) <= MAX_DESCRIPTOR_BYTES
-    assert decode_descriptor(data) == d
+def test_any_fleet_fits_a_kilobyte() -> None:
+    for drones in (1, 2, 5, 64, 200):
+        links = tuple(float(i) for i in range(1, drones))
+        roster = Roster(2**32 - 1, tuple(range(drones)))
+        d = DESCRIPTOR._replace(agent_id=0, roster=roster, peer_goodput_mbps=links, priority_target_ids=(1,))
+        data = encode_descriptor(d)
+        assert len(data) == 164 + 4 * (drones - 1) + 2 + 1 + 3 + 4 + -(-drones // 8) <= MAX_DESCRIPTOR_BYTES
+        assert decode_descriptor(data) == d
 
 
-@each_form
-@given(extended_descriptors.filter(lambda d: d.roster is not None))
+@given(st.sampled_from(ENCODERS), extended_descriptors.filter(lambda d: d.roster is not None))
 def test_goodput_is_read_by_id(encode: Encode, d: Descriptor) -> None:
     """Each member's own, unknown for all others; exact but for the small form's rounding."""
     assert d.roster is not None
@@ -73,11 +69,7 @@ def test_goodput_is_read_by_id(encode: Encode, d: Descriptor) -> None:
         assert back.goodput_to(stranger) == d.goodput_to(stranger) == 0.0
 
 
-# --- mixed versions ------------------------------------------------------------------------------
-
-
-@each_form
-@given(extended_descriptors)
+@given(st.sampled_from(ENCODERS), extended_descriptors)
 def test_an_older_reader_reads_the_same_goodputs(encode: Encode, d: Descriptor) -> None:
     """It takes no peer for another. It passes over the roster, and all that follows from ids is as in the newer reader."""
     data = encode(d)
@@ -125,42 +117,28 @@ def test_a_roster_in_an_unknown_form_is_the_newer_senders_right() -> None:
         assert decode_descriptor(encode_descriptor(plain) + block) == plain
 
 
-# --- what is refused -----------------------------------------------------------------------------
+FORM = "must be an epoch of 4 B and the bits of ids up to 254"
+MALFORMED = {
+    "no ids": (b"", f"roster is 07000000, {FORM}, the last byte not 0"),
+    "zero at the end": (b"\x0a\x00", f"roster is 070000000a00, {FORM}"),
+    "id 255": (bytes(31) + b"\x80", FORM),
+    "id 256": (bytes(32) + b"\x01", FORM),
+    "a list too long": (b"\x0a\x01", r"roster \(1, 3, 8\) of drone 3 does not fit its peer_goodput of 9 entries"),
+    "too short": (b"\x0a\x04", r"roster \(1, 3, 10\) of drone 3 does not fit its peer_goodput of 9 entries"),
+    "goodput of no member": (b"\x08\x02", r"roster \(3, 9\) of drone 3 does not fit"),
+    "itself": (b"\x02\x02", r"roster \(1, 9\) of drone 3 does not fit .* it must hold the drone"),
+}
 
 
-@each_form
-@pytest.mark.parametrize(
-    ("bits", "reason"),
-    [
-        (b"", "roster is 07000000, must be an epoch of 4 B and the bits of ids up to 254, the last byte not 0"),
-        (b"\x0a\x00", "roster is 070000000a00, must be an epoch of 4 B"),
-        (bytes(31) + b"\x80", "must be an epoch of 4 B and the bits of ids up to 254"),
-        (bytes(32) + b"\x01", "must be an epoch of 4 B and the bits of ids up to 254"),
-        (b"\x0a\x01", r"roster \(1, 3, 8\) of drone 3 does not fit its peer_goodput of 9 entries"),
-        (b"\x0a\x04", r"roster \(1, 3, 10\) of drone 3 does not fit its peer_goodput of 9 entries"),
-        (b"\x08\x02", r"roster \(3, 9\) of drone 3 does not fit"),
-        (b"\x02\x02", r"roster \(1, 9\) of drone 3 does not fit .* it must hold the drone"),
-    ],
-    ids=[
-        "no ids",
-        "zero at the end",
-        "id 255",
-        "id 256",
-        "a list too long",
-        "too short",
-        "goodput of no member",
-        "itself",
-    ],
-)
-def test_malformed_rosters(encode: Encode, bits: bytes, reason: str) -> None:
-    body = encode(MEMBER)[:-10]
-    with pytest.raises(MalformedDatagram, match=reason):
-        decode_descriptor(body + bytes([2, 2, 4 + len(bits), 0, 7, 0, 0, 0]) + bits)
+def test_malformed_rosters() -> None:
+    for encode, (bits, reason) in product(ENCODERS, MALFORMED.values()):
+        body = encode(MEMBER)[:-10]
+        with pytest.raises(MalformedDatagram, match=reason):
+            decode_descriptor(body + bytes([2, 2, 4 + len(bits), 0, 7, 0, 0, 0]) + bits)
 
 
-@pytest.mark.parametrize(
-    ("roster", "links", "reason"),
-    [
+def test_a_roster_that_the_wire_cannot_hold_is_refused() -> None:
+    for roster, links, reason in (
         (Roster(2**32, (3,)), 0, "roster.epoch is 4294967296, must be in"),
         (Roster(1, (3, 3)), 1, r"roster.members is \(3, 3\), must be ascending ids"),
         (Roster(1, (9, 3)), 1, r"roster.members is \(9, 3\), must"),
@@ -168,23 +146,17 @@ def test_malformed_rosters(encode: Encode, bits: bytes, reason: str) -> None:
         (Roster(1, ()), 0, "must be ascending ids in .*, one at least"),
         (Roster(1, (4,)), 0, "must hold agent_id = 3"),
         (Roster(1, (1, 3)), 2, "as many others as peer_goodput has entries, 2"),
-    ],
-)
-def test_a_roster_that_the_wire_cannot_hold_is_refused(roster: Roster, links: int, reason: str) -> None:
-    with pytest.raises(ValueError, match=reason):
-        encode_descriptor(DESCRIPTOR._replace(roster=roster, peer_goodput_mbps=(1.0,) * links))
+    ):
+        with pytest.raises(ValueError, match=reason):
+            encode_descriptor(DESCRIPTOR._replace(roster=roster, peer_goodput_mbps=(1.0,) * links))
 
 
-# --- in the contract -----------------------------------------------------------------------------
+# --- in the contract --------------------------------------------------------------------------------------
 
 
-def test_links_to_drones_off_the_roster_are_unknown() -> None:
-    assert [MEMBER.link_state(i) for i in (1, 9)] == [LinkState.MEASURED] * 2
-    assert MEMBER.link_state(4) == LinkState.UNKNOWN
+def test_goodputs_are_of_the_members_and_links_to_others_are_unknown() -> None:
+    assert [MEMBER.link_state(i) for i in (1, 9, 4)] == [LinkState.MEASURED] * 2 + [LinkState.UNKNOWN]
     assert [MEMBER.counts(i) for i in (1, 3, 9, 0, 4)] == [True, True, True, False, False]
-
-
-def test_a_list_by_id_for_who_needs_one() -> None:
     assert MEMBER.goodput_by_id(11) == (0.0, 80.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 12.5, 0.0)
     assert DESCRIPTOR.goodput_by_id(5) is DESCRIPTOR.peer_goodput_mbps
 
