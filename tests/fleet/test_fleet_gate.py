@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from sortie.fleet.gate import HEADER_BYTES, Gate, Payload, make_payload
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES
-from sortie.fleet.plane import codebooks
 from sortie.fleet.tiles import TILE_HEADER_BYTES, cells_of, cut
 from sortie.perception.types import Boxes
 from sortie.policies.contract import Directive, Disc, Representation
@@ -20,7 +19,6 @@ from sortie.policies.staleness import CEILING, DEGRADED_RATE_HZ, LinkHealth, cap
 from sortie.policies.verification.invariants.language import COMPARE
 from sortie.policies.verification.invariants.words import DECISIONS
 from sortie.radio.mac.airtime import fragments
-from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import (
     MIN_TILE_BYTES,
     Radio,
@@ -240,15 +238,6 @@ def test_compact_payloads_go_reliably() -> None:
     kinds = {r: made(FULL._replace(representation=r), 1) for r in list(Representation)[1:]}
     reliable = {Representation.TRACKS, Representation.DETECTIONS, Representation.UNCERTAIN_BOXES}
     assert {r for r, payload in kinds.items() if payload.reliable} == reliable
-
-
-def test_a_codebook_that_a_make_shares_with_the_fleet_is_the_fleet_s() -> None:
-    """It has no name of its own, wherever it lies; the file need not be there to see that."""
-    shared = loads(
-        "name: shared\nperception: {codebook: none/c.safetensors}\n"
-        "fleet: {makes: [{name: own, drones: [1], codebook: none/c.safetensors}]}"
-    )
-    assert codebooks(shared) == ("",) * 5
 
 
 # --- tiles ------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Exports of a record of a few rows, in which every value is another one: each stands in its own field, of its own drone."""
+"""Exports of a record by hand, in which every value is another one: each stands in its own field, of its own drone."""
 
 from __future__ import annotations
 
@@ -44,64 +44,93 @@ perception: {detector: surrogate, sample_rate_hz: 1}
 BEGIN_NS = 5_000_000_000
 NAN = math.nan
 CAR = {"length_m": 4.5, "width_m": 1.9, "yaw_rad": 0.5}
+COLUMNS = ("x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps", "p_radps", "q_radps", "r_radps")
+PACK = ("soc", "voltage_v", "current_a", "spent_j")
 
 
 def state(frame: int, drone: int) -> dict[str, Any]:
     """Ten times the drone and a hundredth of the frame, by the column."""
-    names = (
-        "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps", "p_radps", "q_radps", "r_radps", "soc", "voltage_v", "current_a", "spent_j",
-    )  # fmt: skip
-    values = {name: 10.0 * drone + k + frame / 100 for k, name in enumerate(names)}
+    values = {name: 10.0 * drone + k + frame / 100 for k, name in enumerate((*COLUMNS, *PACK))}
     half = 0.1 * (drone + 1) + 0.01 * frame
     turn = {"qx": 0.0, "qy": 0.0, "qz": math.sin(half), "qw": math.cos(half)}
     return {"t_s": float(frame), "drone": drone, "airborne": not (drone == 2 and frame == 2), **values, **turn}
 
 
+def flies(frame: int, group: int) -> dict[str, Any]:
+    """The fleet tracks target 0, and drone 2 searches for target 1 elsewhere."""
+    region = dict(
+        zip(("region_x_m", "region_y_m", "region_radius_m"), ((1.0, 2.0, 30.0), (7.0, 8.0, 9.0))[group], strict=True)
+    )
+    target = {"target": group, "target_x_m": (3.0 - group) * frame, "target_y_m": 40.0 * group}
+    return {"t_s": float(frame), "group": group, "phase": ("track", "search")[group], **target, **region}
+
+
+def claims(t_s: float, d: int) -> dict[str, Any]:
+    radius_m = 30.0 + d if t_s < 2 else NAN
+    return {
+        "t_s": t_s,
+        "drone": d,
+        "stamp_ns": round(t_s * 1e9) - 4_000_000,
+        "soc": 0.9 - d / 10,
+        "cpu_headroom": 0.5 + d / 10,
+        "gpu_headroom": 0.3 + d / 10,
+        "goodput_mbps": [10.0 * d + 1, 10.0 * d + 2],
+        "coverage_grid": bytes([d]) * 64,
+        "novelty_flags": TARGET_FLAG if d else 0,
+        "phase": "track" if d < 2 else "search",
+        **{"region_x_m": 1.0 + d, "region_y_m": 2.0 + d, "region_radius_m": radius_m},
+    }
+
+
+FIRST = {
+    "t_s": 0.5,
+    "drone": 1,
+    "peer": 2,
+    "representation": "features",
+    "rho": 0.25,
+    "rate_hz": 7.5,
+    "deadline_s": 0.35,
+}
+FIRST |= {
+    "roi_x_m": 3.0,
+    "roi_y_m": 4.0,
+    "roi_radius_m": 5.0,
+    "fusion_weight": 0.6,
+    "duty_percent": 80,
+    "reason": "first",
+}
+SECOND = {
+    "t_s": 1.5,
+    "drone": 0,
+    "peer": 1,
+    "representation": "detections",
+    "rho": 0.0,
+    "rate_hz": 2.0,
+    "deadline_s": 0.1,
+}
+SECOND |= {"roi_radius_m": NAN, "fusion_weight": 1.0, "duty_percent": 100, "reason": "second"}
+
+
 def exported() -> SortieRecord:
-    said = [(0.004, 0), (0.005, 1), (0.006, 2), (1.004, 1), (2.9, 0)]
+    published = [(0.004, 0), (0.005, 1), (0.006, 2), (1.004, 1), (2.9, 0)]
+    seen = {"t_s": 0.5, "drone": 0, **CAR}
+    found = ((0, 2.1, 3.0, 0.9), (0, -9.0, -8.0, 0.5), (2, 40.0, 41.0, 0.25))
     given = {
         "states": [state(frame, drone) for frame in range(3) for drone in range(3)],
-        "mission": [
-            {
-                "t_s": float(k), "group": g, "phase": "track" if g == 0 else "search", "target": g, "target_x_m": (3.0 - g) * k, "target_y_m": 40.0 * g,
-                "region_x_m": 1.0 + 6 * g, "region_y_m": 2.0 + 6 * g, "region_radius_m": 30.0 - 21 * g,
-            }
-            for k in range(3)
-            for g in range(2)
-        ],
-        "descriptors": [
-            {
-                "t_s": t_s, "drone": d, "stamp_ns": round(t_s * 1e9) - 4_000_000, "soc": 0.9 - d / 10, "cpu_headroom": 0.5 + d / 10, "gpu_headroom": 0.3 + d / 10,
-                "goodput_mbps": [10.0 * d + 1, 10.0 * d + 2], "coverage_grid": bytes([d]) * 64, "novelty_flags": TARGET_FLAG if d else 0,
-                "phase": "track" if d < 2 else "search", "region_x_m": 1.0 + d, "region_y_m": 2.0 + d, "region_radius_m": 30.0 + d if t_s < 2 else NAN,
-            }
-            for t_s, d in said
-        ],
-        "directives": [
-            {
-                "t_s": 0.5, "drone": 1, "peer": 2, "representation": "features", "rho": 0.25, "roi_x_m": 3.0, "roi_y_m": 4.0, "roi_radius_m": 5.0,
-                "rate_hz": 7.5, "deadline_s": 0.35, "fusion_weight": 0.6, "duty_percent": 80, "reason": "first",
-            },
-            {
-                "t_s": 1.5, "drone": 0, "peer": 1, "representation": "detections", "rho": 0.0, "roi_radius_m": NAN, "rate_hz": 2.0,
-                "deadline_s": 0.1, "fusion_weight": 1.0, "duty_percent": 100, "reason": "second",
-            },
-        ],
+        "mission": [flies(frame, group) for frame in range(3) for group in range(2)],
+        "descriptors": [claims(t_s, d) for t_s, d in published],
+        "directives": [FIRST, SECOND],
         "events": [
-            {"t_s": 0.2, "drone": -1, "kind": "jam", "text": "a jammer"}, {"t_s": 1.0, "drone": 1, "kind": "gnss_loss", "text": "lost GNSS"},
+            {"t_s": 0.2, "drone": -1, "kind": "jam", "text": "a jammer"},
+            {"t_s": 1.0, "drone": 1, "kind": "gnss_loss", "text": "lost GNSS"},
             {"t_s": 1.5, "drone": 1, "kind": "gnss_back", "text": "GNSS again"},
         ],
         "fusions": [
-            {"t_s": 0.5, "drone": 0, "detections": 2, "truths": 2}, {"t_s": 0.5, "drone": 2, "detections": 1, "truths": 0},
+            {"t_s": 0.5, "drone": d, "detections": k, "truths": k if d == 0 else 0} for d, k in ((0, 2), (2, 1))
         ],
-        "truths": [
-            {"t_s": 0.5, "drone": 0, "x_m": 2.0, "y_m": 3.0, **CAR, "car": 0}, {"t_s": 0.5, "drone": 0, "x_m": 22.0, "y_m": 23.0, **CAR, "car": 1},
-        ],
-        "detections": [
-            {"t_s": 0.5, "drone": 0, "x_m": 2.1, "y_m": 3.0, **CAR, "score": 0.9}, {"t_s": 0.5, "drone": 0, "x_m": -9.0, "y_m": -8.0, **CAR, "score": 0.5},
-            {"t_s": 0.5, "drone": 2, "x_m": 40.0, "y_m": 41.0, **CAR, "score": 0.25},
-        ],
-    }  # fmt: skip
+        "truths": [{**seen, "x_m": 2.0, "y_m": 3.0, "car": 0}, {**seen, "x_m": 22.0, "y_m": 23.0, "car": 1}],
+        "detections": [{**seen, "drone": d, "x_m": x, "y_m": y, "score": score} for d, x, y, score in found],
+    }
     return replace(record(), scenario=loads(SCENARIO), tables=tables_of(given))
 
 
@@ -139,50 +168,60 @@ def test_a_descriptor_has_the_fields_of_its_row_and_the_pose_of_its_frame() -> N
         assert d.footprint_radius_m == pytest.approx(math.tan(math.radians(35)) * s["z_m"])
 
 
-def flight() -> dict[str, list[tuple[float, Any]]]:
+def test_a_blind_station_has_no_footprint_and_no_network() -> None:
+    settings = SCENARIO.replace("  overrides:", "  ground: [{drone: 2, position_m: [20, 21, 22]}]\n  overrides:")
+    made = [d for _, d in descriptors(replace(exported(), scenario=loads(settings)))]
+    blind = {"footprint_radius_m": 0.0, "feature_space": "none"}
+    plain = [d for _, d in descriptors(exported())]
+    assert made == [d._replace(**blind) if d.agent_id == 2 else d for d in plain]
+
+
+Told = dict[str, list[tuple[float, Any]]]
+
+
+def told_of(made: SortieRecord) -> Told:
     """The bag's messages by topic."""
-    origin = Origin(47.0, 8.0, 400.0)
-    made: dict[str, list[tuple[float, Any]]] = {}
-    for stream in bag._streams(exported(), bag._makers(get_typestore(Stores.ROS2_HUMBLE).types), BEGIN_NS, origin):
+    found: Told = {}
+    types = bag._makers(get_typestore(Stores.ROS2_HUMBLE).types)
+    for stream in bag._streams(made, types, BEGIN_NS, Origin(47.0, 8.0, 400.0)):
         for m in stream:
-            made.setdefault(m.topic, []).append((m.t_s, m.value))
-    return made
+            found.setdefault(m.topic, []).append((m.t_s, m.value))
+    return found
 
 
 @pytest.fixture(scope="module")
-def told() -> dict[str, list[tuple[float, Any]]]:
-    return flight()
+def told() -> Told:
+    return told_of(exported())
 
 
-def test_poses_frames_fixes_and_batteries_are_each_drone_s_own(told: dict[str, list[tuple[float, Any]]]) -> None:
-    frames = {}
-    for t_s, message in told["/tf"]:
-        (moved,) = message.transforms
-        frames[t_s, moved.child_frame_id] = moved
+def xyz(point: Any) -> tuple[float, float, float]:
+    return point.x, point.y, point.z
+
+
+def test_poses_frames_fixes_and_batteries_are_each_drone_s_own(told: Told) -> None:
+    frames = {(t_s, m.transforms[0].child_frame_id): m.transforms[0] for t_s, m in told["/tf"]}
     assert len(frames) == len(told["/tf"]) == 9
-    for drone in range(3):
-        for frame in range(3):
-            s, t_s = state(frame, drone), float(frame)
-            turn = tuple(s[q] for q in ("qx", "qy", "qz", "qw"))
-            at, moved = where(frame, drone), frames[t_s, f"drone_{drone}"]
-            assert moved.header.frame_id == "world"
-            assert (moved.transform.translation.x, moved.transform.translation.y, moved.transform.translation.z) == at
-            r = moved.transform.rotation
-            assert (r.x, r.y, r.z, r.w) == turn
-            when, pose = told[f"/drone_{drone}/pose"][frame]
-            assert (when, pose.header.frame_id, pose.header.stamp.sec) == (t_s, "world", 5 + frame)
-            assert (pose.pose.position.x, pose.pose.position.y, pose.pose.position.z) == at
-            _, fix = told[f"/drone_{drone}/fix"][frame]
-            assert (fix.latitude, fix.longitude, fix.altitude) == geodetic(at, Origin(47.0, 8.0, 400.0))
-            assert fix.header.frame_id == f"drone_{drone}"
-            assert fix.status.status == (-1 if (drone, frame) == (1, 1) else 0)
-            _, battery = told[f"/drone_{drone}/battery"][frame]
-            assert (battery.voltage, battery.current, battery.percentage) == (s["voltage_v"], -s["current_a"], s["soc"])
-            assert battery.header.frame_id == f"drone_{drone}"
+    for drone, frame in np.ndindex(3, 3):
+        s, t_s = state(frame, drone), float(frame)
+        at, moved = where(frame, drone), frames[t_s, f"drone_{drone}"]
+        assert moved.header.frame_id == "world"
+        assert xyz(moved.transform.translation) == at
+        r = moved.transform.rotation
+        assert (r.x, r.y, r.z, r.w) == tuple(s[q] for q in ("qx", "qy", "qz", "qw"))
+        when, pose = told[f"/drone_{drone}/pose"][frame]
+        assert (when, pose.header.frame_id, pose.header.stamp.sec) == (t_s, "world", 5 + frame)
+        assert xyz(pose.pose.position) == at
+        _, fix = told[f"/drone_{drone}/fix"][frame]
+        assert (fix.latitude, fix.longitude, fix.altitude) == geodetic(at, Origin(47.0, 8.0, 400.0))
+        assert fix.header.frame_id == f"drone_{drone}"
+        assert fix.status.status == (-1 if (drone, frame) == (1, 1) else 0)
+        _, battery = told[f"/drone_{drone}/battery"][frame]
+        assert (battery.voltage, battery.current, battery.percentage) == (s["voltage_v"], -s["current_a"], s["soc"])
+        assert battery.header.frame_id == f"drone_{drone}"
     assert [t_s for t_s, _ in told["/clock"]] == [0.0, 1.0, 2.0]
 
 
-def test_the_log_names_who_decided_and_what_happened_to_whom(told: dict[str, list[tuple[float, Any]]]) -> None:
+def test_the_log_names_who_decided_and_what_happened_to_whom(told: Told) -> None:
     assert [(t_s, m.level, m.name, m.msg) for t_s, m in told["/decisions"]] == [
         (0.2, 30, "fleet", "fleet: a jammer"),
         (0.5, 20, "drone_1", "drone 1 → 2: features ρ=0.25 at 7.5 Hz in 5 m, because first"),
@@ -196,8 +235,7 @@ def test_the_log_names_who_decided_and_what_happened_to_whom(told: dict[str, lis
 
 
 def place(marker: Any) -> tuple[float, float, float]:
-    p = marker.pose.position
-    return (p.x, p.y, p.z)
+    return xyz(marker.pose.position)
 
 
 def colour(marker: Any) -> tuple[float, ...]:
@@ -205,26 +243,40 @@ def colour(marker: Any) -> tuple[float, ...]:
     return tuple(round(255 * part, 6) for part in (c.r, c.g, c.b, c.a))
 
 
-def test_boxes_are_where_they_were_found_in_the_colour_of_what_they_are(
-    told: dict[str, list[tuple[float, Any]]],
-) -> None:
-    (t_s, message), = told["/drone_0/boxes"]  # fmt: skip
+def test_boxes_are_where_they_were_found_in_the_colour_of_what_they_are(told: Told) -> None:
+    ((t_s, message),) = told["/drone_0/boxes"]
     clear, found, missed, false = message.markers
     assert (t_s, clear.action) == (0.5, 3)
-    assert [(m.ns, place(m)) for m in (found, missed, false)] == [
-        ("found", (2.1, 3.0, 0.9)), ("missed", (22.0, 23.0, 0.9)), ("false", (-9.0, -8.0, 0.9)),
-    ]  # fmt: skip
+    at = {m.ns: place(m) for m in (found, missed, false)}
+    assert at == {"found": (2.1, 3.0, 0.9), "missed": (22.0, 23.0, 0.9), "false": (-9.0, -8.0, 0.9)}
     for m, shades, score in ((found, FOUND, 0.9), (missed, MISSED, 1.0), (false, FALSE, 0.5)):
         assert colour(m) == pytest.approx((*shades[0], 60 + 120 * score))
         assert (m.scale.x, m.scale.y, m.scale.z) == (4.5, 1.9, 1.8)
         assert (m.pose.orientation.z, m.pose.orientation.w) == pytest.approx((math.sin(0.25), math.cos(0.25)))
     (_, one), (down_s, cleared) = told["/drone_2/boxes"]
     assert [(m.ns, place(m)) for m in one.markers[1:]] == [("false", (40.0, 41.0, 0.9))]
-    assert (down_s, len(cleared.markers)) == (2.0, 1)
+    assert (down_s, len(cleared.markers)) == (2.0, 1)  # it is down, and its boxes are cleared
     assert "/drone_1/boxes" not in told
 
 
-def test_regions_targets_and_jammers_are_drawn_where_they_are(told: dict[str, list[tuple[float, Any]]]) -> None:
+def test_the_boxes_of_a_drone_that_waits_for_its_turn_are_cleared() -> None:
+    """Three drones, two at a time: drone 0 waits at 1.5 s, and its boxes are of an earlier time."""
+    made = exported()
+    scenario = loads(SCENARIO.replace("sample_rate_hz: 1", "sample_rate_hz: 1, egos: 2"))
+    turns = [(0.5, 0), (0.5, 2), (1.5, 1), (1.5, 2)]
+    tables = tables_of(
+        {
+            "fusions": [{"t_s": t_s, "drone": d, "detections": 1} for t_s, d in turns],
+            "detections": [{"t_s": t_s, "drone": d, **CAR, "score": 0.5} for t_s, d in turns],
+        }
+    )
+    of_turns = {name: tables[name] for name in ("fusions", "detections", "truths")}
+    told = told_of(replace(made, scenario=scenario, tables={**made.tables, **of_turns}))
+    assert [(t_s, len(m.markers) > 1) for t_s, m in told["/drone_0/boxes"]] == [(0.5, True), (1.5, False)]
+    assert [t_s for t_s, _ in told["/drone_2/boxes"]] == [0.5, 1.5, 2.0]
+
+
+def test_regions_targets_and_jammers_are_drawn_where_they_are(told: Told) -> None:
     assert [t_s for t_s, _ in told["/scene/mission"]] == [0.0, 1.0, 2.0]
     for k, (_, message) in enumerate(told["/scene/mission"]):
         discs = [m for m in message.markers if m.ns == "region" and m.type == 3]
@@ -244,7 +296,7 @@ def test_regions_targets_and_jammers_are_drawn_where_they_are(told: dict[str, li
         assert [m.text for m in jammers if m.text] == ["jammer 17 dBm"] * (k == 1)
 
 
-def test_links_run_from_their_senders_in_the_colour_of_their_goodput(told: dict[str, list[tuple[float, Any]]]) -> None:
+def test_links_run_from_their_senders_in_the_colour_of_their_goodput(told: Told) -> None:
     """In frame 1 drones 0, 1 and 2 have said what their links carry; in frame 2 drone 2 is down."""
     latest = {0: [1.0, 2.0], 1: [11.0, 12.0], 2: [21.0, 22.0]}
     for frame, up in ((1, (0, 1, 2)), (2, (0, 1))):
@@ -261,9 +313,9 @@ def test_links_run_from_their_senders_in_the_colour_of_their_goodput(told: dict[
                 assert (c.r, c.g, c.b, c.a) == pytest.approx(tuple(rgba / 255))
 
 
-def test_the_town_and_its_cars_have_their_own_places_and_sizes(told: dict[str, list[tuple[float, Any]]]) -> None:
+def test_the_town_and_its_cars_have_their_own_places_and_sizes(told: Told) -> None:
     scene = scene_of(exported())
-    (_, town), = told["/scene/town"]  # fmt: skip
+    ((_, town),) = told["/scene/town"]
     built = [m for m in town.markers if m.ns == "buildings"]
     for m, (x, y, u, v, top, _) in zip(built, houses(scene).tolist(), strict=True):
         assert place(m) == pytest.approx(((x + u) / 2, (y + v) / 2, top / 2))
@@ -285,7 +337,7 @@ def test_the_town_and_its_cars_have_their_own_places_and_sizes(told: dict[str, l
         assert known == len(there)
 
 
-# --- telemetry ------------------------------------------------------------------------------------------------------
+# --- telemetry --------------------------------------------------------------------------------------------
 
 
 def test_telemetry_has_every_column_of_its_drone_s_row() -> None:
@@ -299,12 +351,7 @@ def test_telemetry_has_every_column_of_its_drone_s_row() -> None:
         assert t.orientation_xyzw == (s["qx"], s["qy"], s["qz"], s["qw"])
         assert t.velocity_mps == (still if down else (s["vx_mps"], s["vy_mps"], s["vz_mps"]))
         assert t.body_rates_radps == (still if down else (s["p_radps"], s["q_radps"], s["r_radps"]))
-        assert (t.soc, t.voltage_v, t.current_a, t.energy_used_j) == (
-            s["soc"],
-            s["voltage_v"],
-            s["current_a"],
-            s["spent_j"],
-        )
+        assert (t.soc, t.voltage_v, t.current_a, t.energy_used_j) == tuple(s[name] for name in PACK)
         assert t.landed == down
         assert t.fixed == ((drone, k // 3) != (1, 1))
         assert t.home_m == (10.0 * drone, 10.0 * drone + 1, 0.0)
@@ -340,12 +387,6 @@ def test_each_vehicle_says_its_own_pack_and_its_own_texts() -> None:
 def test_a_jammer_is_on_from_its_begin_to_before_its_end() -> None:
     short = SimpleNamespace(at_s=1.0, until_s=2.0)
     long = SimpleNamespace(at_s=1.5, until_s=None)
-    for t_s, on in (
-        (0.99, []),
-        (1.0, [short]),
-        (1.5, [short, long]),
-        (1.999, [short, long]),
-        (2.0, [long]),
-        (99.0, [long]),
-    ):
+    on_at = {0.99: [], 1.0: [short], 1.5: [short, long], 1.999: [short, long], 2.0: [long], 99.0: [long]}
+    for t_s, on in on_at.items():
         assert jamming([short, long], t_s) == on  # type: ignore[list-item]

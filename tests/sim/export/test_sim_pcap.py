@@ -10,26 +10,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from exported_flight import flown
 from sim_examples import example
-from typer.testing import CliRunner
 
-import sortie.fleet.agent
-from sortie.fleet.messages.auth import Opened, Sealer, open_datagram
+from sortie.fleet.messages.auth import Opened, open_datagram
 from sortie.fleet.messages.cdr import ENCAPSULATION
 from sortie.fleet.messages.compact import FULL, Form
 from sortie.fleet.messages.wire import DIRECTIVE_BYTES, decode_directive
 from sortie.fleet.tiles import cut
-from sortie.sim.cli.app import app
 from sortie.sim.engine.events import group_key
 from sortie.sim.engine.sortie import KEY_ID, run_sortie
 from sortie.sim.export.pcap import KEPT_BYTES, write_pcap
-from sortie.sim.results import run_folder
 from sortie.sim.results.record import SortieRecord
 
 BEGIN_NS = 1_767_225_600_000_000_000
-DROP = "events=[{kind: link_drop, at_s: 3.5, drone: 2, loss_db: 60}]"
 SETTINGS = {
-    "plain": (),
     "tiles": ("radio.framing=tiles",),
     "small": ("context.form=small", "context.authentication=false"),
     "bad": ("radio.tx_power_dbm=6", "radio.path_loss_exponent=3", "policy={name: boxes, dwell_s: 0.3}"),
@@ -68,18 +63,9 @@ def read(path: Path) -> list[Read]:
     return found
 
 
-@pytest.fixture(scope="module", params=SETTINGS)
-def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[SortieRecord, Path]:
-    record = run_sortie(example("duration_s=4.05", DROP, *SETTINGS[request.param]))
-    path = tmp_path_factory.mktemp("pcap") / "a.pcap"
-    counts = write_pcap(record, path, BEGIN_NS)
-    assert sum(counts.values()) == len(read(path))
-    return record, path
-
-
-def test_every_descriptor_is_there_with_its_length_and_time(flown: tuple[SortieRecord, Path]) -> None:
-    record, path = flown
-    heard = [p for p in read(path) if p.ports == (7401, 7401)]
+def check_descriptors(record: SortieRecord, packets: list[Read]) -> None:
+    """Every one is there with its length and time, and opens with its drone's key and counter."""
+    heard = [p for p in packets if p.ports == (7401, 7401)]
     form = Form(**record.scenario.context.form.model_dump())
     header = 0 if form == FULL else 4  # the paper's form has a CDR header of its own
     rows = sorted(record.tables["descriptors"].to_pylist(), key=lambda row: row["t_s"])
@@ -93,35 +79,15 @@ def test_every_descriptor_is_there_with_its_length_and_time(flown: tuple[SortieR
         assert struct.unpack_from("<H", packet.rtps, 34)[0] == len(packet.rtps) - 36
         opened = open_datagram(packet.rtps[20 + 12 + 24 + header :], keys)
         assert isinstance(opened, Opened)
-        assert opened.descriptor.agent_id == row["drone"]
-        assert opened.descriptor.stamp_ns == row["stamp_ns"]
+        assert (opened.descriptor.agent_id, opened.descriptor.stamp_ns) == (row["drone"], row["stamp_ns"])
+        assert opened.descriptor.battery_soc == pytest.approx(row["soc"], rel=1e-6)  # in a small form: as it was read
+        assert opened.descriptor.peer_goodput_mbps == pytest.approx(row["goodput_mbps"], rel=1e-6)
         counters[row["drone"]] += 1
         assert opened.counter == (counters[row["drone"]] if keys else 0)
 
 
-def test_descriptors_are_the_bytes_that_flew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """All but the position, velocity and attitude, which a drone estimates and the record keeps as they truly were."""
-    sent: list[bytes] = []
-    seal = Sealer.seal
-
-    def tapped(self: Sealer, payload: bytes) -> bytes:
-        sent.append(seal(self, payload))
-        return sent[-1]
-
-    with monkeypatch.context() as patch:
-        patch.setattr(sortie.fleet.agent.Sealer, "seal", tapped)
-        record = run_sortie(example("duration_s=2"))
-    write_pcap(record, tmp_path / "a.pcap", BEGIN_NS)
-    written = [p.rtps[56:] for p in read(tmp_path / "a.pcap") if p.ports == (7401, 7401)]
-    pose = slice(16, 60)  # after encapsulation, stamp and id; what follows it is as it was
-    assert [(w[:13], w[pose.stop : -16]) for w in sorted(written)] == [
-        (s[:13], s[pose.stop : -16]) for s in sorted(sent)
-    ]
-
-
-def test_every_directive_is_there(flown: tuple[SortieRecord, Path]) -> None:
-    record, path = flown
-    taken = [p for p in read(path) if p.ports == (7412, 7413)]
+def check_directives(record: SortieRecord, packets: list[Read]) -> None:
+    taken = [p for p in packets if p.ports == (7412, 7413)]
     rows = sorted(record.tables["directives"].to_pylist(), key=lambda row: row["t_s"])
     assert len(taken) == len(rows) == record.totals["directives"]
     for packet, row in zip(taken, rows, strict=True):
@@ -131,14 +97,14 @@ def test_every_directive_is_there(flown: tuple[SortieRecord, Path]) -> None:
         assert order.rate_hz == pytest.approx(row["rate_hz"], rel=1e-6)
 
 
-def test_every_payload_that_got_through_is_there_fragment_by_fragment(flown: tuple[SortieRecord, Path]) -> None:
-    record, path = flown
+def check_payloads(record: SortieRecord, packets: list[Read]) -> None:
+    """Every one that got through is there, fragment by fragment."""
     at: dict[tuple[int, int, int], int] = Counter()  # content by sender, receiver and time of its last fragment
     samples: dict[tuple[int, int, bytes], list[Read]] = defaultdict(list)
-    for packet in read(path):
+    for packet in packets:
         if packet.ports == (7411, 7411):
             submessage = packet.rtps[20 + 12 + 16 :]
-            assert struct.unpack_from("<B", submessage)[0] in (0x15, 0x16)
+            assert submessage[0] in (0x15, 0x16)
             samples[packet.drone, packet.kept[19] - 1, submessage[12:24]].append(packet)
             overhead = 20 + 8 + 20 + 12 + 16 + (28 if submessage[0] == 0x15 else 36)
             at[packet.drone, packet.kept[19] - 1, packet.t_ns] += 1
@@ -148,42 +114,61 @@ def test_every_payload_that_got_through_is_there_fragment_by_fragment(flown: tup
     assert len(rows) > 10
     for row in rows:
         assert at[row["drone"], row["peer"], round(row["t_done_s"] * 1e9)] >= 1
-        assert row["fragments"] == (
-            cut(row["cells"], 1344).number
-            if tiled and row["representation"] == "features"
-            else -(-row["payload_bytes"] // 1344)
-        )
+        in_tiles = tiled and row["representation"] == "features"
+        assert row["fragments"] == (cut(row["cells"], 1344).number if in_tiles else -(-row["payload_bytes"] // 1344))
     if not tiled:  # a sample's fragments have one number
-        sizes = Counter(len(packets) for packets in samples.values())
+        sizes = Counter(len(sent) for sent in samples.values())
         assert sizes >= Counter(row["fragments"] + row["fragments_lost"] for row in rows)
     # a frame has 38 B of 802.11 around the datagram; the record has parts of fragments too, where a deadline came
-    features = [p for (_, _, writer), packets in samples.items() if writer[2] == 3 for p in packets]
+    features = [p for (_, _, writer), sent in samples.items() if writer[2] == 3 for p in sent]
     sent = sum(r["wire_bytes"] for r in record.tables["transmissions"].to_pylist() if r["representation"] == "features")
     assert sum(p.length + 38 for p in features) == pytest.approx(sent, rel=0.01)
 
 
-@pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
-def test_tshark_reads_every_packet_as_rtps(flown: tuple[SortieRecord, Path]) -> None:
-    record, path = flown
-    names = ("frame.time_epoch", "ip.src", "ip.checksum.status", "udp.dstport", "rtps.sm.id", "rtps.info_ts.timestamp",
-             "rtps.data_frag.sample_size", "rtps.data_frag.size", "rtps.data_frag.number", "_ws.malformed")  # fmt: skip
-    fields = [word for name in names for word in ("-e", name)]
-    command = [
-        "tshark",
-        "-r",
-        str(path),
-        "-o",
-        "ip.check_checksum:TRUE",
-        "-u",
-        "s",
-        "-T",
-        "fields",
-        "-E",
-        "separator=;",
-    ]
-    done = subprocess.run([*command, *fields], capture_output=True, text=True, check=True)
-    rows = [line.split(";") for line in done.stdout.splitlines()]
+def captured(record: SortieRecord, path: Path) -> list[Read]:
+    counts = write_pcap(record, path, BEGIN_NS)
     packets = read(path)
+    assert sum(counts.values()) == len(packets)
+    return packets
+
+
+def test_all_that_was_sent_is_there_with_its_length_and_time(tmp_path: Path) -> None:
+    record = flown()[0]
+    packets = captured(record, tmp_path / "a.pcap")
+    for check in (check_descriptors, check_directives, check_payloads):
+        check(record, packets)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_all_is_there_in_flights_of_other_frames_forms_and_air(settings: str, tmp_path: Path) -> None:
+    drop = "events=[{kind: link_drop, at_s: 3.5, drone: 2, loss_db: 60}]"
+    record = run_sortie(example("duration_s=4.05", drop, *SETTINGS[settings]))
+    packets = captured(record, tmp_path / "a.pcap")
+    for check in (check_descriptors, check_directives, check_payloads):
+        check(record, packets)
+
+
+def test_descriptors_are_the_bytes_that_flew(tmp_path: Path) -> None:
+    """All but the position, velocity and attitude, which a drone estimates and the record keeps as they truly were."""
+    record, sent = flown()
+    written = [p.rtps[56:] for p in captured(record, tmp_path / "a.pcap") if p.ports == (7401, 7401)]
+    pose = slice(16, 60)  # after encapsulation, stamp and id; what follows it is as it was
+    apart = [[(data[:13], data[pose.stop : -16]) for data in sorted(each)] for each in (written, sent)]
+    assert apart[0] == apart[1]
+
+
+@pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
+def test_tshark_reads_every_packet_as_rtps(tmp_path: Path) -> None:
+    record, path = flown()[0], tmp_path / "a.pcap"
+    packets = captured(record, path)
+    frame = ("frame.time_epoch", "ip.src", "ip.checksum.status", "udp.dstport", "rtps.sm.id", "rtps.info_ts.timestamp")
+    names = (*frame, *(f"rtps.data_frag.{part}" for part in ("sample_size", "size", "number")), "_ws.malformed")
+    fields = [word for name in names for word in ("-e", name)]
+    shape = ("-o", "ip.check_checksum:TRUE", "-u", "s", "-T", "fields", "-E", "separator=;")
+    command = ["tshark", "-r", str(path), *shape, *fields]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    rows = [line.split(";") for line in done.stdout.splitlines()]
     assert len(rows) == len(packets)
     for row, packet in zip(rows, packets, strict=True):
         epoch, source, checksum, port, submessages, stamp, sample, each, number, malformed = row
@@ -198,15 +183,3 @@ def test_tshark_reads_every_packet_as_rtps(flown: tuple[SortieRecord, Path]) -> 
         if kind == "0x16":
             assert 1 <= int(number) <= -(-int(sample) // int(each))
     assert sum(row[3] == "7401" for row in rows) == len(record.tables["descriptors"])
-
-
-def test_the_command_writes_the_capture_into_the_run(tmp_path: Path) -> None:
-    run_folder.save(run_sortie(example("duration_s=1")), tmp_path / "run")
-    done = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--pcap"])
-    assert done.exit_code == 0, done.output
-    packets = (tmp_path / "run/sortie.pcap").read_bytes()
-    assert "packets (50 context," in done.output
-    assert struct.unpack_from("<I", packets, 24)[0] == BEGIN_NS // 10**9
-    refused = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--pcap", "--mcap"])
-    assert refused.exit_code == 2
-    assert "name one format: --mcap, --tlog or --pcap" in refused.output

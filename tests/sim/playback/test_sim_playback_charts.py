@@ -72,6 +72,12 @@ def drawn(given: dict[str, list[dict[str, Any]]], drones: int = 2, seconds: tupl
     return {path: found for path, found in points.items() if found and "marks" not in path}
 
 
+def traffic(sent: list[dict[str, Any]], seconds: tuple[float, ...]) -> Series:
+    ends = {"drone": 0, "peer": 1}
+    made = drawn({"transmissions": [ends | each for each in sent]}, seconds=seconds)
+    return {path.removeprefix("plots/traffic/"): v for path, v in made.items() if "traffic" in path}
+
+
 @pytest.fixture(params=[(4.0,), (1.0, 2.0, 3.0, 4.0)], ids=["at once", "by seconds"])
 def seconds(request: pytest.FixtureRequest) -> tuple[float, ...]:
     found: tuple[float, ...] = request.param
@@ -86,29 +92,27 @@ def test_batteries_are_in_percent_and_each_drone_s_own(seconds: tuple[float, ...
 
 def test_goodput_is_the_mean_of_the_links_that_were_tried_lately(seconds: tuple[float, ...]) -> None:
     """A probed link reads 2^-9 Mb/s at most, and is left out. A silent one reads 2^-10, and carries nothing."""
-    said = [
-        (0.2, 0, [10.0, 30.0]), (0.7, 0, [40.0, 0.0]), (1.2, 0, [60.0, 2.0**-9]), (1.7, 0, [60.0, 2.0**-10]),
-        (1.5, 1, [0.0, 2.0**-9]), (2.5, 1, [5.0, 7.0]),
-    ]  # fmt: skip
-    given = {"descriptors": [{"t_s": t_s, "drone": d, "goodput_mbps": links} for t_s, d, links in said], "states": []}
-    made = drawn(given, drones=3, seconds=seconds)
+    first = [(0.2, 0, [10.0, 30.0]), (0.7, 0, [40.0, 0.0]), (1.2, 0, [60.0, 2.0**-9]), (1.7, 0, [60.0, 2.0**-10])]
+    second = [(1.5, 1, [0.0, 2.0**-9]), (2.5, 1, [5.0, 7.0])]
+    said = [{"t_s": t_s, "drone": d, "goodput_mbps": links} for t_s, d, links in sorted(first + second)]
+    made = drawn({"descriptors": said, "states": []}, drones=3, seconds=seconds)
     assert made["plots/goodput/0"] == [(0.2, 20.0), (0.7, 40.0), (1.2, 60.0), (1.7, pytest.approx(30.0, abs=1e-3))]
-    (first_s, gap), second = made["plots/goodput/1"]
-    assert (first_s, math.isnan(gap), second) == (1.5, True, (2.5, 6.0))
+    (first_s, gap), later = made["plots/goodput/1"]
+    assert (first_s, math.isnan(gap), later) == (1.5, True, (2.5, 6.0))
     assert "plots/goodput/2" not in made
 
 
 def test_traffic_is_of_the_second_in_which_it_ended(seconds: tuple[float, ...]) -> None:
     """Mb/s: of 125,000 B in one second, 1. A line begins with the first second in which it carries anything."""
+    names = ("t_done_s", "representation", "status", "payload_bytes")
     sent = [
-        {"t_done_s": t_s, "drone": 0, "peer": 1, "representation": what, "status": fate, "payload_bytes": size}
-        for t_s, what, fate, size in (
-            (0.5, "features", "delivered", 125_000), (1.0, "features", "delivered", 500_000), (1.5, "features", "lost", 375_000),
-            (2.5, "detections", "expired", 12_500), (NAN, "features", "in_flight", 999_999),
-        )
-    ]  # fmt: skip
-    made = {path.removeprefix("plots/traffic/"): v for path, v in drawn({"transmissions": sent}, seconds=seconds).items() if "traffic" in path}  # fmt: skip
-    assert made == {
+        (0.5, "features", "delivered", 125_000),
+        (1.0, "features", "delivered", 500_000),
+        (1.5, "features", "lost", 375_000),
+        (2.5, "detections", "expired", 12_500),
+        (NAN, "features", "in_flight", 999_999),
+    ]
+    assert traffic([dict(zip(names, each, strict=True)) for each in sent], seconds) == {
         "features_delivered": [(1, 1.0), (2, 4.0), (3, 0.0), (4, 0.0)],
         "features_lost": [(2, 3.0), (3, 0.0), (4, 0.0)],
         "detections_expired": [(3, 0.1), (4, 0.0)],
@@ -116,18 +120,14 @@ def test_traffic_is_of_the_second_in_which_it_ended(seconds: tuple[float, ...]) 
 
 
 def test_a_payload_that_came_in_part_is_what_arrived_and_what_was_lost_or_expired(seconds: tuple[float, ...]) -> None:
+    names = ("t_done_s", "status", "reason", "payload_bytes", "arrived_bytes")
     sent = [
-        {
-            "t_done_s": t_s, "drone": 0, "peer": 1, "representation": "features", "status": fate, "reason": reason,
-            "payload_bytes": size, "arrived_bytes": arrived,
-        }
-        for t_s, fate, reason, size, arrived in (
-            (0.5, "delivered", "", 125_000, 125_000), (0.6, "partial", "deadline_in_service", 500_000, 375_000),
-            (1.5, "partial", "fragment_lost", 375_000, 125_000),
-        )
-    ]  # fmt: skip
-    made = {path.removeprefix("plots/traffic/"): v for path, v in drawn({"transmissions": sent}, seconds=seconds).items() if "traffic" in path}  # fmt: skip
-    assert made == {
+        (0.5, "delivered", "", 125_000, 125_000),
+        (0.6, "partial", "deadline_in_service", 500_000, 375_000),
+        (1.5, "partial", "fragment_lost", 375_000, 125_000),
+    ]
+    of_features = [{"representation": "features", **dict(zip(names, each, strict=True))} for each in sent]
+    assert traffic(of_features, seconds) == {
         "features_delivered": [(1, 4.0), (2, 1.0), (3, 0.0), (4, 0.0)],
         "features_expired": [(1, 1.0), (2, 0.0), (3, 0.0), (4, 0.0)],
         "features_lost": [(2, 2.0), (3, 0.0), (4, 0.0)],
@@ -155,35 +155,37 @@ def test_accuracy_is_of_the_scene_and_of_the_disc(seconds: tuple[float, ...]) ->
     assert made["plots/ap/mission"] == [(3, 0.5), (4, pytest.approx(2 / 3))]
 
 
+def decided(t_s: float, drone: int, peer: int, what: str, **more: float) -> dict[str, Any]:
+    ends = {"t_s": t_s, "drone": drone, "peer": peer, "representation": what}
+    return ends | {"rate_hz": 2.0, "roi_radius_m": NAN, "reason": ""} | more
+
+
 def test_a_drone_s_lane_shows_nothing_each_time_that_it_is_down(seconds: tuple[float, ...]) -> None:
     """It joins at 0.5 s, and is lost twice. While it is down the first time, only its peer decides."""
     up = {0.0: False, 0.5: True, 1.0: True, 1.5: False, 2.0: True, 2.5: True, 3.0: False, 3.5: False}
     states = [{"t_s": t_s, "drone": d, "airborne": d == 0 or flies} for t_s, flies in up.items() for d in range(2)]
-    directives = [
-        {"t_s": t_s, "drone": d, "peer": 1 - d, "representation": what, "rate_hz": 2.0, "roi_radius_m": NAN, "reason": ""}
-        for t_s, d, what in (
-            (0.6, 1, "detections"), (1.6, 0, "detections"), (2.1, 1, "raw"), (2.6, 1, "tracks"), (3.6, 0, "tracks")
-        )
-    ]  # fmt: skip
+    said = [(0.6, 1, "detections"), (1.6, 0, "detections"), (2.1, 1, "raw"), (2.6, 1, "tracks"), (3.6, 0, "tracks")]
+    directives = [decided(t_s, d, 1 - d, what) for t_s, d, what in said]
     lanes = charted({"states": states, "directives": directives}, seconds=seconds).states
     assert lanes["lanes/drone_1"] == [
-        (0.6, "detections at 2 Hz"), (1.5, "nothing"), (2.0, "detections at 2 Hz"), (2.1, "raw at 2 Hz"),
-        (2.6, "tracks at 2 Hz"), (3.0, "nothing"), (4.0, OVER),
-    ]  # fmt: skip
+        (0.6, "detections at 2 Hz"),
+        (1.5, "nothing"),
+        (2.0, "detections at 2 Hz"),
+        (2.1, "raw at 2 Hz"),
+        (2.6, "tracks at 2 Hz"),
+        (3.0, "nothing"),
+        (4.0, OVER),
+    ]
     assert lanes["lanes/drone_0"] == [(1.6, "detections at 2 Hz"), (3.6, "tracks at 2 Hz"), (4.0, OVER)]
 
 
 def test_of_links_on_one_rung_a_lane_shows_the_one_that_sends_most() -> None:
     """ρ times rate is 0.5 /s to drone 1; to drone 2 it is first 1 /s, and then 0.02 /s."""
-    directives = [
-        {
-            "t_s": t_s, "drone": 0, "peer": peer, "representation": "features", "rho": rho, "rate_hz": rate_hz,
-            "roi_radius_m": NAN, "reason": "",
-        }
-        for t_s, peer, rho, rate_hz in ((0.5, 1, 0.25, 2.0), (1.5, 2, 0.1, 10.0), (2.5, 2, 0.002, 10.0))
-    ]  # fmt: skip
+    said = [(0.5, 1, 0.25, 2.0), (1.5, 2, 0.1, 10.0), (2.5, 2, 0.002, 10.0)]
+    directives = [decided(t_s, 0, peer, "features", rho=rho, rate_hz=rate_hz) for t_s, peer, rho, rate_hz in said]
     states = [{"t_s": 0.0, "drone": d, "airborne": True} for d in range(3)]
     lanes = charted({"states": states, "directives": directives}, drones=3).states
-    assert lanes["lanes/drone_0"] == [
-        (0.5, "features ρ=0.25 at 2 Hz"), (1.5, "features ρ=0.1 at 10 Hz"), (2.5, "features ρ=0.25 at 2 Hz"), (4.0, OVER),
-    ]  # fmt: skip
+    first, second, third = (
+        (t_s, f"features ρ={of}") for t_s, of in ((0.5, "0.25 at 2 Hz"), (1.5, "0.1 at 10 Hz"), (2.5, "0.25 at 2 Hz"))
+    )
+    assert lanes["lanes/drone_0"] == [first, second, third, (4.0, OVER)]
