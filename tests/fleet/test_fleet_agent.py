@@ -237,7 +237,7 @@ def test_links_that_differ_in_one_field_get_payloads_of_their_own() -> None:
 
 
 class Late(Rig):
-    """Flies east, 30 m a frame, and computes for two and a half frames; writes down what it is asked of which capture."""
+    """Flies east, 30 m a frame, computes for two and a half frames, and notes what it is asked of which capture."""
 
     def sense(self, frame: int) -> Sensed:
         at = (30.0 * frame, 0.0, 60.0)
@@ -350,7 +350,7 @@ def test_new_ground_is_new_where_it_was_seen_and_once() -> None:
 
 
 def test_what_was_not_published_stays_new() -> None:
-    """Ground that is first seen in a frame without a descriptor is new in the next descriptor, and in that one alone."""
+    """Ground that is first seen in a frame without a descriptor is new in the next descriptor, and in no other."""
     for every in (1, 3):
         rig = Sees(silent, dwell_s=0.0, publish_every=every)
         rig.env.run(until=1.0)

@@ -20,13 +20,6 @@ from sortie.scenarios.schema import (
 ORIN, LOOK_S, FRAME_S = Computer(), 0.03, 0.1
 
 
-def test_a_frame_by_hand() -> None:
-    """A look of 30 ms and four maps at 0.32 ms on the accelerator; a core feeds it, decides, and copies 41.6 Mb."""
-    cpu, gpu = headrooms(ORIN, LOOK_S, Work(7, 3, 5, 10), Work(8, 7, 6, 5_200_010), FRAME_S)
-    assert gpu == pytest.approx(1 - (30 + 4 * 0.32) / 100)
-    assert cpu == pytest.approx(1 - (30 + 4 * 0.32 + 0.1 + 41.6 / 19.5) / (12 * 100))
-
-
 def test_headrooms_count_looks_maps_decisions_and_bytes() -> None:
     """By hand: each alone, and together."""
     computer = Computer(cpu_cores=4, decision_s=0.01, payload_mbps=100.0, driving_cores=2.0, fusion_s=0.02)

@@ -1,4 +1,4 @@
-"""A drone's own value and the fleet's: an override replaces its make's, a make's replaces the fleet's; none adds to another."""
+"""A drone's own value and the fleet's: an override replaces its make's, and a make's replaces the fleet's."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ def test_an_override_stands_in_place_of_the_value_of_its_make_and_of_the_fleet()
 fleet:
   airframe: {payload_kg: 0.3}
   battery: {initial_soc: 0.9, capacity_wh: 100, cell_resistance_mohm: 20, cycles: 50}
-  makes: [{name: heavy, drones: [1, 2], airframe: {payload_kg: 0.7, mass_kg: 3}, battery: {initial_soc: 0.8, capacity_wh: 200}}]
+  makes:
+    - {name: heavy, drones: [1, 2], airframe: {payload_kg: 0.7, mass_kg: 3},
+       battery: {initial_soc: 0.8, capacity_wh: 200}}
   overrides:
     - {drone: 0, payload_kg: 0.1, initial_soc: 0.5}
     - {drone: 1, payload_kg: 0.0, capacity_wh: 60, cell_resistance_mohm: 5}

@@ -143,7 +143,7 @@ def test_a_claim_is_judged_once() -> None:
 
 
 def test_a_claim_that_is_no_longer_fresh_is_not_judged() -> None:
-    """Its drone may be gone since: who left does not fall into doubt for its last word. Fresh is three of its periods."""
+    """Its drone may be gone: who left does not fall into doubt for its last word. Fresh is three of its periods."""
     for every, judged in ((1, 0), (3, 1)):
         mine = memory(publish_every=every)
         mine.hold(descriptor(0, 10.0), 10.0)

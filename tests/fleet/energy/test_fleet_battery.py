@@ -1,4 +1,4 @@
-"""Packs against closed forms and an independent integration: the cell, where energy goes, landing, and plug-in cells."""
+"""Packs against closed forms and an independent integration: cells, where energy goes, landing, plug-in cells."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from scipy.interpolate import PchipInterpolator
 from sortie.fleet.energy import cell
 from sortie.fleet.energy.battery import CAUSES, RECORDED, FleetBatteries
 from sortie.fleet.energy.cell import (
-    LIPO,
     cell_curve,
     current_a,
     energy_fraction,
@@ -99,17 +98,6 @@ def test_the_pack_against_an_independent_integration() -> None:
     for wanted in reference:
         steady(b, 300.0)
         assert b.soc[0] == pytest.approx(wanted, abs=2e-5)
-
-
-def test_voltage_sags_by_current_times_resistance() -> None:
-    b = FleetBatteries([Battery(), Battery(cell_resistance_mohm=0)], (), 2)
-    at_rest = b.voltage_v[0]
-    steady(b, 0.1)
-    soft_v, stiff_v = b.voltage_v
-    assert stiff_v == pytest.approx(at_rest, abs=1e-5)
-    assert b.energy_j["ohmic"][1] == 0
-    assert soft_v == pytest.approx(at_rest - b.current_a[0] * 4 * 0.013, abs=1e-5)
-    assert soft_v * b.current_a[0] == pytest.approx(LOAD_W)
 
 
 def test_overrides_touch_their_drone_alone() -> None:
@@ -254,16 +242,6 @@ def test_a_pack_of_straight_cells_drains_by_its_own_voltage(straight: Battery) -
     assert packs.soc[0] == pytest.approx(soc, abs=1e-6)
     assert packs.current_a[0] == pytest.approx(packs.spent_j[0] / 600 / (4 * (3.0 + 1.2 * soc)), rel=1e-3)
     assert packs.soc[0] != packs.soc[1]
-
-
-def test_the_built_in_cell_as_a_plug_in(tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text(CELLS)
-    curve = cell_curve(Battery(cell_model=f"{tmp_path / 'own.py'}:same"))
-    np.testing.assert_allclose(curve.soc, LIPO.soc, atol=1e-6)
-    np.testing.assert_allclose(curve.volts, LIPO.volts, atol=1e-6)
-    soc = np.linspace(0, 1, 21)
-    np.testing.assert_allclose(curve.open_circuit_v(soc), open_circuit_cell_v(soc), atol=1e-6)
-    assert cell_curve(Battery()) is LIPO
 
 
 def test_cells_of_one_kind_and_other_parameters_are_other_cells(straight: Battery) -> None:

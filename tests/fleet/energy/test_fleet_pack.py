@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 from sortie.fleet.energy.battery import CAUSES, RECORDED, FleetBatteries
 from sortie.fleet.energy.cell import (
     COOLING_TIME_S,
-    MEAN_CELL_V,
-    ageing,
     energy_fraction,
     heat_capacity_jpk,
     open_circuit_cell_v,
@@ -79,16 +77,6 @@ def test_a_pack_on_the_ground_cools_to_the_air_while_one_in_flight_stays_warm() 
     assert b.temperature_c[1] == 25.0
     assert b.temperature_c[2] > warm_c
     assert b.spent_j[0] == spent
-
-
-def test_age_takes_capacity_and_adds_resistance() -> None:
-    assert ageing(0, 300) == (1.0, 1.0)
-    assert ageing(300, 300) == (pytest.approx(0.8), pytest.approx(2.0))
-    old = FleetBatteries(Battery(cycles=300), (), 1)
-    new = FleetBatteries(Battery(), (), 1)
-    assert old.energy_left_j[0] == pytest.approx(0.8 * new.energy_left_j[0])
-    steady(old, 0.1)
-    assert (old.energy_j["ohmic"][0] / 0.1) == pytest.approx(old.current_a[0] ** 2 * 0.104, rel=1e-6)
 
 
 def test_cold_and_age_act_on_both_parts_of_the_resistance() -> None:
@@ -190,16 +178,6 @@ def test_a_cell_s_mean_voltage_is_over_the_cells_that_work() -> None:
     assert low.landing_reason[0].endswith("cut off below 3.9 V")
 
 
-def test_losing_a_cell_under_a_cut_off_by_the_cell_goes_on_and_the_last_cell_lands() -> None:
-    b = FleetBatteries(Battery(cells=2, cutoff_cell_v=3.0), (), 1)
-    b.drop_cell(0)
-    steady(b, 1.0)
-    assert not b.landed[0]
-    b.drop_cell(0)
-    assert b.landed[0]
-    assert b.energy_left_j[0] == 0.0
-
-
 def test_the_voltage_after_a_fault_is_that_of_the_cold_and_polarised_pack() -> None:
     """Between that of the step before and that of the next; a lost cell takes its own share of it."""
     cold = Battery(ambient_c=-5, polarisation=Polarisation(resistance_mohm=5, time_s=20))
@@ -237,13 +215,6 @@ def test_a_traced_drone_follows_its_trace_and_the_others_their_model() -> None:
     steady(b, 20.0)
     assert b.soc[1] == pytest.approx(0.4, abs=1e-6)  # held after the end
     assert RECORDED not in plain.energy_j
-
-
-def test_a_traced_drone_lands_at_landing_soc_too() -> None:
-    b = FleetBatteries(Battery(landing_soc=0.5), (), 1, {0: trace([0, 10], [0.9, 0.4])})
-    steady(b, 10.0)
-    assert b.landed == [True]
-    assert 0.48 < b.soc[0] <= 0.5
 
 
 def test_faults_of_a_traced_pack_stay_and_each_takes_of_what_is_left() -> None:
@@ -358,10 +329,3 @@ def test_a_packs_voltage_under_its_own_current_is_the_fleets() -> None:
         volts.append(b.voltage_v[0])
     time_s = 0.05 * np.arange(len(volts))
     np.testing.assert_allclose(terminal_voltage_v(time_s, np.array(current), config, 0.95), volts, rtol=2e-4)
-
-
-def test_capacity_in_charge_and_energy_belong_together() -> None:
-    """5.2 Ah at the mean open-circuit voltage: after 2.6 Ah half the charge is left."""
-    config = Battery(capacity_wh=5.2 * 4 * MEAN_CELL_V, cells=4, cell_resistance_mohm=0)
-    volts = terminal_voltage_v(np.array([0.0, 360.0]), np.array([26.0, 0.0]), config, 1.0)
-    np.testing.assert_allclose(volts, 4 * open_circuit_cell_v([1.0, 0.5]))

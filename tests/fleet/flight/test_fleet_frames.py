@@ -68,13 +68,6 @@ def test_swapping_twice_gives_the_attitude_back(q: np.ndarray) -> None:
     assert to_xyzw(to_wxyz(q)).tolist() == q.tolist()
 
 
-def test_arrays_keep_their_shape() -> None:
-    q = np.tile([0.0, 0.0, 0.0, 1.0], (4, 3, 1))
-    assert swap_attitude(q).shape == (4, 3, 4)
-    assert swap_enu_ned(q[..., :3]).shape == (4, 3, 3)
-    assert yaw_rad(q).shape == (4, 3)
-
-
 def test_yaw_is_the_direction_of_the_nose() -> None:
     q = Rotation.from_euler("ZYX", [[100, 20, 30], [-170, -40, 5]], degrees=True).as_quat()
     nose = Rotation.from_quat(q).apply([1, 0, 0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,36 +50,25 @@ wishes = st.tuples(st.integers(0, 5), st.integers(0, 299), st.floats(-60, 60), s
 fences = st.none() | st.tuples(st.floats(-120, -70), st.floats(-80, -40), st.floats(50, 90), st.floats(90, 130))
 
 
-@settings(max_examples=75, deadline=None)
-@given(
-    st.sampled_from(SHAPES),
-    st.floats(4, 30),
-    st.floats(1, 25),
-    st.floats(0.5, 8),
-    st.floats(0.2, 3),
-    st.floats(0, 50),
-    fences,
-    st.lists(wishes, min_size=1, max_size=40),
+formations = st.fixed_dictionaries({"shape": st.sampled_from(SHAPES), "spacing_m": st.floats(4, 30)})
+limits = st.fixed_dictionaries(
+    {
+        "reach_m": st.floats(0, 50),
+        "speed_mps": st.floats(0.5, 8),
+        "acceleration_mps2": st.floats(0.2, 3),
+        "separation_m": st.floats(1, 25),
+        "fence_m": fences,
+    }
 )
+
+
+@settings(max_examples=75, deadline=None)
+@given(formations, limits, st.lists(wishes, min_size=1, max_size=40))
 def test_no_wish_breaks_a_bound(
-    shape: str,
-    spacing_m: float,
-    separation_m: float,
-    speed_mps: float,
-    acceleration_mps2: float,
-    reach_m: float,
-    fence: tuple[float, float, float, float] | None,
-    asked: list[tuple[int, int, float, float]],
+    formation: dict[str, Any], limits: dict[str, Any], asked: list[tuple[int, int, float, float]]
 ) -> None:
     """At every instant, a hundredth of a second apart: distance, fence, reach, speed and acceleration."""
-    viewpoints = {
-        "reach_m": reach_m, "speed_mps": speed_mps, "acceleration_mps2": acceleration_mps2,
-        "separation_m": separation_m, "fence_m": fence,
-    }  # fmt: skip
-    fleet = fleet_with(
-        drones=6, formation={"shape": shape, "spacing_m": spacing_m}, viewpoints=viewpoints,
-        motion={"pose_jitter_m": 0.2},
-    )  # fmt: skip
+    fleet = fleet_with(drones=6, formation=formation, viewpoints=limits, motion={"pose_jitter_m": 0.2})
     try:
         course, bounds = course_and_bounds(fleet)
     except MotionError:
@@ -93,9 +83,9 @@ def test_no_wish_breaks_a_bound(
     places = np.stack([course.slot_m[i] + shift_m(plans[i], fine_s) for i in range(6)], axis=1)
     for i in range(6):
         shift, rate, push = (np.linalg.norm(v, axis=-1) for v in shifts(plans[i], fine_s))
-        assert shift.max() <= reach_m + 1e-9
-        assert rate.max() <= speed_mps + 1e-9
-        assert push.max() <= acceleration_mps2 + 1e-9
+        assert shift.max() <= limits["reach_m"] + 1e-9
+        assert rate.max() <= limits["speed_mps"] + 1e-9
+        assert push.max() <= limits["acceleration_mps2"] + 1e-9
         for j in range(i):
             apart = np.linalg.norm(places[:, i] - places[:, j], axis=-1)
             assert apart.min() >= least_m(course, bounds, i, j) - 1e-6
@@ -151,7 +141,7 @@ def test_a_wish_for_where_another_is_going_waits_and_is_cut_short() -> None:
 
 
 def test_a_wish_that_would_leave_the_fence_some_day_is_cut_short_now() -> None:
-    """Drone 4 flies 20 m right of the track, on the last leg at x = 40: there 15 m farther out is within 58, 30 m not."""
+    """Drone 4 flies 20 m right of the track, on the last leg at x = 40: 15 m farther out is within 58, 30 m is not."""
     fleet = fleet_with(viewpoints={"fence_m": [-100, -100, 60, 100]})
     course, bounds = course_and_bounds(fleet)
     assert bounds.fence_m == (-98, -98, 58, 98)
@@ -208,7 +198,7 @@ def test_a_move_changes_its_drone_alone_from_its_begin_on_and_keeps_the_errors_o
 
 
 def test_a_move_in_a_turn_has_the_velocity_and_acceleration_of_its_place() -> None:
-    """Turning frame, moving slot: no term of the two derivatives is missing. A drone that descends goes on descending."""
+    """Turning frame, moving slot: no term of the derivatives is missing. A drone that descends goes on descending."""
     turning = {"waypoints_m": [(0.0, 0.0), (60.0, 0.0), (60.0, 200.0)], "speed_mps": 5.0}
     fleet = Fleet.model_validate({"route": turning, "motion": {**STILL, "wind_mps": (0.0, 0.0)}})
     base = fly(fleet, 40.0, 0.05, 3)
@@ -225,7 +215,7 @@ def test_a_move_in_a_turn_has_the_velocity_and_acceleration_of_its_place() -> No
 
 
 def test_whatever_follows_whatever_a_velocity_is_the_slope_of_its_place() -> None:
-    """A drone that goes home, moves within the formation and comes back, in any order: each keeps what it does not change."""
+    """A drone goes home, moves within the formation and comes back, in any order: each keeps what it leaves alone."""
     fleet = Fleet.model_validate({"motion": STILL})
     base = fly(fleet, 30.0, 0.1, 3)
     for order in (("descends", "moves"), ("moves", "descends"), ("descends", "moves", "climbs")):

@@ -1,4 +1,4 @@
-"""Groups with routes and legs of their own, take-off, and ground stations: where they are, and what they leave alone."""
+"""Groups with routes and legs of their own, take-off, and ground stations: where they are, what they leave alone."""
 
 from __future__ import annotations
 
@@ -107,14 +107,6 @@ def test_a_group_flies_as_a_fleet_of_its_own_would() -> None:
     np.testing.assert_array_equal(motion.orientation_xyzw[:, [4, 1]], alone.orientation_xyzw)
     _, others = flown(drones=3)
     np.testing.assert_array_equal(motion.position_m[:, [0, 2, 3]], others.position_m)
-
-
-def test_nobody_else_flies_otherwise_for_a_group_and_a_station() -> None:
-    group, station = {"drones": [3], "route": {"waypoints_m": [[50, 50]]}}, {"drone": 4, "position_m": [9, 8, 7]}
-    _, mixed = flown(drones=5, groups=[group], ground=[station], motion={})
-    _, plain = flown(drones=5, motion={})
-    for name in ("position_m", "orientation_xyzw", "est_position_m", "est_yaw_rad", "wind_mps"):
-        np.testing.assert_array_equal(getattr(mixed, name)[:, :3], getattr(plain, name)[:, :3], err_msg=name)
 
 
 def test_a_station_stands_level_in_any_wind_and_needs_no_rotors() -> None:

@@ -66,21 +66,6 @@ def test_a_telemetry_log_that_begins_in_1970_is_read(tmp_path: Path) -> None:
     assert log.utc_s == 0.0
 
 
-def test_signal_strength_where_the_log_has_it(tmp_path: Path) -> None:
-    logs = {kind: read_log(written(tmp_path, kind, data)) for kind, data in WHOLE.items()}
-    assert (logs["bin"].rssi_unit, known(logs["bin"].rssi).values[0, 0]) == ("dBm", pytest.approx(-27.0))
-    assert (logs["ulg"].rssi_unit, known(logs["ulg"].rssi).values[0, 0]) == ("percent", 80.0)
-    assert logs["tlog"].rssi is None
-
-
-def test_without_an_estimate_the_receivers_positions_are_taken(tmp_path: Path) -> None:
-    log = read_log(written(tmp_path, "bin", WHOLE["bin"].replace(b"XKF1", b"ZZZ1")))
-    assert log.position is not None
-    assert log.origin_deg == pytest.approx((47.0, 8.0))
-    np.testing.assert_allclose(log.position.values[-1], [29.7, 39.6, 9.9], atol=0.02)
-    assert log.velocity is None
-
-
 @given(st.tuples(st.floats(-3000, 3000), st.floats(-3000, 3000), st.floats(-100, 500)))
 def test_local_metres_undo_the_geodetic(position: tuple[float, float, float]) -> None:
     fixes = np.array([geodetic((0.0, 0.0, 0.0), examples.ORIGIN), geodetic(position, examples.ORIGIN)])

@@ -153,7 +153,7 @@ def test_a_pause_is_one_by_the_usual_interval_of_its_series() -> None:
 
 
 def test_a_value_that_is_unknown_for_a_while_is_a_gap_of_its_own_column() -> None:
-    """The other column of the same series goes on; a short pause is bridged, and nothing is known after a column's end."""
+    """Other columns of the series go on; a short pause is bridged, and nothing is known after a column's end."""
     time_s = np.arange(11.0) / 2
     holed, ends, whole = (np.arange(11.0) for _ in range(3))
     holed[3:8] = np.nan  # 1.5 to 3.5 s, from 1.0 s to 4.0 s without a sample
@@ -261,7 +261,7 @@ def placed_beside(lat_deg: list[float], alt_m: float, position_s: list[float]) -
 
 
 def test_places_side_by_side_are_moved_by_the_median_of_their_fixes() -> None:
-    """One fix that is off moves nothing, nor do fixes from before the estimator ran: it was carried 100 m north then."""
+    """One fix that is off moves nothing, nor do fixes from before the estimator ran: it was carried north then."""
     lat_deg = [47.0] * 4 + [47.0109] + [47.0009] * 4
     found = placed_beside(lat_deg, 400.0, [4.0, 5.0, 6.0, 7.0, 8.0])
     np.testing.assert_allclose(found, [[0.0, 0.0009 * 111_180, 0.0]] * 5, atol=0.5)

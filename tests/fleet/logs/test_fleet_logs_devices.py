@@ -212,7 +212,7 @@ def test_a_live_charge_is_that_of_the_first_battery_that_knows_it() -> None:
 
 
 def test_a_height_is_that_above_the_origin_and_not_above_home() -> None:
-    """GLOBAL_POSITION_INT has both. A vehicle that took off from a hill is still where it is; 0° and 0° is no place yet."""
+    """GLOBAL_POSITION_INT has both: a vehicle that took off from a hill is where it is. 0° and 0° is no place yet."""
     place = (0, 470_000_000, 80_000_000, 430_000, 5_000, 100, 200, -50, 0)
     nowhere = ((1, 1), "global_position_int", (0, 0, 0, 17_000, 0, 0, 0, 0, 0))
     at = Origin(47.0, 8.0, 400.0)

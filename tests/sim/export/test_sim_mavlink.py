@@ -40,7 +40,6 @@ from sortie.sim.export.origin import ORIGIN
 from sortie.sim.export.telemeter import Telemeter
 from sortie.sim.export.telemetry import DATAGRAM_BYTES, MavlinkEndpoint, save_tlog
 from sortie.sim.folders import RunError
-from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
 
 BEGIN_US = 1_767_225_600_000_000
@@ -86,56 +85,10 @@ def test_the_log_has_every_drone_s_pose_at_10_hz_and_status_at_1_hz(log: Path, r
     assert read_back[-1]._timestamp == pytest.approx(BEGIN_US * 1e-6 + SECONDS - 0.1)
 
 
-def test_values_are_the_record_s_in_mavlink_s_frames(log: Path, record: SortieRecord) -> None:
-    drone, frame, messages = 1, 17, read(log)
-    rows = [s for s in record.tables["states"].to_pylist() if s["drone"] == drone]
-    row, first = rows[frame], rows[10]
-    ned, globe = (of_drone(messages, drone, name)[frame] for name in ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"))
-    assert ned.time_boot_ms == globe.time_boot_ms == 1700
-    assert (ned.x, ned.y, ned.z) == pytest.approx((row["y_m"], row["x_m"], -row["z_m"]), rel=1e-6)
-    assert (ned.vx, ned.vy, ned.vz) == pytest.approx((row["vy_mps"], row["vx_mps"], -row["vz_mps"]), rel=1e-6)
-    assert globe.relative_alt == round(1000 * row["z_m"])
-    assert globe.alt == round(1000 * (488.0 + row["z_m"]))
-    # a second of latitude is 30.88 m at 47.4°
-    assert (globe.lat / 1e7 - ORIGIN.latitude_deg) * 3600 * 30.88 == pytest.approx(row["y_m"], abs=0.05)
-    status, battery = (of_drone(messages, drone, name)[1] for name in ("SYS_STATUS", "BATTERY_STATUS"))
-    assert status.voltage_battery == round(1000 * first["voltage_v"])
-    assert battery.current_battery == round(100 * first["current_a"])
-    assert battery.energy_consumed == round(first["spent_j"] / 100) > 0
-    published = [d for d in record.tables["descriptors"].to_pylist() if d["drone"] == drone and d["t_s"] < 1.05]
-    assert status.load == round(1000 * (1 - published[-1]["cpu_headroom"]))
-
-
-def test_a_lost_drone_is_disarmed_and_one_without_gnss_has_no_fix(log: Path) -> None:
-    """Its fix ends and comes back, and it is its drone's alone."""
-    messages, flag = read(log), mavlink2.MAV_MODE_FLAG_SAFETY_ARMED
-    armed = [bool(m.base_mode & flag) for m in of_drone(messages, 3, "HEARTBEAT")]
-    assert armed[:2] == [True, True]
-    assert armed[-1] is False
-    fixes = {drone: [m.fix_type for m in of_drone(messages, drone, "GPS_RAW_INT")] for drone in (0, 1)}
-    assert fixes == {0: [3] * 5, 1: [3, 3, 1, 1, 3]}
-
-
 def test_the_capacity_of_a_pack_is_read_again_by_import(log: Path, record: SortieRecord) -> None:
     pack, flight = record.scenario.fleet.battery, read_logs(log)[0]
     capacity_wh = flight.parameters["BATT_CAPACITY"] * 1e-3 * pack.cells * MEAN_CELL_V
     assert capacity_wh == pytest.approx(pack.capacity_wh, rel=1e-6)
-
-
-def test_texts_say_what_was_decided_and_what_happened(log: Path, record: SortieRecord) -> None:
-    """Joined as a ground station joins them; by the sender's system, at their times, in the words of the record."""
-    said: dict[tuple[int, int], str] = {}
-    for m in read(log):
-        if m.get_type() == "STATUSTEXT":
-            at_us = round(m._timestamp * 1e6) - BEGIN_US
-            said[m.get_srcSystem(), at_us] = said.get((m.get_srcSystem(), at_us), "") + m.text
-    changes = list(transitions(record.tables["directives"], {}))
-    assert len(changes) > 20
-    for change in changes:
-        about = f"drone {change['drone']} -> {', '.join(map(str, change['peers']))}: "
-        assert about in said[change["drone"] + 1, round(change["t_s"] * 1e6)]
-    lost = next(e for e in record.tables["events"].to_pylist() if e["kind"] == "drone_lost")
-    assert said[4, 2_000_000].startswith(f"drone 3: {lost['text']}")
 
 
 def test_telemetry_of_a_flight_in_slices_is_that_of_the_whole(record: SortieRecord) -> None:

@@ -1,4 +1,4 @@
-"""MAVProxy, a ground station on a terminal, joins a flying fleet; it is heavy, and these tests are skipped where it is missing.
+"""MAVProxy, a ground station on a terminal, joins a flying fleet; it is heavy, and skipped where it is missing.
 
 `make mavproxy` installs it in an environment of its own, and so does `pipx install MAVProxy`.
 """

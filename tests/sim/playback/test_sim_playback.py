@@ -17,7 +17,7 @@ from sim_examples import example
 
 from sortie.sim.playback.charts import OVER
 from sortie.sim.playback.recording import save_rrd, scene_of
-from sortie.sim.results.accuracy import accuracy, matched
+from sortie.sim.results.accuracy import matched
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words
@@ -176,30 +176,6 @@ def test_a_drone_that_waits_for_its_turn_shows_no_boxes(record: SortieRecord, tm
             assert bool(last) == (scored == drone), (drone, t_s)
 
 
-def test_accuracy_is_the_outcome_s_over_the_same_window(rows: Rows, record: SortieRecord) -> None:
-    for name, path in (("full_scene", "/plots/ap/full_scene"), ("mission", "/plots/ap/mission")):
-        drawn = dict(series(rows, path))
-        assert drawn[8.0] == pytest.approx(accuracy(record, 3.0, 8.0)[name])
-    assert min(dict(series(rows, "/plots/ap/mission"))) == 4.0
-
-
-def test_the_age_of_descriptors_is_that_of_each_second(rows: Rows, record: SortieRecord) -> None:
-    drawn = dict(series(rows, "/plots/age/p99_ms"))
-    for second in (4.0, 5.0):
-        ages = [a["age_s"] for a in record.tables["ages"].to_pylist() if second <= a["t_s"] < second + 1.0]
-        assert drawn[second + 1.0] == pytest.approx(1e3 * np.percentile(ages, 99))
-
-
-def test_the_share_of_lost_descriptors_is_that_of_each_second(rows: Rows, record: SortieRecord) -> None:
-    drawn = dict(series(rows, "/plots/lost/percent"))
-    assert sorted(drawn) == [float(second) for second in range(1, round(record.scenario.duration_s) + 1)]
-    for second, percent in drawn.items():
-        within = [r for r in record.tables["receptions"].to_pylist() if second - 1.05 <= r["t_s"] < second - 0.05]
-        every = sum(sum(r.values()) - r["t_s"] for r in within)
-        assert percent == pytest.approx(100.0 * (1.0 - sum(r["heard"] for r in within) / every))
-    assert max(drawn.values()) > 5.0
-
-
 def test_moving_cars_are_the_scene_s(rows: Rows, record: SortieRecord) -> None:
     scene, frame = scene_of(record), 41
     place = record.tables["states"].slice(frame * 5, 5)
@@ -230,16 +206,6 @@ def test_a_transition_in_words() -> None:
     change = {"drone": 2, "peers": [1, 4], "to": "detections at 2 Hz", "reason": "goodput 3.1 < 5 Mb/s"}
     assert decision_in_words(change) == "drone 2 → 1, 4: detections at 2 Hz, because goodput 3.1 < 5 Mb/s"
     assert decision_in_words({**change, "peers": [1], "to": "nothing", "reason": ""}) == "drone 2 → 1: nothing"
-
-
-def test_a_lane_shows_the_best_that_a_drone_sends(rows: Rows) -> None:
-    states = [(t_s, v) for t_s, _, (v,) in rows["/lanes/drone_2"]["StateChange:state"]]
-    assert any(v.startswith("features") for t_s, v in states if t_s < 4.0)
-    assert next(v for t_s, v in states if t_s > 4.0).startswith("detections at 2 Hz")
-    *_, before, last, over = [(t_s, v) for t_s, _, (v,) in rows["/lanes/drone_3"]["StateChange:state"]]
-    assert before[1].startswith("features")
-    assert last == (6.0, "nothing")  # it was lost then, and nothing was decided on it any more
-    assert over == (8.0, OVER)
 
 
 def test_no_house_hides_the_mission_region(rows: Rows, record: SortieRecord) -> None:

@@ -185,20 +185,6 @@ def test_a_ground_station_is_drawn_as_a_mast_that_leaves_no_trail(tmp_path: Path
 # --- two policies in one recording ------------------------------------------------------------------------
 
 
-def columns(path: Path) -> dict[tuple[str, str], list[object]]:
-    """(entity, component) → all values, in order of time."""
-    found: dict[tuple[str, str], list[tuple[int, object]]] = {}
-    for chunk in RrdReader(path).stream().to_chunks():
-        batch = chunk.to_record_batch()
-        names = batch.schema.names
-        stamps = batch["sim_time"].cast(pa.int64()).to_pylist() if "sim_time" in names else [-1] * batch.num_rows
-        for name in names:
-            if name not in ("rerun.controls.RowId", "sim_time", "frame"):
-                values = found.setdefault((chunk.entity_path, name), [])
-                values += [(t, v) for t, v in zip(stamps, batch[name].to_pylist(), strict=True) if v is not None]
-    return {key: [v for _, v in sorted(values, key=lambda v: v[0])] for key, values in found.items()}
-
-
 def test_each_policy_is_drawn_below_its_root_as_it_is_alone(tmp_path: Path) -> None:
     """And the plots that they share have a line for each."""
     other = small(policy="all-4")
@@ -206,11 +192,15 @@ def test_each_policy_is_drawn_below_its_root_as_it_is_alone(tmp_path: Path) -> N
     flown = [("worked", small()), ("all-4(received_budget=0.1)", dataclasses.replace(other, tables=tables))]
     both_roots = ("worked", "all-4_received_budget_0_1")
     save_comparison(flown, tmp_path / "both.rrd")
-    both = columns(tmp_path / "both.rrd")
+    both = read(tmp_path / "both.rrd")
     for root, (_, record) in zip(both_roots, flown, strict=True):
-        save_rrd(record, tmp_path / "one.rrd")
-        alone = {key: v for key, v in columns(tmp_path / "one.rrd").items() if not key[0].startswith("/__")}
-        below = {(e.removeprefix(f"/{root}") or "/", c): v for (e, c), v in both.items() if e.startswith(f"/{root}")}
+        alone = {(e, c): v for e, each in drawn(record, tmp_path).items() for c, v in each.items() if e[:3] != "/__"}
+        below = {
+            (e.removeprefix(f"/{root}") or "/", c): v
+            for e, each in both.items()
+            for c, v in each.items()
+            if e.startswith(f"/{root}")
+        }
         assert repr(sorted(below.items())) == repr(sorted(alone.items()))  # by what is written: NaN is not itself
     reader = RrdReader(tmp_path / "both.rrd")
     assert len(reader.recordings()) == 1
