@@ -128,7 +128,7 @@ def test_the_smallest_lag_tells_the_offset_and_only_peers_that_are_asked_for_cou
 
 
 def test_ages_are_true_whoever_s_clock_is_off() -> None:
-    """Of descriptors and payloads, once a peer's clock is known: to half a frame, never below the time since they came."""
+    """Of descriptors and payloads, once a peer's clock is known: to half a frame; at least the time since they came."""
     for mine_s, theirs_s in product((0.0, 3.0, -2.0), (0.0, 5.0, -4.0)):
         mine = memory()
         mine.status.clock_skew_s = mine_s

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from sortie.fleet.energy.recorded import BatteryTrace
 from sortie.fleet.flight.frames import tangent_plane_m
 from sortie.fleet.flight.motion import fly
-from sortie.fleet.traces import DroneTrace, PoseTrace, TraceError, flown_at, flown_motion, follow, read_traces
+from sortie.fleet.traces import PoseTrace, TraceError, flown_at, flown_motion, follow, read_traces
 from sortie.scenarios.schema import Fleet, Origin, Route
 
 FLEET = Fleet(route=Route(waypoints_m=((0, 0), (200, 0))))
@@ -104,21 +104,6 @@ def test_before_the_first_and_after_the_last_place_a_drone_stands(tmp_path: Path
         np.testing.assert_allclose(flown.yaw_rad[:, 0], np.pi / 2)
         held_m = np.where(flown.time_s[~moves] < 4, 10.0, 30.0 - 5e-9)
         assert (flown.position_m[~moves, 0, 1] == held_m).all()
-
-
-def test_one_that_speeds_up_has_the_slopes_of_what_is_flown_within_its_trace_alone() -> None:
-    base = fly(Fleet.model_validate({"motion": {"pose_jitter_m": 0.0, "gust_sigma_mps": 0.0}}), 6.0, 0.1, 3)
-    t_s = np.arange(2.0, 4.01, 0.1)
-    along = 1.5 * (t_s - 1.0) ** 2
-    place = np.stack([along, 0 * along, 60 + 0 * along], axis=1)
-    flown = follow(base, {1: DroneTrace(PoseTrace(t_s, place, None, None), None)}, 0.1)
-    speed, push = flown.velocity_mps[:, 1], flown.acceleration_mps2[:, 1]
-    beyond = (base.time_s < 2.0 - 1e-6) | (base.time_s > 4.0 + 1e-6)
-    assert beyond.sum() == 39
-    assert not speed[beyond].any()
-    assert not push[beyond].any()
-    assert push[22:38, 0] == pytest.approx(np.full(16, 3.0), abs=1e-6)
-    assert speed[25, 0] == pytest.approx(3.0 * 1.5)
 
 
 def test_a_flight_written_as_states_flies_again(tmp_path: Path) -> None:

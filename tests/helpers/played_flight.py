@@ -108,3 +108,21 @@ def series(rows: Rows, path: str) -> list[tuple[float, float]]:
 
 def with_tables(record: SortieRecord, **changed: pa.Table) -> SortieRecord:
     return dataclasses.replace(record, tables={**record.tables, **changed})
+
+
+class Kept:
+    """A canvas that keeps what is drawn."""
+
+    def __init__(self) -> None:
+        self.still: dict[str, Any] = {}
+        self.rows: dict[str, list[tuple[float, list[Any]]]] = {}
+
+    def static(self, path: str, *shown: Any) -> None:
+        self.still[path] = shown[0]
+
+    def columns(self, path: str, t_s: Any, columns: Any) -> None:
+        for column in columns:
+            name = column.component_descriptor().component.split(":")[1]
+            values = column.as_arrow_array().to_pylist()
+            known = self.rows.setdefault(f"{path} {name}", [])
+            known += zip(np.asarray(t_s, float).tolist(), values, strict=True)

@@ -168,20 +168,6 @@ def test_a_fault_takes_energy_at_once_and_may_land() -> None:
         b.fault(1, 1.5)
 
 
-def test_who_is_told_to_land_draws_nothing_and_takes_off_with_what_is_left() -> None:
-    packs = FleetBatteries(Battery(), (), 2)
-    steady(packs, 1.0)
-    packs.land(0, "told to")
-    left, spent = packs.energy_left_j[0], packs.spent_j[0]
-    steady(packs, 1.0)
-    assert packs.landed == [True, False]
-    assert (packs.energy_left_j[0], packs.spent_j[0], packs.current_a[0]) == (left, spent, 0.0)
-    assert packs.voltage_v[0] == pytest.approx(4 * float(open_circuit_cell_v(packs.soc[0])), abs=1e-3)
-    packs.take_off(0)
-    steady(packs, 1.0)
-    assert packs.energy_left_j[0] < left
-
-
 def test_a_member_on_the_mains_is_full_whatever_is_said_of_its_pack() -> None:
     """A low charge, an override, a trace, faults: nothing is drawn of it, and it never lands."""
     low = (DroneOverride(drone=1, initial_soc=0.3),)

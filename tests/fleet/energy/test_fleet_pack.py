@@ -111,20 +111,6 @@ def test_all_that_is_lost_in_a_pack_warms_its_mass() -> None:
         assert packs.temperature_c[0] > 10.05
 
 
-def test_it_lands_when_its_cells_fall_below_the_cut_off() -> None:
-    b = FleetBatteries(Battery(cutoff_cell_v=3.6, capacity_wh=20), (), 1)
-    volts = []
-    while not b.landed[0]:
-        steady(b, 0.1)
-        volts.append(b.voltage_v[0])
-    assert b.soc[0] > 0.1
-    assert min(volts[:-1]) >= 4 * 3.6
-    assert 4 * float(open_circuit_cell_v(b.soc[0])) == pytest.approx(b.voltage_v[0], abs=1e-4)  # at rest again
-    spent = sum(b.energy_j[c][0] for c in CAUSES)
-    steady(b, 10.0)
-    assert sum(b.energy_j[c][0] for c in CAUSES) == spent
-
-
 def test_a_pack_that_takes_off_again_is_one_of_its_charge_that_never_flew() -> None:
     """What was polarised is gone at rest; voltage, current and what is spent go on from the charge alone."""
     of = Battery(capacity_wh=120, polarisation=Polarisation(resistance_mohm=8, time_s=30))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -15,8 +14,6 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sortie.fleet.logs.flightlog import FlightLog, read_log, read_logs
 from sortie.sim.cli.import_log import flown_log
-
-CASES = Path(os.environ.get("SORTIE_LOG_CASES", Path(__file__).resolve().parents[4] / "shared/cases"))
 
 
 class Telemetry:
@@ -229,37 +226,3 @@ def test_the_origin_is_where_the_flight_began(tmp_path: Path) -> None:
 
 
 # --- the inputs that were reported ------------------------------------------------------------------------
-
-
-Reported = tuple[float, float, tuple[float, float] | None, int | None]
-REPORTED: dict[str, Reported] = {
-    "01_tlog_reboot/reboot.tlog": (14.9, 149.0, (0.8, 0.73), 3),
-    "02_tlog_gimbal/gimbal.tlog": (9.75, 2.97, (0.9, 0.9), 3),
-    "03_charge_low_sample/ul_glitch.ulg": (19.9, 99.5, (0.95, 0.9102), 3),
-    "03_charge_low_sample/ul_usb.ulg": (19.9, 99.5, (0.946, 0.9102), 3),
-    "04_timestamp_spike/df_spike.bin": (19.9, 30.27, (1.0, 0.9602), 3),
-    "04_timestamp_spike/ul_first0.ulg": (19.8, 99.0, (0.9, 0.8801), 3),
-    "05_tlog_ground_clock/jump.tlog": (9.9, 3.765, (0.9, 0.86), 3),
-    "06_battery_instance/df_inst1.bin": (19.9, 30.27, (1.0, 0.9602), 3),
-    "06_battery_instance/ul_disc.ulg": (19.9, 99.5, (0.9, 0.8801), 4),
-    "06_battery_instance/ul_inst1.ulg": (19.9, 99.5, (0.9, 0.8801), 3),
-    "07_cells/ul_6s.ulg": (19.9, 99.5, (0.9, 0.8801), 6),
-    "07_cells/ul_lihv.ulg": (19.9, 99.5, (0.9, 0.8801), 3),
-    "14_battery_status_only/bs.tlog": (9.9, 3.765, (0.88, 0.88), 3),
-    "14_battery_status_only/raw.tlog": (9.9, 37.65, None, None),
-}
-"""Seconds, metres east in the end, charge in the beginning and in the end, and cells."""
-
-
-@pytest.mark.skipif(not CASES.is_dir(), reason=f"{CASES} has no cases")
-def test_the_reported_inputs() -> None:
-    wrong = {}
-    for file, reported in REPORTED.items():
-        log = read_log(CASES / file)
-        ends = None if log.charge is None else tuple(log.charge.values[[0, -1], 0].tolist())
-        found = (log.duration_s, float(known(log.position).values[-1, 0]), ends, log.cells)
-        seconds, east_m, charge, cells = reported
-        near = (pytest.approx(seconds, abs=1e-6), pytest.approx(east_m, abs=0.02))
-        if found != (*near, charge and pytest.approx(charge, abs=2e-3), cells):
-            wrong[file] = found
-    assert wrong == {}

@@ -69,13 +69,6 @@ def test_optional_fields_survive_the_compact_forms(d: Descriptor, form: Form) ->
     assert [getattr(back, f.name) for f in FIELDS] == [getattr(d, f.name) for f in FIELDS]
 
 
-def test_types_ascend_and_every_optional_field_has_a_default() -> None:
-    numbers = [f.number for f in FIELDS]
-    assert numbers == sorted(set(numbers))
-    assert all(0 < n <= 255 for n in numbers)
-    assert {f.name for f in FIELDS} | {"priority_target_ids"} == set(Descriptor._field_defaults)
-
-
 def test_optional_fields_pass_the_hysteresis() -> None:
     """Its result is a descriptor of its own when a quantity rose."""
     before = DESCRIPTOR._replace(battery_soc=0.2, feature_space="a")

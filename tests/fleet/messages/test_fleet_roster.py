@@ -15,7 +15,7 @@ from sortie.fleet.messages import extensions
 from sortie.fleet.messages.auth import Opened, Sealer, open_datagram
 from sortie.fleet.messages.cdr import MalformedDatagram
 from sortie.fleet.messages.compact import FULL, Form, encode_compact
-from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES, VERSION
+from sortie.fleet.messages.extensions import MAX_DESCRIPTOR_BYTES
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
 from sortie.fleet.standings import UNJUDGED
 from sortie.fleet.trust import Arrival, judge
@@ -79,38 +79,6 @@ def test_an_older_reader_reads_the_same_goodputs(encode: Encode, d: Descriptor) 
     assert old.feature_space == new.feature_space
     opened = open_datagram(Sealer(bytes(32), 7).seal(data), {7: bytes(32)})
     assert isinstance(opened, Opened)
-
-
-CAPTURED = (
-    "000100003d00000001a3e11103000000000048c10000a2410000704200"
-    "00003f000000bf0000003f0000003f0000a040000000bf0000003e0000"
-    "28420000403f0000003f0000803e040000000000a04200000000000048"
-    "4100004040000102030405060708090a0b0c0d0e0f1011121314151617"
-    "18191a1b1c1d1e1f202122232425262728292a2b2c2d2e2f3031323334"
-    "35363738393a3b3c3d3e3f05020000000020410000a0c1000000420000"
-    "803f010000000700020105006e65742d62",
-    "c00801103d00000001a3e1110302850401ce7f5080ef80ffbf0040ffbf"
-    "ffbfff89007f3f800015ffbf00800040061400002203c1002780b07f00"
-    "0450555055fafffaff0700020105006e65742d62",
-)
-"""Datagrams of the version before rosters, in CDR and in the small form."""
-
-
-def test_old_captures_are_read_and_written_as_before() -> None:
-    named = DESCRIPTOR._replace(feature_space="net-b", priority_target_ids=(7,))
-    for captured, encode in zip(CAPTURED, (ENCODERS[0], ENCODERS[2]), strict=True):
-        assert encode(named).hex() == captured
-    assert decode_descriptor(bytes.fromhex(CAPTURED[0])) == named
-    small = decode_descriptor(bytes.fromhex(CAPTURED[1]))
-    assert (small.feature_space, small.roster, small.priority_target_ids) == ("net-b", None, (7,))
-    assert [small.goodput_to(i) for i in range(6)] == pytest.approx([80.0, 0.0, 12.5, 0.0, 3.0, 0.0], abs=0.01)
-
-
-def test_a_roster_in_an_unknown_form_is_the_newer_senders_right() -> None:
-    plain = DESCRIPTOR._replace(peer_goodput_mbps=(1.0, 2.0))
-    for value in (b"", bytes(40), (7).to_bytes(4, "little") + bytes([0b1111])):
-        block = bytes([VERSION + 1, 2, len(value), 0]) + value
-        assert decode_descriptor(encode_descriptor(plain) + block) == plain
 
 
 FORM = "must be an epoch of 4 B and the bits of ids up to 254"

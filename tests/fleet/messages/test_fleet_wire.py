@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from fleet_examples import DESCRIPTOR, DIRECTIVE, descriptors, directives
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -221,7 +221,6 @@ def decodes_or_is_malformed(data: bytes) -> None:
         assert decode(encode(value)) == value
 
 
-@settings(max_examples=200)
 @given(st.binary(max_size=1200) | st.binary(min_size=160, max_size=300).map(lambda b: ENCAPSULATION + b))
 def test_random_bytes(data: bytes) -> None:
     decodes_or_is_malformed(data)
@@ -236,7 +235,6 @@ def test_truncations(data: bytes, draw: st.DataObject) -> None:
         decode_directive(short)
 
 
-@settings(max_examples=200)
 @given(descriptors.map(encode_descriptor) | directives.map(encode_directive), st.data())
 def test_bit_flips(data: bytes, draw: st.DataObject) -> None:
     flipped = bytearray(data)

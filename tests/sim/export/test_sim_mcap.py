@@ -69,19 +69,6 @@ def test_the_reader_finds_every_message_of_the_record(bag: Bag, record: SortieRe
     assert [t * 1e-9 for t in times] == pytest.approx(expected, abs=1e-9)
 
 
-def test_fields_come_out_as_the_record_has_them(bag: Bag, record: SortieRecord) -> None:
-    row = [d for d in record.tables["descriptors"].to_pylist() if d["drone"] == 1][40]
-    m = [m for _, m in bag["/fleet/context"] if m.agent_id == 1][40]
-    assert (m.agent_id, m.task_phase) == (1, 2)
-    assert m.stamp.sec * 1_000_000_000 + m.stamp.nanosec == BEGIN_NS + row["stamp_ns"]
-    assert list(m.peer_goodput) == pytest.approx(row["goodput_mbps"], rel=1e-6)
-    assert list(m.region) == pytest.approx([row["region_x_m"], row["region_y_m"], 32.0, 1.0], rel=1e-6)
-    assert bytes(m.coverage_grid) == row["coverage_grid"]
-    order = [d for d in record.tables["directives"].to_pylist() if d["drone"] == 1][-1]
-    _, m = bag[f"/drone_1/to_drone_{order['peer']}/directive"][-1]
-    assert (m.source, m.destination, m.rate) == (1, order["peer"], pytest.approx(order["rate_hz"]))
-
-
 def test_the_log_is_the_decisions_in_words(bag: Bag, record: SortieRecord) -> None:
     said = [m.msg for _, m in bag["/decisions"] if m.level == 20]
     assert said == [decision_in_words(t) for t in outcome(record)["transitions"]]

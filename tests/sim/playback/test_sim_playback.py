@@ -208,15 +208,6 @@ def test_a_transition_in_words() -> None:
     assert decision_in_words({**change, "peers": [1], "to": "nothing", "reason": ""}) == "drone 2 → 1: nothing"
 
 
-def test_no_house_hides_the_mission_region(rows: Rows, record: SortieRecord) -> None:
-    """Its second ring lies above every roof."""
-    ((_, _, (ground, above, *posts)),) = rows["/world/mission/disc"]["LineStrips3D:strips"]
-    roofs = rows["/world/town/buildings"]["Boxes3D:half_sizes"][0][2]
-    assert {z for _, _, z in ground} == {0.0}
-    assert [z for _, _, z in above] == pytest.approx([2 * max(half[2] for half in roofs) + 1.0] * len(above), rel=1e-5)
-    assert len(posts) == 8
-
-
 def test_the_map_has_the_fleet_where_it_flew_with_north_up(rows: Rows, record: SortieRecord) -> None:
     scene, n = scene_of(record), record.scenario.fleet.drones
     x0, _, _, y1 = scene.rect

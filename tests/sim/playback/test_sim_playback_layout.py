@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from played_flight import Kept
 from record_by_hand import record, tables_of
 from sim_examples import example
 
@@ -19,24 +20,6 @@ from sortie.sim.playback.comparison import SHARED, comparison, roots
 from sortie.sim.playback.ground_map import GroundMap
 from sortie.sim.playback.recording import spread_m
 from sortie.sim.results import palette
-
-
-class Kept:
-    """A canvas, and a recording, that keep what is drawn."""
-
-    def __init__(self) -> None:
-        self.still: dict[str, Any] = {}
-        self.rows: dict[str, list[tuple[float, list[Any]]]] = {}
-
-    def static(self, path: str, *shown: Any) -> None:
-        self.still[path] = shown[0]
-
-    def columns(self, path: str, t_s: Any, columns: Any) -> None:
-        for column in columns:
-            name = column.component_descriptor().component.split(":")[1]
-            values = column.as_arrow_array().to_pylist()
-            known = self.rows.setdefault(f"{path} {name}", [])
-            known += zip(np.asarray(t_s, float).tolist(), values, strict=True)
 
 
 def told(part: Any) -> Any:
@@ -166,12 +149,6 @@ def test_lanes_are_of_the_first_drones_and_of_every_group() -> None:
     scenario = example("fleet.drones=10", "mission.groups=[{drones: [1], phases: [{phase: search}]}]")
     lanes = layout.lanes_view(scenario).contents
     assert list(lanes) == ["/lanes/events", "/lanes/phase", "/lanes/phase_1", *(f"/lanes/drone_{i}" for i in range(8))]
-
-
-def test_the_map_shows_the_middle_of_a_town_that_is_wider_than_high() -> None:
-    shown = layout._middle((900.0, 700.0))
-    edge = layout.MARGIN_M - layout.MAP_EDGE_M
-    assert told(shown.range) == [{"x_range": [edge, 900.0 - edge], "y_range": [edge, 700.0 - edge]}]
 
 
 def test_the_legend_tells_of_boxes_and_of_turns_where_there_are_any() -> None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
-from played_flight import Rows, drawn, flown, with_tables
+from played_flight import Kept, Rows, drawn, flown, with_tables
 from record_by_hand import tables_of
 
 from sortie.perception.budget import CELL_M
@@ -68,19 +67,6 @@ def test_goodput_runs_from_red_by_yellow_to_green() -> None:
 
 
 # --- arrows by hand ---------------------------------------------------------------------------------------
-
-
-class Kept:
-    """A canvas that keeps what is drawn."""
-
-    def __init__(self) -> None:
-        self.rows: dict[str, list[tuple[float, list[Any]]]] = {}
-
-    def columns(self, path: str, t_s: Any, columns: Any) -> None:
-        for column in columns:
-            name = column.component_descriptor().component.split(":")[1]
-            known = self.rows.setdefault(f"{path} {name}", [])
-            known += zip(np.asarray(t_s, float).tolist(), column.as_arrow_array().to_pylist(), strict=True)
 
 
 Goodput = list[list[float]]

@@ -9,11 +9,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 import rerun as rr
-from played_flight import DURATION_S, Rows, drawn, flown, read
+from played_flight import Rows, drawn, flown, read
 from record_by_hand import record as by_hand
 from rerun.chunk import RrdReader
 from sim_examples import example
@@ -23,7 +22,6 @@ from sortie.sim.folders import RunError
 from sortie.sim.playback import recording
 from sortie.sim.playback.recording import save_comparison, save_rrd, scene_of
 from sortie.sim.playback.viewer import LiveViewer, open_viewer, to_file, to_new_viewer
-from sortie.sim.results.outcome import outcome, transitions
 from sortie.sim.results.record import SortieRecord
 
 
@@ -35,40 +33,6 @@ def record() -> SortieRecord:
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> Rows:
     return drawn(flown(), tmp_path_factory.mktemp("rrd"))
-
-
-def slices(record: SortieRecord) -> list[tuple[float, dict[str, pa.Table]]]:
-    """The record second by second, cut as rows come in a sortie: what is stamped up to and with the frame at t."""
-    stamps = {"transmissions": "t_done_s", "energy": None}
-    cut, before = [], -1.0
-    for t_s in [float(t) for t in range(math.ceil(DURATION_S))] + [DURATION_S]:
-        new = {}
-        for name, table in record.tables.items():
-            stamp = stamps.get(name, "t_s")
-            if stamp is None:
-                keep = pa.array([t_s == DURATION_S] * table.num_rows, pa.bool_())
-            else:
-                late = pc.and_(pc.is_nan(table[stamp]), t_s == DURATION_S)
-                keep = pc.or_(pc.and_(pc.greater(table[stamp], before), pc.less_equal(table[stamp], t_s)), late)
-            new[name] = table.filter(keep)
-        cut.append((t_s, new))
-        before = t_s
-    return cut
-
-
-def test_live_draws_what_is_saved(rows: Rows, record: SortieRecord, tmp_path: Path) -> None:
-    viewer = LiveViewer(to_file(tmp_path / "live.rrd"))
-    viewer.begin(record.scenario, scene_of(record))
-    for t_s, new in slices(record):
-        viewer.second(t_s, new)
-    viewer.close()
-    assert_same(read(tmp_path / "live.rrd"), rows)
-
-
-def test_transitions_in_slices_are_those_of_the_whole(record: SortieRecord) -> None:
-    carried: dict[tuple[int, int], str] = {}
-    pieces = [t for _, new in slices(record) for t in transitions(new["directives"], carried)]
-    assert pieces == outcome(record)["transitions"]
 
 
 def test_a_long_sortie_is_drawn_in_blocks(
