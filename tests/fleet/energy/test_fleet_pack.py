@@ -164,6 +164,16 @@ def test_a_cell_s_mean_voltage_is_over_the_cells_that_work() -> None:
     assert low.landing_reason[0].endswith("cut off below 3.9 V")
 
 
+def test_losing_a_cell_under_a_cut_off_by_the_cell_goes_on_and_the_last_cell_lands() -> None:
+    b = FleetBatteries(Battery(cells=2, cutoff_cell_v=3.0), (), 1)
+    b.drop_cell(0)
+    steady(b, 1.0)
+    assert not b.landed[0]
+    b.drop_cell(0)
+    assert b.landed[0]
+    assert b.energy_left_j[0] == 0.0
+
+
 def test_the_voltage_after_a_fault_is_that_of_the_cold_and_polarised_pack() -> None:
     """Between that of the step before and that of the next; a lost cell takes its own share of it."""
     cold = Battery(ambient_c=-5, polarisation=Polarisation(resistance_mohm=5, time_s=20))
@@ -201,6 +211,13 @@ def test_a_traced_drone_follows_its_trace_and_the_others_their_model() -> None:
     steady(b, 20.0)
     assert b.soc[1] == pytest.approx(0.4, abs=1e-6)  # held after the end
     assert RECORDED not in plain.energy_j
+
+
+def test_a_traced_drone_lands_at_landing_soc_too() -> None:
+    b = FleetBatteries(Battery(landing_soc=0.5), (), 1, {0: trace([0, 10], [0.9, 0.4])})
+    steady(b, 10.0)
+    assert b.landed == [True]
+    assert 0.48 < b.soc[0] <= 0.5
 
 
 def test_faults_of_a_traced_pack_stay_and_each_takes_of_what_is_left() -> None:

@@ -15,6 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from sortie.fleet.coverage import TARGET_FLAG
 from sortie.fleet.energy.cell import MEAN_CELL_V
 from sortie.fleet.logs.geodesy import Origin, geodetic
+from sortie.fleet.messages.compact import Form, decode_compact, encode_compact
+from sortie.fleet.messages.wire import decode_descriptor
 from sortie.policies.contract import Directive, Disc, Representation, TaskPhase
 from sortie.scenarios.reading.load import loads
 from sortie.sim.export import bag
@@ -168,12 +170,15 @@ def test_a_descriptor_has_the_fields_of_its_row_and_the_pose_of_its_frame() -> N
         assert d.footprint_radius_m == pytest.approx(math.tan(math.radians(35)) * s["z_m"])
 
 
-def test_a_blind_station_has_no_footprint_and_no_network() -> None:
+def test_a_ground_station_is_blind_and_stays_on_its_mast_when_it_is_off() -> None:
     settings = SCENARIO.replace("  overrides:", "  ground: [{drone: 2, position_m: [20, 21, 22]}]\n  overrides:")
     made = [d for _, d in descriptors(replace(exported(), scenario=loads(settings)))]
     blind = {"footprint_radius_m": 0.0, "feature_space": "none"}
     plain = [d for _, d in descriptors(exported())]
     assert made == [d._replace(**blind) if d.agent_id == 2 else d for d in plain]
+    last = list(Telemeter(loads(settings)).add(exported().tables))[-1][1]
+    assert (last.landed, last.ground_station) == (True, True)
+    assert last.position_m == tuple(state(2, 2)[name] for name in ("x_m", "y_m", "z_m"))
 
 
 Told = dict[str, list[tuple[float, Any]]]
@@ -192,6 +197,16 @@ def told_of(made: SortieRecord) -> Told:
 @pytest.fixture(scope="module")
 def told() -> Told:
     return told_of(exported())
+
+
+def test_a_descriptor_of_a_smaller_form_is_in_the_bag_as_its_peers_read_it() -> None:
+    small = replace(exported(), scenario=loads(SCENARIO.replace("roster: false", "roster: false, form: small")))
+    form = Form(**small.scenario.context.form.model_dump())
+    said = (decode_descriptor(data) for _, data in told_of(small)["/fleet/context"])
+    for (_, d), found in zip(descriptors(small), said, strict=True):
+        read = decode_compact(encode_compact(d, form)).peer_goodput_mbps
+        assert found.peer_goodput_mbps == pytest.approx(read, rel=1e-6)
+        assert read != d.peer_goodput_mbps
 
 
 def xyz(point: Any) -> tuple[float, float, float]:
@@ -357,14 +372,6 @@ def test_telemetry_has_every_column_of_its_drone_s_row() -> None:
         assert t.home_m == (10.0 * drone, 10.0 * drone + 1, 0.0)
         assert t.cpu_load == pytest.approx(0.5 - drone / 10)
         assert not t.ground_station
-
-
-def test_a_ground_station_that_is_off_stays_on_its_mast() -> None:
-    settings = SCENARIO.replace("  overrides:", "  ground: [{drone: 2, position_m: [20, 21, 22]}]\n  overrides:")
-    made = list(Telemeter(loads(settings)).add(exported().tables))
-    assert made[-1][1].landed
-    assert made[-1][1].ground_station
-    assert made[-1][1].position_m == (state(2, 2)["x_m"], state(2, 2)["y_m"], state(2, 2)["z_m"])
 
 
 def test_each_vehicle_says_its_own_pack_and_its_own_texts() -> None:
