@@ -128,6 +128,7 @@ def test_a_drone_looks_as_often_as_any_of_its_links_asks_also_one_that_carries_n
     gate.enforce(Directive(0, 2, duty_percent=70))
     assert gate.duty_percent == 70
     gate.enforce(Directive(0, 2, duty_percent=10))
+    gate.enforce(Directive(0, 3, duty_percent=5))
     assert gate.duty_percent == 20
 
 
