@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -71,12 +72,21 @@ def rows_on_disk(folder: Path) -> int:
 
 
 class Pretended:
-    """An engine whose rows follow from the task alone, without flying; it can break off after some runs."""
+    """An engine whose rows follow from the task alone, without flying; it can break off after some runs.
+
+    Args:
+        change: what becomes of each row.
+    """
 
     workers = 1
 
-    def __init__(self, order: Sequence[int] | None = None, stop_after: int | None = None) -> None:
-        self.order, self.stop_after, self.flown = order, stop_after, list[int]()
+    def __init__(
+        self,
+        order: Sequence[int] | None = None,
+        stop_after: int | None = None,
+        change: Callable[[RunResult], RunResult] = lambda row: row,
+    ) -> None:
+        self.order, self.stop_after, self.change, self.flown = order, stop_after, change, list[int]()
 
     def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
         todo = list(tasks)
@@ -86,7 +96,7 @@ class Pretended:
             if self.stop_after is not None and len(self.flown) >= self.stop_after:
                 raise KeyboardInterrupt
             self.flown.append(run)
-            yield [pretend(run, task, code)]
+            yield [self.change(pretend(run, task, code))]
 
 
 class InProcess:
@@ -99,15 +109,26 @@ class InProcess:
             yield fly_batch(code, [task])[0]
 
 
+def small_cluster(n_workers: int = 1, **options: Any) -> Any:
+    """A dask cluster on this machine, one thread a worker, without a dashboard."""
+    from distributed import LocalCluster
+
+    return LocalCluster(
+        n_workers=n_workers,
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        memory_limit=0,
+        silence_logs="CRITICAL",
+        **options,
+    )
+
+
 def pretend(run: int, task: str, code: str) -> RunResult:
     """A row made of the task."""
     asked, key = json.loads(task), task_key(task, code)
     scenario = asked["scenario"]
     value = scenario["fleet"]["battery"]["initial_soc"] + 10 * (scenario["policy"]["name"] == "worked")
     return RunResult(run, key, "done", "", key[:16], (value, float(asked["replication"])))
-
-
-__all__ = ["BASE", "CAMPAIGN", "InProcess", "Pretended", "plan", "pretend", "rows_on_disk", "table_bytes", "write"]
 
 
 def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> CampaignRows:
@@ -123,3 +144,15 @@ def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_
             columns.setdefault(name, []).append(v)
     table = pa.table(columns)
     return CampaignRows(p, table, table["unit"].to_numpy(), np.array([p.at(r).policy for r in range(p.runs)]))
+
+
+def report_lines(rows: CampaignRows, folder: Path) -> list[str]:
+    """A campaign's report without its figures."""
+    from sortie.sim.campaign.report import _lines
+
+    return list(_lines(rows, folder, {"varied.png": False, "pareto.png": False}))
+
+
+def failed(row: RunResult, error: str = "ValueError: planted") -> RunResult:
+    """The row of the same run, had it failed."""
+    return RunResult(row.run, row.key, "failed", error, "", (None, None))

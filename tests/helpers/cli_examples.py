@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,6 +24,25 @@ def command(*arguments: object, run: Callable[[], None] = main) -> int:
         except SystemExit as stop:
             return int(stop.code or 0)
     return 0
+
+
+def run_line(text: str) -> int:
+    """The exit code of a command line, written as in a shell and without `sortie`."""
+    return command(*shlex.split(text))
+
+
+def refused(folder: Path, table: Sequence[tuple[str, str]], capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+    """The command lines that were not refused in one line with these words, exit code 2 and nothing written."""
+    wrong, before = {}, sorted(folder.iterdir())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for line, words in table:
+            code, printed = run_line(line), capsys.readouterr()
+            one_line = printed.err.startswith("error: ") and printed.err.count("\n") == 1
+            if code != 2 or printed.out or not one_line or words not in printed.err:
+                wrong[line] = f"{code}: {printed.out}{printed.err}"
+    assert sorted(folder.iterdir()) == before, "nothing was left behind"
+    return wrong
 
 
 def refusal(
@@ -49,7 +69,7 @@ class Seen:
         self.answer = answer
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        self.calls.append((args, {name: value for name, value in kwargs.items() if name != "progress"}))
+        self.calls.append((args, {name: value for name, value in kwargs.items() if name not in ("progress", "notice")}))
         if self.answer is None:
             raise SortieError("seen")
         return self.answer

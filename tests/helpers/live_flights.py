@@ -7,8 +7,11 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 from sim_examples import example
+from typer.testing import CliRunner
 
 from sortie.policies.staleness import LinkHealth
+from sortie.sim.cli.app import app
+from sortie.sim.folders import RunError
 from sortie.sim.live import session
 from sortie.sim.live.bench import FleetReports
 from sortie.sim.live.reports import Report
@@ -76,3 +79,10 @@ class ending_when:  # noqa: N801 - used as a function
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._patch.stop()
         assert kind is not None or self._held, f"it did not hold within {LONGEST_S:g} s"
+
+
+def refusal_of(*arguments: str) -> str:
+    """The error of `sortie live` with these arguments."""
+    error = CliRunner().invoke(app, ["live", *arguments]).exception
+    assert isinstance(error, RunError)
+    return str(error)

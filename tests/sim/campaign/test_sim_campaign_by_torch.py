@@ -32,7 +32,7 @@ METRICS = CAMPAIGN.replace("[bytes.data_sent, energy_j.total]", "[ap50.full_scen
 
 
 class TwoDetectors:
-    """Rows that follow from the task: torch finds half of what the surrogate finds, and an offset that the draw decides."""
+    """Rows that follow from the task: torch finds half of what the surrogate finds, and an offset by the draw."""
 
     workers = 1
 
@@ -110,7 +110,7 @@ def test_the_mean_uses_the_surrogate_s_other_draws(tmp_path: Path) -> None:
 
 
 def test_where_torch_is_the_surrogate_and_an_offset_the_interval_is_that_of_all_draws(tmp_path: Path) -> None:
-    """The mean over forty draws and the offset, whichever ten torch flew; the interval is much narrower than torch's alone."""
+    """The mean over forty draws and the offset, whichever ten torch flew; it is much narrower than torch's alone."""
     folder = flown(tmp_path, 10, METRICS.replace("{count: 6}", "{count: 40, method: random}"), wave=0.0)
     rows = read_rows(folder)
     torch = read_torch(folder, rows)
@@ -122,67 +122,54 @@ def test_where_torch_is_the_surrogate_and_an_offset_the_interval_is_that_of_all_
     assert first.worth > 2
 
 
-def test_the_report_has_both_and_says_what_depends_on_no_detector(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    told = write_report(flown(tmp_path)).read_text()
-    assert "The torch detector flew the first 3 draws as well" in told
-    assert "Both detectors gave the same values of energy_j.total." in told
-    section = told.partition("## By the torch detector")[2].partition("## By varied field")[0]
-    assert section.count("| ap50.full_scene |") == 3, "two means and a difference"
-
-
-@pytest.mark.parametrize(
-    ("text", "base", "units", "told"),
-    [
-        (METRICS, BASE, 3, "--by-torch: perception.detector is none, must be surrogate"),
-        (METRICS, SCORED, 7, "--by-torch: 7, must be from 2 to the campaign's 6 draws"),
-        (METRICS, SCORED, 1, "--by-torch: 1, must be from 2 to the campaign's 6 draws"),
-        (
-            METRICS.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n", "").replace(
-                "{count: 6}", "{count: 6, method: morris}"
-            ),
-            SCORED, 3, "--by-torch: sample.method is morris, whose means have no intervals",
-        ),
-        (
-            METRICS.replace("vary:", "vary:\n  perception.detector: {kind: grid, values: [surrogate, torch]}"),
-            SCORED, 3, "--by-torch: perception.detector is varied; both detectors must fly the same fleet",
-        ),
-        (
-            METRICS.replace("vary:", "vary:\n  perception: {kind: grid, values: [{detector: surrogate}, {detector: torch}]}"),
-            SCORED, 3, "--by-torch: perception is varied; both detectors must fly the same fleet",
-        ),
-        (
-            METRICS.replace("vary:", "vary:\n  fleet.makes.0.detector: {kind: choice, values: [surrogate, torch]}"),
-            SCORED.replace("{drones: 2}", "{drones: 2, makes: [{name: a, drones: [1]}]}"), 3,
-            "--by-torch: fleet.makes.0.detector is varied; both detectors must fly the same fleet",
-        ),
-        (
-            METRICS, SCORED.replace("{drones: 2}", "{drones: 2, makes: [{name: a, drones: [1], detector: surrogate}]}"), 3,
-            "--by-torch: make a has a detector or weights of its own; both must fly the same fleet",
-        ),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_estimated_is_refused_before_anything_flies(
-    text: str, base: str, units: int, told: str, tmp_path: Path
-) -> None:
-    with pytest.raises(RunError) as error:
-        sortie.campaign(write(tmp_path, text, base), out=tmp_path / "c", by_torch=units)
-    assert str(error.value) == told
-    assert not (tmp_path / "c").exists()
-
-
-@pytest.mark.parametrize("units", [2.5, "2", True, -1])
-def test_the_number_of_units_is_a_whole_number(units: object, tmp_path: Path) -> None:
-    with pytest.raises(SortieError, match=rf"^by_torch: {units!r}, must be a whole number from 0 to 2\^63 - 1$"):
-        sortie.campaign(write(tmp_path, METRICS, SCORED), out=tmp_path / "c", by_torch=units)  # type: ignore[arg-type]
-
-
-def test_before_torch_has_flown_a_whole_unit_the_report_is_that_of_the_surrogate(tmp_path: Path) -> None:
+def test_the_report_has_both_once_torch_has_flown_a_whole_unit(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     plan, torch = plans(tmp_path)
     run_campaign(plan, tmp_path / "c", TwoDetectors())
     CampaignStore(tmp_path / "c" / by_torch.FOLDER, torch).close()
     assert "By the torch detector" not in write_report(tmp_path / "c").read_text()
+    run_campaign(torch, tmp_path / "c" / by_torch.FOLDER, TwoDetectors(), units=3)
+    text = write_report(tmp_path / "c").read_text()
+    assert "The torch detector flew the first 3 draws as well" in text
+    assert "Both detectors gave the same values of energy_j.total." in text
+    section = text.partition("## By the torch detector")[2].partition("## By varied field")[0]
+    assert section.count("| ap50.full_scene |") == 3, "two means and a difference"
+
+
+GRID = "  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n"
+MORRIS = METRICS.replace(GRID, "").replace("{count: 6}", "{count: 6, method: morris}")
+BOTH = "{kind: grid, values: [surrogate, torch]}"
+OWN_DETECTOR = SCORED.replace("{drones: 2}", "{drones: 2, makes: [{name: a, drones: [1], detector: surrogate}]}")
+SAME_FLEET = "is varied; both detectors must fly the same fleet"
+
+
+def vary(field: str) -> str:
+    """The campaign with one field more that is varied."""
+    return METRICS.replace("vary:", f"vary:\n  {field}")
+
+
+REFUSED = [
+    (METRICS, BASE, 3, "perception.detector is none, must be surrogate"),
+    (METRICS, SCORED, 7, "7, must be from 2 to the campaign's 6 draws"),
+    (METRICS, SCORED, 1, "1, must be from 2 to the campaign's 6 draws"),
+    (MORRIS, SCORED, 3, "sample.method is morris, whose means have no intervals"),
+    (vary(f"perception.detector: {BOTH}"), SCORED, 3, f"perception.detector {SAME_FLEET}"),
+    (vary("perception: {kind: grid, values: [{detector: torch}]}"), SCORED, 3, f"perception {SAME_FLEET}"),
+    (vary(f"fleet.makes.0.detector: {BOTH}"), OWN_DETECTOR, 3, f"fleet.makes.0.detector {SAME_FLEET}"),
+    (METRICS, OWN_DETECTOR, 3, "make a has a detector or weights of its own; both must fly the same fleet"),
+]
+
+
+def test_what_cannot_be_estimated_is_refused_before_anything_flies(tmp_path: Path) -> None:
+    said = []
+    for text, base, units, _ in REFUSED:
+        with pytest.raises(RunError) as error:
+            sortie.campaign(write(tmp_path, text, base), out=tmp_path / "c", by_torch=units)
+        said.append(str(error.value))
+    assert said == [f"--by-torch: {why}" for *_, why in REFUSED]
+    with pytest.raises(SortieError, match=r"^by_torch: 2.5, must be a whole number from 0 to 2\^63 - 1$"):
+        sortie.campaign(write(tmp_path, METRICS, SCORED), out=tmp_path / "c", by_torch=2.5)  # type: ignore[arg-type]
+    assert not (tmp_path / "c").exists()
 
 
 def test_torch_flies_no_more_units_than_stop_when_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,13 +188,3 @@ def test_torch_flies_no_more_units_than_stop_when_left(tmp_path: Path, monkeypat
     kept, torch = (sortie.open_campaign(folder) for folder in (done.path, done.path / by_torch.FOLDER))
     assert kept.finished < 40 * 8
     assert torch.finished == kept.finished // 8 * 8 < 10 * 8
-
-
-def test_another_campaign_s_rows_by_torch_are_refused(tmp_path: Path) -> None:
-    folder = flown(tmp_path)
-    _, other = plans(tmp_path, METRICS.replace("seed: 5", "seed: 6"))
-    (folder / by_torch.FOLDER).rename(tmp_path / "old")
-    run_campaign(other, folder / by_torch.FOLDER, TwoDetectors(), units=3)
-    with pytest.raises(RunError) as error:
-        read_torch(folder, read_rows(folder))
-    assert str(error.value) == f"{folder / 'by_torch'}: holds results of another campaign"

@@ -1,42 +1,48 @@
-"""Clusters without workers, schedulers that die, certificates: one line each."""
+"""A dask cluster: workers that come late, die or lose results, schedulers that die, certificates."""
 
 from __future__ import annotations
 
-import logging
+import os
 import shutil
-import ssl
+import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
-from campaign_examples import CLUSTER, InProcess, plan, table_bytes, write
+from campaign_examples import CAMPAIGN, CLUSTER, InProcess, Pretended, plan, pretend, small_cluster, table_bytes, write
 from typer.testing import CliRunner
 
-import sortie
 from sortie.sim.campaign import cluster
-from sortie.sim.campaign.cluster import Dask, _quiet
-from sortie.sim.campaign.drive import run_campaign
+from sortie.sim.campaign.cluster import Dask
+from sortie.sim.campaign.drive import Progress, run_campaign
 from sortie.sim.campaign.engine import open_engine
+from sortie.sim.campaign.processes import AHEAD
+from sortie.sim.campaign.work import Task
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
-
-pytestmark = pytest.mark.slow
 
 pytest.importorskip("distributed")
 
 GONE = "--scheduler tcp://head:8786: the scheduler is gone; what is finished is kept, the same command goes on"
 
 
-class _Waiting:
-    """What dask gives for a task that no worker takes, until somebody ends it."""
+class _Future:
+    """What dask gives for a task, until somebody ends it; it answers with rows that follow from the task."""
 
-    def __init__(self, call: Callable[[], Any]) -> None:
-        self.status, self.result, self._calls = "pending", call, list[Callable[[Any], None]]()
+    def __init__(self, code: str, batch: list[Task]) -> None:
+        self.status, self._calls = "pending", list[Callable[[Any], None]]()
+        self.error: BaseException | None = None
+        self.result: Callable[[], Any] = lambda: ([pretend(run, task, code) for run, task in batch], len(batch))
 
     def add_done_callback(self, call: Callable[[Any], None]) -> None:
         self._calls.append(call)
+
+    def exception(self) -> BaseException | None:
+        return self.error
 
     def end(self, status: str) -> None:
         self.status, calls, self._calls = status, self._calls, []
@@ -48,14 +54,14 @@ class _Client:
     """A cluster without workers: each look at it takes the next of `looks`."""
 
     def __init__(self, *looks: Callable[[_Client], int]) -> None:
-        self.status, self.flying, self._looks = "running", list[_Waiting](), iter(looks)
+        self.status, self.flying, self._looks = "running", list[_Future](), iter(looks)
 
     def scheduler_info(self, n_workers: int = 5) -> dict[str, Any]:
         threads = next(self._looks, lambda client: 0)(self)
         return {"workers": {"a": {"nthreads": threads}} if threads else {}}
 
-    def submit(self, function: Any, code: str, batch: Any, memory_b: int | None, **_: Any) -> _Waiting:
-        self.flying.append(_Waiting(lambda: function(code, batch, memory_b)))
+    def submit(self, function: Any, code: str, batch: list[Task], memory_b: int | None, **_: Any) -> _Future:
+        self.flying.append(_Future(code, batch))
         return self.flying[-1]
 
 
@@ -79,23 +85,18 @@ def test_a_cluster_without_workers_is_told_and_given_up(tmp_path: Path) -> None:
     )
 
 
-def test_workers_that_come_late_are_used(tmp_path: Path) -> None:
-    def fly(client: _Client) -> int:
-        for future in client.flying:
-            future.end("finished")
-        return 1
-
-    p, noticed = plan(tmp_path), list[str]()
-    client = _Client(*[lambda client: 0] * 8, *[fly] * 200)
-    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786", wait_s=600, notice=noticed.append))
-    assert (done.finished, done.failed) == (48, 0)
-    assert len(noticed) == 1
-
-
 def _all_end(client: _Client) -> int:
     for future in client.flying:
         future.end("finished")
     return 1
+
+
+def test_workers_that_come_late_are_used(tmp_path: Path) -> None:
+    p, noticed = plan(tmp_path), list[str]()
+    client = _Client(*[lambda client: 0] * 8, *[_all_end] * 200)
+    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786", wait_s=600, notice=noticed.append))
+    assert (done.finished, done.failed) == (48, 0)
+    assert len(noticed) == 1
 
 
 def test_batches_that_come_together_are_written_together(tmp_path: Path) -> None:
@@ -118,6 +119,75 @@ def test_batches_that_come_together_are_written_together(tmp_path: Path) -> None
         next(broken)
 
 
+class _Mortal(_Client):
+    """Two workers that answer at once, die of one run and lose the results of some; it counts what is in flight."""
+
+    def __init__(self, deadly: int = -1, lost: frozenset[int] = frozenset()) -> None:
+        super().__init__()
+        self.deadly, self.lost, self.batches, self.in_flight, self.most = deadly, lost, list[int](), 0, 0
+
+    def scheduler_info(self, n_workers: int = 5) -> dict[str, Any]:
+        return {"workers": {"a": {"nthreads": 1}, "b": {"nthreads": 1}}}
+
+    def submit(self, function: Any, code: str, batch: list[Task], memory_b: int | None, **_: Any) -> Any:
+        from distributed import KilledWorker
+
+        runs = {run for run, _ in batch}
+        self.batches.append(len(batch))
+        self.in_flight += 1
+        self.most = max(self.most, self.in_flight)
+        future = _Future(code, batch)
+        answer, lose = future.result, bool(runs & self.lost)
+
+        def give() -> Any:
+            self.in_flight -= 1
+            return answer()
+
+        def end(call: Callable[[Any], None]) -> None:
+            nonlocal lose
+            future.error = KilledWorker("x", "y", 4) if self.deadly in runs else None
+            future.status = "lost" if lose else "finished" if future.error is None else "error"
+            lose = False
+            call(future)
+
+        future.result, future.add_done_callback = give, end  # type: ignore[method-assign]
+        return future
+
+
+def test_a_run_that_kills_its_workers_is_recorded_and_its_batch_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    p, client = plan(tmp_path), _Mortal(deadly=17)
+    monkeypatch.setattr(cluster, "BATCH_S", 1e9)  # as many a batch as there may be
+    monkeypatch.setattr(cluster, "MAX_BATCH", 5)
+    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786"))
+    assert (done.finished, done.failed) == (48, 1)
+    table = pq.read_table(tmp_path / "a" / "runs").to_pylist()
+    assert [(r["run"], r["error"]) for r in table if r["status"] == "failed"] == [(17, "WorkerDied: on every attempt")]
+    assert all(r["key"] == p.key(r["run"]) for r in table)
+    assert max(client.batches) == 5
+    assert client.most <= AHEAD * 2 + max(client.batches)  # no more than what is in flight
+
+
+def test_a_result_lost_with_its_worker_is_waited_for_again(tmp_path: Path) -> None:
+    """The worker dies after its run has ended and before the result was fetched."""
+    p, client = plan(tmp_path), _Mortal(lost=frozenset({0, 7, 47}))
+    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786"))
+    assert (done.finished, done.failed) == (p.runs, 0)
+    assert sum(client.batches) == p.runs  # none was given out twice
+    run_campaign(p, tmp_path / "alone", Pretended())
+    assert table_bytes(tmp_path / "a") == table_bytes(tmp_path / "alone")
+
+
+def test_batches_are_about_a_second_long() -> None:
+    engine = Dask(_Client(), "tcp://head:8786")
+    assert engine._batch() == 1  # until it is known how long a run takes
+    engine._learn(0.3)
+    assert engine._batch() == 3
+    engine._learn(300)
+    assert engine._batch() == 1
+
+
 def _dies(client: _Client) -> int:
     raise OSError("Connection reset by peer\nin two lines")
 
@@ -133,172 +203,134 @@ def _closes(client: _Client) -> int:
     return 0
 
 
-@pytest.mark.parametrize("what", [_dies, _cancels, _closes])
-@pytest.mark.parametrize("before", [0, 1, 5])
-def test_a_scheduler_that_dies_is_one_line(tmp_path: Path, what: Callable[[_Client], int], before: int) -> None:
-    client = _Client(*[lambda client: 0] * before, *[what] * 9)
-    with pytest.raises(RunError) as told:
-        run_campaign(plan(tmp_path), tmp_path / "a", Dask(client, "tcp://head:8786", wait_s=600))
-    assert str(told.value) == GONE
+def _loses_results(client: _Client) -> int:
+    def fetch() -> Any:
+        raise TimeoutError
+
+    for future in client.flying:
+        future.result = fetch
+        future.end("finished")
+    return 1
 
 
-def test_a_scheduler_that_dies_before_its_first_answer_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """dask passes over the error, and then knows nothing of workers."""
-    monkeypatch.setattr(_Client, "scheduler_info", lambda self, n_workers=5: {})
-    with pytest.raises(RunError) as told:
-        run_campaign(plan(tmp_path), tmp_path / "a", Dask(_Client(), "tcp://head:8786"))
-    assert str(told.value) == GONE
+class _Silent(_Client):
+    """Dies before its first answer: dask passes over the error, and then knows nothing of workers."""
+
+    def scheduler_info(self, n_workers: int = 5) -> dict[str, Any]:
+        return {}
 
 
-def test_a_result_that_cannot_be_fetched_is_one_line(tmp_path: Path) -> None:
-    def lose(client: _Client) -> int:
-        def call() -> Any:
-            raise TimeoutError
+def test_a_scheduler_that_dies_is_one_line(tmp_path: Path) -> None:
+    """Whatever dask gives then, and however often it was asked before."""
+    endings: dict[str, _Client] = {"before its first answer": _Silent(), "at results": _Client(*[_loses_results] * 9)}
+    for what in (_dies, _cancels, _closes):
+        for before in (0, 1, 5):
+            endings[f"{what.__name__} {before}"] = _Client(*[lambda client: 0] * before, *[what] * 9)
+    said = {}
+    for name, client in endings.items():
+        with pytest.raises(RunError) as error:
+            run_campaign(plan(tmp_path), tmp_path / name, Dask(client, "tcp://head:8786", wait_s=600))
+        said[name] = str(error.value)
+    assert said == dict.fromkeys(endings, GONE)
 
-        for future in client.flying:
-            future.result = call
-            future.end("finished")
-        return 1
 
-    with pytest.raises(RunError) as told:
-        run_campaign(plan(tmp_path), tmp_path / "a", Dask(_Client(*[lose] * 9), "tcp://head:8786"))
-    assert str(told.value) == GONE
-
-
-def test_what_dask_logs_is_not_told(caplog: pytest.LogCaptureFixture) -> None:
-    """Its modules have levels of their own, which that of "distributed" does not change."""
-    names = ("distributed", "distributed.client", "distributed.mine", "tornado.application", "asyncio")
-    logging.getLogger("distributed.client").setLevel(logging.WARNING)
-    before = [logging.getLogger(name).level for name in names]
-    with _quiet():
-        for name in names:
-            logging.getLogger(name).critical("Traceback")
-    assert caplog.messages == []
-    assert [logging.getLogger(name).level for name in names] == before
+Certificates = Callable[[str], tuple[Path, Path, Path]]
 
 
 @pytest.fixture(scope="module")
-def certificates(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, Path, Path]]:
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
     """CA, certificate and key of an authority, made once for each name."""
     openssl = shutil.which("openssl")
     if openssl is None:
         pytest.skip("needs the openssl command")
-    made: dict[str, tuple[Path, Path, Path]] = {}
 
     def run(*arguments: str | Path) -> None:
         subprocess.run([openssl, *map(str, arguments)], check=True, capture_output=True)
 
+    @cache
     def make(name: str) -> tuple[Path, Path, Path]:
-        if name not in made:
-            folder = tmp_path_factory.mktemp(name)
-            ca, ca_key, cert, key, ask = (folder / f for f in ("ca.pem", "ca.key", "cert.pem", "key.pem", "ask.csr"))
-            new = ["-newkey", "rsa:2048", "-nodes"]
-            run("req", "-x509", *new, "-days", "2", "-subj", f"/CN={name} authority", "-keyout", ca_key, "-out", ca)
-            run("req", *new, "-subj", f"/CN={name}", "-keyout", key, "-out", ask)
-            sign = ["-CA", ca, "-CAkey", ca_key, "-CAcreateserial", "-days", "2"]
-            run("x509", "-req", "-in", ask, *sign, "-out", cert)
-            made[name] = (ca, cert, key)
-        return made[name]
+        folder = tmp_path_factory.mktemp(name)
+        ca, ca_key, cert, key, ask = (folder / f for f in ("ca.pem", "ca.key", "cert.pem", "key.pem", "ask.csr"))
+        new = ["-newkey", "rsa:2048", "-nodes"]
+        run("req", "-x509", *new, "-days", "2", "-subj", f"/CN={name} authority", "-keyout", ca_key, "-out", ca)
+        run("req", *new, "-subj", f"/CN={name}", "-keyout", key, "-out", ask)
+        run("x509", "-req", "-in", ask, "-CA", ca, "-CAkey", ca_key, "-CAcreateserial", "-days", "2", "-out", cert)
+        return ca, cert, key
 
     return make
 
 
-@pytest.mark.parametrize(
-    ("how", "message"),
-    [
-        (
-            lambda ours, theirs: ["--scheduler", "tcp://127.0.0.1:1", "--security", *ours],
-            "--scheduler tcp://127.0.0.1:1: must be an address like tls://host:8786, as --security is given",
-        ),
-        (
-            lambda ours, theirs: ["--scheduler", "tls://127.0.0.1:1"],
-            "--scheduler tls://127.0.0.1:1: needs --security CA CERT KEY",
-        ),
-        (
-            lambda ours, theirs: ["--scheduler", "tls://127.0.0.1:1", "--security", *ours],
-            "--scheduler tls://127.0.0.1:1: no scheduler answers there that takes these certificates",
-        ),
-        (
-            lambda ours, theirs: ["--workers", "0", "--security", *ours],
-            "--security goes with --scheduler",
-        ),
-        (
-            lambda ours, theirs: ["--scheduler", "tls://127.0.0.1:1", "--security", ours[0], "nowhere.pem", ours[2]],
-            "--security nowhere.pem: no such file",
-        ),
-        (
-            lambda ours, theirs: ["--scheduler", "tls://127.0.0.1:1", "--security", ours[2], ours[1], ours[2]],
-            "--security {key}: is not a PEM certificate (",
-        ),
-        (
-            lambda ours, theirs: ["--scheduler", "tls://127.0.0.1:1", "--security", ours[0], ours[1], theirs[2]],
-            "--security {cert} {their_key}: not a certificate and its key (",
-        ),
-        (lambda ours, theirs: ["--workers", "0", "--worker-memory", "0"], "worker_memory_gb: 0.0, must be a number above 0, or None"),
-        (lambda ours, theirs: ["--workers", "0", "--worker-memory", "nan"], "worker_memory_gb: nan, must be a number above 0, or"),
-    ],
-)  # fmt: skip
+@pytest.mark.slow
 def test_what_cannot_be_done_is_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    certificates: Callable[[str], tuple[Path, Path, Path]],
-    how: Callable[[tuple[Path, ...], tuple[Path, ...]], list[object]],
-    message: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, certificates: Certificates
 ) -> None:
     monkeypatch.setattr(cluster, "CONNECT_S", 0.2)
-    ours, theirs = certificates("ours"), certificates("theirs")
-    arguments = ["campaign", str(write(tmp_path)), "--out", str(tmp_path / "a"), *map(str, how(ours, theirs))]
-    result = CliRunner().invoke(app, arguments)
-    assert isinstance(result.exception, RunError), result.output
-    said = str(result.exception)
-    assert said.startswith(message.format(cert=ours[1], key=ours[2], their_key=theirs[2]))
-    assert "\n" not in said
+    (ca, cert, key), (*_, their_key) = certificates("ours"), certificates("theirs")
+    tcp, tls = ["--scheduler", "tcp://127.0.0.1:1"], ["--scheduler", "tls://127.0.0.1:1"]
+    ours = ["--security", ca, cert, key]
+    memory = "worker_memory_gb: {}, must be a number above 0, or None"
+    table: list[tuple[list[Any], str]] = [
+        ([*tcp, *ours], f"{' '.join(tcp)}: must be an address like tls://host:8786, as --security is given"),
+        (tls, f"{' '.join(tls)}: needs --security CA CERT KEY"),
+        ([*tls, *ours], f"{' '.join(tls)}: no scheduler answers there that takes these certificates"),
+        (["--workers", "0", *ours], "--security goes with --scheduler"),
+        ([*tls, "--security", ca, "nowhere.pem", key], "--security nowhere.pem: no such file"),
+        ([*tls, "--security", key, cert, key], f"--security {key}: is not a PEM certificate ("),
+        ([*tls, "--security", ca, cert, their_key], f"--security {cert} {their_key}: not a certificate and its key ("),
+        (["--workers", "0", "--worker-memory", "0"], memory.format("0.0")),
+        (["--workers", "0", "--worker-memory", "nan"], memory.format("nan")),
+    ]
+    campaign, wrong = write(tmp_path), {}
+    for options, message in table:
+        arguments = ["campaign", campaign, "--out", tmp_path / "a", *options]
+        error = CliRunner().invoke(app, list(map(str, arguments))).exception
+        if not isinstance(error, RunError) or not str(error).startswith(message) or "\n" in str(error):
+            wrong[message] = error
+    assert wrong == {}
 
 
-def test_security_is_three_paths(tmp_path: Path) -> None:
-    for wrong in ("ca.pem", ("ca.pem", "cert.pem")):
-        with pytest.raises(RunError, match="must be three paths: CA, certificate, key"):
-            sortie.campaign("link_battery", security=wrong)  # type: ignore[arg-type]
-
-
-@pytest.fixture
-def tls_scheduler(certificates: Callable[[str], tuple[Path, Path, Path]]) -> Iterator[str]:
-    """A cluster that speaks TLS alone; its address."""
-    from distributed import LocalCluster
-
-    made = cluster._certificates(certificates("ours"))
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL",
-        security=made,
-    ) as opened:  # fmt: skip
-        yield opened.scheduler_address
+@pytest.mark.slow
+@CLUSTER
+def test_a_cluster_with_tls_flies_the_same_rows_and_lets_nobody_else_in(
+    tmp_path: Path, certificates: Certificates, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    p = plan(tmp_path)
+    run_campaign(p, tmp_path / "alone", InProcess())
+    with small_cluster(security=cluster._certificates(certificates("ours"))) as opened:
+        address = opened.scheduler_address
+        assert address.startswith("tls://")
+        with open_engine(scheduler=address, security=certificates("ours")) as engine:
+            run_campaign(p, tmp_path / "joined", engine)
+        assert table_bytes(tmp_path / "joined") == table_bytes(tmp_path / "alone")
+        monkeypatch.setattr(cluster, "CONNECT_S", 2.0)
+        for scheduler, security in ((address, certificates("theirs")), (address.replace("tls://", "tcp://"), None)):
+            with (
+                pytest.raises(RunError, match=f"--scheduler {scheduler}: no scheduler answers there"),
+                open_engine(scheduler=scheduler, security=security),
+            ):
+                pass
 
 
 @CLUSTER
-def test_a_cluster_with_tls_flies_the_same_rows_and_lets_nobody_else_in(
-    tmp_path: Path,
-    tls_scheduler: str,
-    certificates: Callable[[str], tuple[Path, Path, Path]],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    p = plan(tmp_path)
-    assert tls_scheduler.startswith("tls://")
+@pytest.mark.slow
+def test_a_cluster_of_four_loses_two_on_the_way(tmp_path: Path) -> None:
+    """The scheduler is joined by its address; two worker processes get SIGKILL while runs are in flight."""
+    import dask
+
+    p = plan(tmp_path, CAMPAIGN.replace("replications: 2", "replications: 4"))
     run_campaign(p, tmp_path / "alone", InProcess())
-    with open_engine(scheduler=tls_scheduler, security=certificates("ours")) as engine:
-        run_campaign(p, tmp_path / "joined", engine)
-    assert table_bytes(tmp_path / "joined") == table_bytes(tmp_path / "alone")
-    address = tls_scheduler.replace("tls://", "tcp://")
-    monkeypatch.setattr(cluster, "CONNECT_S", 2.0)
-    for scheduler, security in ((tls_scheduler, certificates("theirs")), (address, None)):
-        with (
-            pytest.raises(RunError, match=f"--scheduler {scheduler}: no scheduler answers there"),
-            open_engine(scheduler=scheduler, security=security),
-        ):
-            pass
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 10}),
+        small_cluster(4) as cluster,
+        open_engine(scheduler=cluster.scheduler_address) as engine,
+    ):
+        victims = [w.pid for w in cluster.workers.values()][:2]
 
+        def progress(done: Progress) -> None:
+            if victims and done.flown >= 5 * (3 - len(victims)):
+                os.kill(victims.pop(), signal.SIGKILL)
 
-def test_openssl_makes_what_python_takes(certificates: Callable[[str], tuple[Path, Path, Path]]) -> None:
-    ca, cert, key = certificates("ours")
-    ssl.create_default_context(cafile=str(ca)).load_cert_chain(cert, key)
+        done = run_campaign(p, tmp_path / "cluster", engine, progress=progress)
+    assert not victims
+    assert (done.finished, done.failed) == (96, 0)
+    assert table_bytes(tmp_path / "cluster") == table_bytes(tmp_path / "alone")

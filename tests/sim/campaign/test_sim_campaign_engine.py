@@ -1,30 +1,26 @@
-"""The same rows in the process, on one worker, on two, and on a cluster that is joined; workers that die."""
+"""The same rows in this process, on one worker and on two; workers that die; runs that fail, and flying one again."""
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import BASE, CAMPAIGN, CLUSTER, InProcess, Pretended, plan, table_bytes, write
+from campaign_examples import BASE, CAMPAIGN, InProcess, plan, table_bytes, write
 from typer.testing import CliRunner
 
 from sortie.sim.apart import DiedError
 from sortie.sim.campaign import cluster, processes
-from sortie.sim.campaign.cluster import Dask
 from sortie.sim.campaign.drive import Progress, run_campaign
 from sortie.sim.campaign.engine import open_engine
 from sortie.sim.campaign.plan import CampaignPlan
-from sortie.sim.campaign.processes import AHEAD, OneProcess, Processes, Turns
+from sortie.sim.campaign.processes import OneProcess, Processes, Turns
 from sortie.sim.campaign.rows import find_row
 from sortie.sim.campaign.store import CampaignStore
-from sortie.sim.campaign.work import Task, fly_batch
+from sortie.sim.campaign.work import fly_batch
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
 from sortie.sim.identity import RELEASE, codes_here
@@ -53,34 +49,6 @@ def test_zero_one_and_two_workers_give_the_same_bytes(tmp_path: Path) -> None:
     tables = [table_bytes(tmp_path / str(w)) for w in (0, 1, 2)]
     assert tables[0] == tables[1] == tables[2]
     assert list(tables[0]) == ["table.parquet"]
-
-
-@CLUSTER
-@pytest.mark.slow
-def test_a_cluster_of_four_loses_two_on_the_way(tmp_path: Path) -> None:
-    """The scheduler is joined by its address; two worker processes get SIGKILL while runs are in flight."""
-    import dask
-    from distributed import LocalCluster
-
-    p = plan(tmp_path, CAMPAIGN.replace("replications: 2", "replications: 4"))
-    run_campaign(p, tmp_path / "alone", InProcess())
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 10}),
-        LocalCluster(
-            n_workers=4, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL"
-        ) as cluster,
-        open_engine(scheduler=cluster.scheduler_address) as engine,
-    ):
-        victims = [w.pid for w in cluster.workers.values()][:2]
-
-        def progress(done: Progress) -> None:
-            if victims and done.flown >= 5 * (3 - len(victims)):
-                os.kill(victims.pop(), signal.SIGKILL)
-
-        done = run_campaign(p, tmp_path / "cluster", engine, progress=progress)
-    assert not victims
-    assert (done.finished, done.failed) == (96, 0)
-    assert table_bytes(tmp_path / "cluster") == table_bytes(tmp_path / "alone")
 
 
 @pytest.mark.slow
@@ -173,90 +141,6 @@ def test_rows_that_came_are_kept_when_another_run_cannot_fly(tmp_path: Path) -> 
             next(late)
 
 
-class _Future:
-    """What dask gives for a task, here at once or as the death of its worker; or at first lost with its worker."""
-
-    def __init__(self, call: Any, error: BaseException | None, *, lost: bool = False) -> None:
-        self.call, self.error, self.lost = call, error, lost
-
-    @property
-    def status(self) -> str:
-        if self.lost:
-            self.lost = False
-            return "lost"
-        return "finished" if self.error is None else "error"
-
-    def result(self) -> Any:
-        return self.call()
-
-    def exception(self) -> BaseException | None:
-        return self.error
-
-    def add_done_callback(self, call: Any) -> None:
-        call(self)
-
-
-class _Client:
-    """A cluster whose workers die of one run, and lose the results of some; it counts what is in flight."""
-
-    status = "running"
-
-    def __init__(self, deadly: int = -1, lost: frozenset[int] = frozenset()) -> None:
-        self.deadly, self.lost, self.batches, self.most, self.flying = deadly, lost, list[int](), 0, 0
-
-    def scheduler_info(self, n_workers: int = 5) -> dict[str, Any]:
-        return {"workers": {"a": {"nthreads": 1}, "b": {"nthreads": 1}}}
-
-    def submit(self, function: Any, code: str, batch: list[Task], memory_b: int | None, **_: Any) -> _Future:
-        from distributed import KilledWorker
-
-        self.batches.append(len(batch))
-        dies = any(run == self.deadly for run, _ in batch)
-        lost = any(run in self.lost for run, _ in batch)
-        self.flying += 1
-        self.most = max(self.most, self.flying)
-
-        def call() -> Any:
-            self.flying -= 1
-            return function(code, batch, memory_b)
-
-        return _Future(call, KilledWorker("x", "y", 4) if dies else None, lost=lost)
-
-
-def test_a_run_that_kills_its_workers_is_recorded_and_its_batch_is_not_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    p, client = plan(tmp_path), _Client(deadly=17)
-    monkeypatch.setattr(cluster, "BATCH_S", 1e9)  # as many a batch as there may be
-    monkeypatch.setattr(cluster, "MAX_BATCH", 5)
-    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786"))
-    assert (done.finished, done.failed) == (48, 1)
-    table = pq.read_table(tmp_path / "a" / "runs").to_pylist()
-    assert [(r["run"], r["error"]) for r in table if r["status"] == "failed"] == [(17, "WorkerDied: on every attempt")]
-    assert all(r["key"] == p.key(r["run"]) for r in table)
-    assert max(client.batches) == 5
-    assert client.most <= AHEAD * 2 + max(client.batches)  # no more than what is in flight
-
-
-def test_a_result_lost_with_its_worker_is_waited_for_again(tmp_path: Path) -> None:
-    """The worker dies after its run has ended and before the result was fetched."""
-    p, client = plan(tmp_path), _Client(lost=frozenset({0, 7, 48}))
-    done = run_campaign(p, tmp_path / "a", Dask(client, "tcp://head:8786"))
-    assert (done.finished, done.failed) == (p.runs, 0)
-    assert sum(client.batches) == p.runs  # none was given out twice
-    run_campaign(p, tmp_path / "alone", InProcess())
-    assert table_bytes(tmp_path / "a") == table_bytes(tmp_path / "alone")
-
-
-def test_batches_are_about_a_second_long() -> None:
-    engine = Dask(_Client(), "tcp://head:8786")
-    assert engine._batch() == 1  # until it is known how long a run takes
-    engine._learn(0.3)
-    assert engine._batch() == 3
-    engine._learn(300)
-    assert engine._batch() == 1
-
-
 def test_a_worker_with_other_code_flies_nothing(tmp_path: Path) -> None:
     p = plan(tmp_path)
     with pytest.raises(RunError, match=rf"this worker runs Sortie {RELEASE}\+[0-9a-f]+, the campaign is of other"):
@@ -264,22 +148,15 @@ def test_a_worker_with_other_code_flies_nothing(tmp_path: Path) -> None:
 
 
 def test_a_worker_that_sees_another_policy_file_flies_nothing(tmp_path: Path) -> None:
-    policy = tmp_path / "mine.py"
-    policy.write_text(FAULTY.format(what="pass"))
-    p = plan(tmp_path, CAMPAIGN.replace("worked", f"{policy}:decide"))
-    policy.write_text(FAULTY.format(what="pass # edited"))
-    with pytest.raises(RunError, match=r"mine.py: is not the file that the campaign was begun with"):
-        fly_batch(p.code, [(0, p.task(0))])
-
-
-def test_a_policy_file_that_is_edited_between_two_runs_is_noticed_by_the_same_worker(tmp_path: Path) -> None:
-    policy = tmp_path / "mine.py"
-    policy.write_text(FAULTY.format(what="pass"))
-    p = plan(tmp_path, CAMPAIGN.replace("worked", f"{policy}:decide"))
-    fly_batch(p.code, [(0, p.task(0))])
-    policy.write_text(FAULTY.format(what="pass # edited"))
-    with pytest.raises(RunError, match=r"mine.py: is not the file that the campaign was begun with"):
-        fly_batch(p.code, [(1, p.task(1))])
+    """Whether it was edited before the worker's first run, or between two of its runs."""
+    for before in ([], [0]):
+        policy = tmp_path / "mine.py"
+        policy.write_text(FAULTY.format(what="pass"))
+        p = plan(tmp_path, CAMPAIGN.replace("worked", f"{policy}:decide"))
+        fly_batch(p.code, [(run, p.task(run)) for run in before])
+        policy.write_text(FAULTY.format(what="pass # edited"))
+        with pytest.raises(RunError, match=r"mine.py: is not the file that the campaign was begun with"):
+            fly_batch(p.code, [(2, p.task(2))])
 
 
 def test_a_worker_flies_with_its_own_torch_alone(tmp_path: Path) -> None:
@@ -319,25 +196,6 @@ def test_a_failing_run_is_recorded_and_the_rest_goes_on(tmp_path: Path, monkeypa
     )
 
 
-@pytest.mark.slow
-def test_failed_runs_are_flown_again_on_the_command_line(tmp_path: Path) -> None:
-    cause = tmp_path / "cause"
-    cause.touch()
-    policy = tmp_path / "faulty.py"
-    policy.write_text(FAULTY.format(what=f"assert not os.path.exists({str(cause)!r}), 'planted'"))
-    path, folder = write(tmp_path, CAMPAIGN.replace("worked", f"{policy}:decide")), tmp_path / "a"
-    command = ["campaign", str(path), "--workers", "0", "--out", str(folder), "--no-report"]
-    told = CliRunner().invoke(app, command)
-    failed = [r["run"] for r in pq.read_table(folder / "runs").to_pylist() if r["status"] == "failed"]
-    assert (told.exit_code, f"{len(failed)} failed" in told.stdout) == (1, True)
-    assert failed
-    cause.unlink()
-    told = CliRunner().invoke(app, [*command, "--retry-failed"])
-    assert (told.exit_code, f"48 runs finished; {len(failed)} of them now" in told.stdout) == (0, True)
-    assert CliRunner().invoke(app, [*command[:-2], str(tmp_path / "b"), "--no-report"]).exit_code == 0
-    assert table_bytes(folder) == table_bytes(tmp_path / "b")
-
-
 def test_any_run_of_a_campaign_that_broke_off_can_be_flown(tmp_path: Path) -> None:
     """A run with a row is compared with it, whether its part is finished or not; one that was not flown has no row."""
     p, folder = plan(tmp_path), tmp_path / "a"
@@ -359,68 +217,36 @@ def test_any_run_of_a_campaign_that_broke_off_can_be_flown(tmp_path: Path) -> No
     assert waiting == find_row(folder, 3)[1] is not None
 
 
-def test_a_broken_file_is_one_line_on_the_command_line(tmp_path: Path) -> None:
-    p, folder = plan(tmp_path), tmp_path / "a"
-    run_campaign(p, folder, Pretended())
-    file = folder / "campaign.sqlite"
-    file.write_bytes(file.read_bytes()[:5000])
-    for command in (["campaign", "report", str(folder)], ["fly", "--from-campaign", str(folder), "--run", "40"]):
-        result = CliRunner().invoke(app, command)
-        assert isinstance(result.exception, RunError)  # sortie.sim.cli.app prints it in one line and exits with 2
-        assert str(result.exception).startswith(f"{file}: is broken (")
-
-
 def test_a_drawn_value_that_the_schema_refuses_is_a_failed_run(tmp_path: Path) -> None:
-    text = CAMPAIGN.replace("{kind: uniform, low: 0.2, high: 1}", "{kind: normal, mean: 0.9, sd: 0.2}")
-    p = plan(tmp_path, text)
-    above = {r for r in range(p.runs) if p.varied(p.at(r).cell)["fleet.battery.initial_soc"] > 1}
+    p = plan(tmp_path, CAMPAIGN.replace("{kind: uniform, low: 0.2, high: 1}", "{kind: normal, mean: 0.9, sd: 0.2}"))
+    above = [r for r in range(p.runs) if p.varied(p.at(r).cell)["fleet.battery.initial_soc"] > 1]
     assert 0 < len(above) < p.runs
-    run_campaign(p, tmp_path / "a", InProcess())
-    table = pq.read_table(tmp_path / "a" / "runs").to_pylist()
-    assert {r["run"] for r in table if r["status"] == "failed"} == above
-    assert "initial_soc" in table[min(above)]["error"]
+    rows, _ = fly_batch(p.code, [(run, p.task(run)) for run in above])
+    assert {row.status for row in rows} == {"failed"}
+    assert "initial_soc" in rows[0].error
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--workers", "1", "--scheduler", "tcp://localhost:1"], "--workers and --scheduler: name one of them"),
-        (["--scheduler", "foo"], "--scheduler foo: must be an address like tcp://host:8786: missing port number"),
-        (
-            ["--scheduler", "smb://foo:1"],
-            "--scheduler smb://foo:1: must be an address like tcp://host:8786: unknown address",
-        ),
-        (["--scheduler", "tcp://127.0.0.1:1"], "--scheduler tcp://127.0.0.1:1: no scheduler answers there"),
-        (["--workers", "0", "--resume"], "no campaign there to resume (campaign.sqlite is missing)"),
-        (["--workers", "0", "--out", __file__ + "/a"], "/a: its folder cannot be made or written to: "),
-        (["--workers", "0", "--out", "/proc/nothing/here"], "/proc/nothing/here: "),
-    ],
-)
-def test_what_cannot_be_done_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
-) -> None:
+ADDRESS = "must be an address like tcp://host:8786"
+CANNOT_BE_DONE = [
+    ("--workers 1 --scheduler tcp://localhost:1", "--workers and --scheduler: name one of them"),
+    ("--scheduler foo", f"--scheduler foo: {ADDRESS}: missing port number"),
+    ("--scheduler smb://foo:1", f"--scheduler smb://foo:1: {ADDRESS}: unknown address"),
+    ("--scheduler tcp://127.0.0.1:1", "--scheduler tcp://127.0.0.1:1: no scheduler answers there"),
+    ("--workers 0 --resume", "no campaign there to resume (campaign.sqlite is missing)"),
+    (f"--workers 0 --out {__file__}/a", "/a: its folder cannot be made or written to: "),
+    ("--workers 0 --out /proc/nothing/here", "/proc/nothing/here: "),
+]
+
+
+def test_what_cannot_be_done_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import distributed
 
     monkeypatch.setattr(cluster, "CONNECT_S", 0.2)
     monkeypatch.setattr(distributed, "Client", None)  # one that finds nobody would hang, and complain, when it goes
-    path = write(tmp_path)
-    if "--out" not in arguments:
-        arguments = [*arguments, "--out", str(tmp_path / "a")]
-    result = CliRunner().invoke(app, ["campaign", str(path), *arguments])
-    assert isinstance(result.exception, RunError)  # sortie.sim.cli.app prints it in one line and exits with 2
-    assert message in str(result.exception)
-
-
-def test_the_driver_keeps_only_what_is_in_flight() -> None:
-    """An engine pulls tasks as it can use them."""
-    pulled = []
-
-    def tasks() -> Iterator[Task]:
-        for run in range(1000):
-            pulled.append(run)
-            yield run, "{}"
-
-    stream = InProcess().results("other code", tasks())
-    with pytest.raises(RunError):
-        next(stream)
-    assert pulled == [0]
+    campaign, wrong = str(write(tmp_path)), {}
+    for options, message in CANNOT_BE_DONE:
+        out = [] if "--out" in options else ["--out", str(tmp_path / "a")]
+        error = CliRunner().invoke(app, ["campaign", campaign, *options.split(), *out]).exception
+        if not isinstance(error, RunError) or message not in str(error):
+            wrong[options] = error
+    assert wrong == {}

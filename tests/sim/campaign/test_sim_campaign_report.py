@@ -13,18 +13,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import BASE, CAMPAIGN, Pretended, plan, rows_of
+from campaign_examples import BASE, CAMPAIGN, Pretended, failed, plan, report_lines, rows_of
 
 from sortie.scenarios.intervals import SHARE, mean_interval
 from sortie.scenarios.report_text import prefixed
 from sortie.scenarios.schema.campaign import SampledField
 from sortie.sim.campaign.drive import run_campaign
-from sortie.sim.campaign.figures import on_front
-from sortie.sim.campaign.rows import CampaignRows, find_row, read_rows, short_names, sign, winner_metrics
+from sortie.sim.campaign.figures import draw_pareto, draw_varied, on_front, whiskers, with_values
+from sortie.sim.campaign.report import write_report
+from sortie.sim.campaign.rows import CampaignRows, find_row, read_rows, short_names
 from sortie.sim.campaign.sensitivity import _morris, _saltelli, sensitivity
 from sortie.sim.campaign.spread import design
-from sortie.sim.campaign.winners import other_winners, rule, winner
-from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError
 
 TWO = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 40]}\n", "").replace(
@@ -32,39 +31,6 @@ TWO = CAMPAIGN.replace("  fleet.formation.spacing_m: {kind: grid, values: [20, 4
 )
 
 ONE_METRIC = TWO.replace("[bytes.data_sent, energy_j.total]", "[bytes.data_sent]")
-
-
-def test_a_planted_flip_is_found_with_its_threshold(tmp_path: Path) -> None:
-    """Policy 0 wins by 1 above a charge of 0.4, policy 1 by 1 below: three quarters of the draws are above."""
-    text = TWO.replace("{count: 6}", "{count: 80}")
-    noise = np.random.default_rng(3).normal(0, 0.3, 10_000).tolist()
-
-    def value(fields: dict[str, float], policy: int) -> float:
-        gain = 1 if fields["fleet.battery.initial_soc"] > 0.4 else -1
-        return -(fields["fleet.battery.initial_soc"] * 50 + gain * (policy == 0) + noise.pop())  # bytes: less is better
-
-    rows = rows_of(tmp_path, text, value)
-    assert winner(rows, "bytes.data_sent") == "worked"
-    (found,) = other_winners(rows, "bytes.data_sent")
-    assert (found.field, found.winner, found.sure) == ("fleet.battery.initial_soc", "best-2(received_budget=0.1)", True)
-    assert found.part.startswith("0.2")
-    made = rule(rows, "bytes.data_sent")
-    assert made is not None
-    assert (made.field, made.below, made.above) == (
-        "fleet.battery.initial_soc",
-        "best-2(received_budget=0.1)",
-        "worked",
-    )
-    assert made.threshold == pytest.approx(0.4, abs=0.03)
-    assert made.gain.low > 0
-
-
-def test_where_nothing_flips_no_rule_gains(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    rows = rows_of(tmp_path, TWO.replace("{count: 6}", "{count: 80}"), lambda f, p: p + rng.normal(0, 0.1))
-    assert other_winners(rows, "bytes.data_sent") == []
-    made = rule(rows, "bytes.data_sent")
-    assert made is None or made.gain.low <= 0
 
 
 def test_sobol_indices_of_ishigami_are_the_known_ones() -> None:
@@ -139,8 +105,9 @@ def test_a_field_of_other_values_than_numbers_and_texts_has_its_effect(tmp_path:
     found = sensitivity(replace(rows, table=table), "bytes.data_sent", 0)
     assert found is not None
     assert dict(zip(found.fields, found.figures[:, 0] > 0, strict=True)) == {
-        "context.trust": True, "fleet.battery.initial_soc": False,
-    }  # fmt: skip
+        "context.trust": True,
+        "fleet.battery.initial_soc": False,
+    }
 
 
 def test_a_failed_run_takes_its_whole_block_with_it(tmp_path: Path) -> None:
@@ -162,23 +129,10 @@ def test_the_front_holds_whom_nobody_beats() -> None:
     assert on_front([1, math.nan, 3], [1, 5, math.nan]) == [True, False, False], "without a value it stands nowhere"
 
 
-class Failing(Pretended):
-    """Run 3 fails."""
-
-    def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
-        for rows in super().results(code, tasks):  # type: ignore[arg-type]
-            yield [
-                RunResult(r.run, r.key, "failed", "ValueError: planted", "", (None, None)) if r.run == 3 else r
-                for r in rows
-            ]
-
-
 def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from sortie.sim.campaign.report import write_report
-
     p, folder = plan(tmp_path), tmp_path / "a"
-    run_campaign(p, folder, Failing())  # type: ignore[arg-type]
+    run_campaign(p, folder, Pretended(change=lambda row: failed(row) if row.run == 3 else row))
     text = write_report(folder).read_text()
     assert text == write_report(folder).read_text()
     for part in (
@@ -205,16 +159,13 @@ def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> No
 
 def test_rates_stay_within_their_range_and_bytes_above_zero(tmp_path: Path) -> None:
     """Student's interval of the bare mean is [0.85, 1.06] for these misses, and begins below zero for these bytes."""
-    from sortie.sim.campaign.figures import whiskers
-    from sortie.sim.campaign.report import _lines
-
     rates, sent = iter([0.8, 1.0, 1.0, 1.0, 0.95, 0.98] * 2), iter([0.0] * 10 + [6e6, 3e6])
     metrics = "metrics: [deadline_miss_rate, bytes.data_sent]"
     text = TWO.replace("metrics: [bytes.data_sent, energy_j.total]", metrics)
     rows = rows_of(tmp_path, text, lambda fields, p: next(rates), "deadline_miss_rate")
     table = rows.table.append_column("bytes.data_sent", pa.array([next(sent) for _ in range(12)]))
     rows = CampaignRows(rows.plan, table, rows.unit, rows.policy)
-    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    told = "\n".join(report_lines(rows, tmp_path))
     first = told.partition("Differences from")[0]
     for metric, highest in (("deadline_miss_rate", 1.0), ("bytes.data_sent", math.inf)):
         (line,) = (line for line in first.splitlines() if line.startswith(f"| {metric} |"))
@@ -227,9 +178,6 @@ def test_rates_stay_within_their_range_and_bytes_above_zero(tmp_path: Path) -> N
 
 def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: Path) -> None:
     """Warnings are errors here: no mean of nothing is taken, in words or in figures."""
-    from sortie.sim.campaign.figures import draw_pareto, draw_varied, with_values
-    from sortie.sim.campaign.report import _lines
-
     metrics = "metrics: [ap50.mission, ap50.full_scene, bytes.data_sent]"
     text = TWO.replace("metrics: [bytes.data_sent, energy_j.total]", metrics)
     rows = rows_of(tmp_path, text, lambda fields, p: 1.0 + p)
@@ -237,7 +185,7 @@ def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: P
     none = pa.array([None] * rows.table.num_rows, pa.float64())
     rows = CampaignRows(rows.plan, seen.append_column("ap50.mission", none), rows.unit, rows.policy)
     assert with_values(rows) == ["ap50.full_scene", "bytes.data_sent"]
-    told = list(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    told = report_lines(rows, tmp_path)
     assert [line for line in told if "ap50.mission" in line] == [
         "| ap50.mission | – | – |",
         "\nNo scene can be compared by ap50.mission: left out of what follows.",
@@ -251,133 +199,54 @@ def test_of_a_metric_without_values_it_is_said_once_and_nothing_else(tmp_path: P
     for metric in rows.plan.campaign.metrics:
         nothing = nothing.set_column(nothing.schema.get_field_index(metric), metric, none)
     rows = CampaignRows(rows.plan, nothing, rows.unit, rows.policy)
-    told = list(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    told = report_lines(rows, tmp_path)
     assert [line.split("\n")[1] for line in told if line.startswith("\n## ")] == ["## Metrics by policy", "## The rows"]
     assert not draw_varied(rows, tmp_path / "none.png")
     assert not draw_pareto(rows, tmp_path / "none.png")
 
 
-def test_a_campaign_that_knew_enough_says_so(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    from sortie.sim.campaign.report import write_report
-
-    enough = "stop_when: {metric: bytes.data_sent, half_width: 1000000, at_least: 3}\n"
-    folder = tmp_path / "a"
-    run_campaign(plan(tmp_path, CAMPAIGN.replace("{count: 6}", "{count: 40}") + enough), folder, Pretended())
-    told = write_report(folder).read_text()
-    assert (
-        "`stop_when` ended it: the interval of bytes.data_sent is narrow enough. It is a little too narrow, because"
-        in told
-    )
-    assert "the more so the smaller `at_least` is (here 3)." in told
-
-
-def test_a_campaign_with_a_gap_was_not_ended_by_stop_when(tmp_path: Path) -> None:
+def test_a_campaign_that_knew_enough_says_so_and_one_with_a_gap_was_not_ended_by_it(tmp_path: Path) -> None:
     """Its driver looks at parts in their order, and has not come to those behind the gap."""
-    from sortie.sim.campaign.report import _stopped
-
-    text = CAMPAIGN.replace("{count: 6}", "{count: 40}")
+    text = CAMPAIGN.replace("{count: 6}", "{count: 40}").replace(", energy_j.total]", "]")
     text += "stop_when: {metric: bytes.data_sent, half_width: 1000000, at_least: 3}\n"
     rows = rows_of(tmp_path, text, lambda fields, policy: 10.0 * fields["fleet.battery.initial_soc"] + policy)
     size = rows.plan.shard
     assert rows.table.num_rows > 3 * size
 
-    def of_parts(*parts: int) -> CampaignRows:
+    def told_of_parts(*parts: int) -> str:
         table = pa.concat_tables([rows.table.slice(k * size, size) for k in parts])
-        return CampaignRows(rows.plan, table, table["unit"].to_numpy(), np.zeros(table.num_rows, np.int64))
+        policy = np.concatenate([rows.policy[k * size : (k + 1) * size] for k in parts])
+        return "\n".join(report_lines(CampaignRows(rows.plan, table, table["unit"].to_numpy(), policy), tmp_path))
 
-    assert _stopped(of_parts(0, 1))
-    assert not _stopped(of_parts(0, 2))
-
-
-def test_a_rule_over_a_grid_is_judged_on_other_draws(tmp_path: Path) -> None:
-    """Policy 0 wins by 1 at 20 m, policy 1 at 40 m: worth 1 over the best fixed policy, and sure of it over draws."""
-    rng = np.random.default_rng(7)
-
-    def value(fields: dict[str, float], policy: int) -> float:
-        return -(1.0 if (fields["fleet.formation.spacing_m"] == 20) == (policy == 0) else -1.0) + rng.normal(0, 0.01)
-
-    made = rule(rows_of(tmp_path, CAMPAIGN.replace("{count: 6}", "{count: 40}"), value), "bytes.data_sent")
-    assert made is not None
-    assert (made.field, made.threshold, made.below, made.above) == (
-        "fleet.formation.spacing_m", 30.0, "worked", "best-2(received_budget=0.1)",
-    )  # fmt: skip
-    assert made.gain.mean == pytest.approx(1.0, abs=0.01)
-    assert made.gain.count == 40, "draws, not cells"
+    ended = "`stop_when` ended it: the interval of bytes.data_sent is narrow enough."
+    assert ended in (enough := told_of_parts(0, 1))
+    assert "the more so the smaller `at_least` is (here 3)." in enough
+    assert ended not in told_of_parts(0, 2)
 
 
-def test_a_rule_and_the_fixed_policy_that_it_is_compared_with_are_chosen_on_the_same_half(tmp_path: Path) -> None:
-    """Policy 0 leads in every even draw, policy 1 in every odd one: each half chooses one policy for all, and gains nothing."""
-    runs = iter(range(1000))
-
-    def value(fields: dict[str, float], policy: int) -> float:
-        lead = (0.3 if next(runs) // 2 % 2 == 0 else -0.3) + (
-            0.2 if fields["fleet.battery.initial_soc"] > 0.6 else -0.2
-        )
-        return -lead * (policy == 0)  # bytes: less is better
-
-    made = rule(rows_of(tmp_path, TWO.replace("{count: 6}", "{count: 40}"), value), "bytes.data_sent")
-    assert made is not None
-    assert (made.below, made.above) == ("best-2(received_budget=0.1)", "worked")
-    assert (made.gain.low, made.gain.mean, made.gain.high, made.gain.count) == (0.0, 0.0, 0.0, 40)
-
-
-@pytest.mark.parametrize(
-    ("method", "why"), [("morris", "The draws are Morris' levels"), ("saltelli", "The draws are Saltelli's blocks")]
-)
-def test_draws_that_share_values_have_no_intervals_and_no_winners(method: str, why: str, tmp_path: Path) -> None:
-    from sortie.sim.campaign.report import _lines
-
-    text = ONE_METRIC.replace("{count: 6}", f"{{count: 8, method: {method}}}")
-    rows = rows_of(tmp_path, text, lambda fields, policy: fields["fleet.battery.initial_soc"] + policy)
-    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
-    assert why in told
-    assert re.search(r"^\| bytes\.data_sent \| 0\.\d+ \| 1\.\d+ \|$", told, re.MULTILINE)
-    assert "## Sensitivity" in told
-    assert not any(part in told for part in ("## By varied field", "## Where the winner changes", "Differences from"))
+def test_draws_that_share_values_have_no_intervals_and_no_winners(tmp_path: Path) -> None:
+    for method, why in (("morris", "Morris' levels"), ("saltelli", "Saltelli's blocks")):
+        text = ONE_METRIC.replace("{count: 6}", f"{{count: 8, method: {method}}}")
+        rows = rows_of(tmp_path, text, lambda fields, policy: fields["fleet.battery.initial_soc"] + policy)
+        told = "\n".join(report_lines(rows, tmp_path))
+        assert f"The draws are {why}" in told
+        assert re.search(r"^\| bytes\.data_sent \| 0\.\d+ \| 1\.\d+ \|$", told, re.MULTILINE)
+        assert "## Sensitivity" in told
+        for part in ("## By varied field", "## Where the winner changes", "Differences from"):
+            assert part not in told
 
 
 def test_one_draw_gives_no_interval(tmp_path: Path) -> None:
-    from sortie.sim.campaign.report import _lines
-
     rows = rows_of(tmp_path, ONE_METRIC.replace("{count: 6}", "{count: 1}"), lambda fields, policy: policy)
-    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    told = "\n".join(report_lines(rows, tmp_path))
     assert "1 draw × 1 replication × 2 policies" in told
     assert "One draw gives no interval: ask for more, by `sample.count`." in told
-
-
-@pytest.mark.parametrize(
-    ("metric", "better"),
-    [
-        ("ap50.mission", 1), ("phases.1.ap50.full_scene", 1), ("ap50.scored_fusions", 0), ("ap50.sample_rate_hz", 0),
-        ("bytes.data_sent", -1), ("bytes.data_delivered", 1), ("energy_j.total", -1), ("drones.0.energy_j", -1),
-        ("drones.0.soc", 1), ("battery.3", 1), ("deadline_miss_rate", -1), ("phases.0.deadline_miss_rate", -1),
-        ("policies.invariant_violations", -1), ("policies.shield_interventions", -1), ("policies.changes", 0),
-        ("distrusted_by.2", -1), ("age_s.p99", -1), ("payload_fates.delivered", 1),
-        ("payload_fates.expired/deadline_queued", -1), ("duration_s", 0),
-    ],
-)  # fmt: skip
-def test_what_is_better_of_a_metric(metric: str, better: int) -> None:
-    assert sign(metric) == better
-
-
-def test_a_winner_is_told_by_what_is_known_to_be_better() -> None:
-    assert winner_metrics(["bytes.data_sent", "phases.0.ap50.mission"]) == ["phases.0.ap50.mission"]
-    assert winner_metrics(["policies.changes", "ap50.scored_fusions", "energy_j.total"]) == ["energy_j.total"]
-    assert winner_metrics(["policies.changes"]) == []
 
 
 def test_figures_of_an_interval_share_their_prefix() -> None:
     assert prefixed(2317.0, 962.4, 3672.0) == ["2.317 k", "0.9624 k", "3.672 k"]
     assert prefixed(0.00149, 0.00078, 0.007) == ["0.00149", "0.00078", "0.007"]
     assert prefixed(math.nan, 12.0) == ["–", "12"]
-
-
-def test_a_grid_of_large_numbers_keeps_its_labels(tmp_path: Path) -> None:
-    seeds = "perception.scene.seed: {kind: grid, values: [12341, 12342]}"
-    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", seeds)
-    rows = rows_of(tmp_path, text, lambda fields, policy: policy)
-    assert [label for label, _, _ in rows.bins("perception.scene.seed")] == ["12341", "12342"]
 
 
 def test_a_folder_without_finished_parts_has_no_report(tmp_path: Path) -> None:
@@ -389,8 +258,6 @@ def test_a_folder_without_finished_parts_has_no_report(tmp_path: Path) -> None:
 
 def test_a_metric_of_ones_own_has_a_table_by_varied_field_and_models_have_short_names(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from sortie.sim.campaign.report import write_report
-
     for name in ("own", "rain"):
         (tmp_path / f"{name}.py").write_text("def model(record):\n    return 1.0\n")
     vary = "radio.path_loss: {kind: grid, values: [two_ray, 'rain.py:model(db=3)']}"

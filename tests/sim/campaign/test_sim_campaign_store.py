@@ -8,25 +8,22 @@ import resource
 import shutil
 import signal
 import sqlite3
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import BASE, CAMPAIGN, Pretended, plan, pretend, rows_on_disk, table_bytes, write
+from campaign_examples import BASE, CAMPAIGN, Pretended, failed, plan, pretend, rows_on_disk, table_bytes
 
 from sortie.sim.campaign.drive import run_campaign
 from sortie.sim.campaign.plan import CampaignPlan
 from sortie.sim.campaign.report import write_report
-from sortie.sim.campaign.rows import find_row, read_rows
+from sortie.sim.campaign.rows import read_rows
 from sortie.sim.campaign.store import FILE, CampaignStore
 from sortie.sim.campaign.table import TABLE
-from sortie.sim.campaign.work import RunResult, Task
 from sortie.sim.folders import RunError
 from sortie.sim.identity import RELEASE
 
@@ -42,16 +39,24 @@ def test_the_order_in_which_runs_finish_does_not_show(tmp_path: Path) -> None:
     assert flown(p, tmp_path / "a") == flown(p, tmp_path / "b", order=order)
 
 
-@pytest.mark.parametrize("stop_after", [0, 1, 29, 30, 31, 47])
-def test_a_driver_that_breaks_off_is_gone_on_with(tmp_path: Path, stop_after: int) -> None:
+def test_a_driver_that_breaks_off_is_gone_on_with(tmp_path: Path) -> None:
+    """Also before its first row, whatever of its files is there: none is lost, and none is flown twice."""
     p = plan(tmp_path)
-    with pytest.raises(KeyboardInterrupt):
-        run_campaign(p, tmp_path / "a", Pretended(stop_after=stop_after))
-    rest = Pretended()
-    done = run_campaign(p, tmp_path / "a", rest)
-    assert rest.flown == list(range(stop_after, 48))  # none lost, none twice
-    assert (done.finished, done.of, done.failed) == (48, 48, 0)
-    assert table_bytes(tmp_path / "a") == flown(p, tmp_path / "b")
+    whole = flown(p, tmp_path / "whole")
+    for stop_after in (0, 1, 29, 30, 31, 47):
+        folder, rest = tmp_path / str(stop_after), Pretended()
+        with pytest.raises(KeyboardInterrupt):
+            run_campaign(p, folder, Pretended(stop_after=stop_after))
+        done = run_campaign(p, folder, rest)
+        assert rest.flown == list(range(stop_after, 48))
+        assert (done.finished, done.of, done.failed) == (48, 48, 0)
+        assert table_bytes(folder) == whole
+    for left in ([], [FILE], [".lock", FILE]):
+        folder = tmp_path / f"left {len(left)}"
+        folder.mkdir()
+        for name in left:
+            (folder / name).touch()
+        assert flown(p, folder) == whole
 
 
 def change(folder: Path, *statements: str) -> None:
@@ -61,49 +66,36 @@ def change(folder: Path, *statements: str) -> None:
             db.execute(statement)
 
 
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "UPDATE rows SET row = x'00ff' WHERE run = 31",
-        "UPDATE rows SET row = '[' WHERE run = 31",
-        "UPDATE rows SET row = '[1]' WHERE run = 31",
-        "UPDATE rows SET row = 'null' WHERE run = 31",
-        "UPDATE rows SET row = json_set(row, '$[13]', 'text') WHERE run = 31",
-        "UPDATE plan SET spec = '[]'",
-        "UPDATE plan SET spec = '{\"format\": 2}'",
-        "UPDATE plan SET spec = '{'",
-        "DELETE FROM plan",
-    ],
-)
-def test_a_damaged_store_is_one_line(tmp_path: Path, statement: str) -> None:
-    p, folder = plan(tmp_path), tmp_path / "a"
-    flown(p, folder)
-    change(folder, statement)
-    readers: list[Callable[[], object]] = [lambda: read_rows(folder), lambda: run_campaign(p, folder, Pretended())]
-    for use in readers:
-        with pytest.raises(RunError) as told:
-            use()
-        assert str(told.value).startswith(
-            (f"{folder / FILE}: is broken (", f"{folder}: holds results of another campaign")
-        )
-        assert "\n" not in str(told.value)
+DAMAGE = [
+    "UPDATE rows SET row = x'00ff' WHERE run = 31",
+    "UPDATE rows SET row = '[' WHERE run = 31",
+    "UPDATE rows SET row = '[1]' WHERE run = 31",
+    "UPDATE rows SET row = 'null' WHERE run = 31",
+    "UPDATE rows SET row = json_set(row, '$[13]', 'text') WHERE run = 31",
+    "UPDATE plan SET spec = '[]'",
+    "UPDATE plan SET spec = '{\"format\": 2}'",
+    "UPDATE plan SET spec = '{'",
+    "DELETE FROM plan",
+]
 
 
-def test_a_folder_of_an_earlier_version_is_read_and_continued(tmp_path: Path) -> None:
-    """Its file has digests beside the plan and the rows, which nobody reads any more."""
-    p, folder = plan(tmp_path), tmp_path / "a"
-    before = flown(p, folder)
-    change(
-        folder,
-        "ALTER TABLE plan ADD COLUMN digest TEXT",
-        "ALTER TABLE rows ADD COLUMN sha256 TEXT",
-        "UPDATE rows SET sha256 = 'x'",
-        "DELETE FROM rows WHERE run = 31",
-    )
-    assert find_row(folder, 3)[1] is not None
-    rest = Pretended()
-    run_campaign(p, folder, rest)
-    assert (rest.flown, table_bytes(folder)) == ([31], before)
+def test_a_damaged_store_is_one_line(tmp_path: Path) -> None:
+    p, whole = plan(tmp_path), tmp_path / "whole"
+    flown(p, whole)
+    for number, statement in enumerate(DAMAGE):
+        folder = tmp_path / str(number)
+        shutil.copytree(whole, folder)
+        change(folder, statement)
+        broken, other = f"{folder / FILE}: is broken (", f"{folder}: holds results of another campaign"
+        readers: list[Callable[[], object]] = [
+            partial(read_rows, folder),
+            partial(run_campaign, p, folder, Pretended()),
+        ]
+        for use in readers:
+            with pytest.raises(RunError) as told:
+                use()
+            assert str(told.value).startswith((broken, other)), statement
+            assert "\n" not in str(told.value)
 
 
 def test_a_damaged_table_is_written_anew(tmp_path: Path) -> None:
@@ -129,69 +121,49 @@ def no_file_beyond(size_b: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-@pytest.mark.parametrize("size_b", [100, 9_000, 17_000, 21_000])
-def test_a_full_disk_is_one_line_and_costs_nothing(tmp_path: Path, size_b: int) -> None:
-    p, folder = plan(tmp_path), tmp_path / "a"
-    first, rest = Pretended(), Pretended()
-    with (
-        no_file_beyond(size_b),
-        pytest.raises(RunError, match=r"a: cannot be written: .*; what is finished is kept, the"),
-    ):
-        run_campaign(p, folder, first)
-    kept = rows_on_disk(folder)
-    assert kept == max(0, len(first.flown) - 1)  # the last one had no room
-    assert (kept > 0) == (size_b > 15_000)  # the plan comes first, of some 13 kB
-    run_campaign(p, folder, rest)
-    assert rest.flown == list(range(kept, 48))
-    assert table_bytes(folder) == flown(p, tmp_path / "b")
-
-
-@pytest.mark.parametrize("left", [[], [FILE], [".lock", FILE]])
-def test_a_driver_that_broke_off_before_its_first_row_is_gone_on_with(tmp_path: Path, left: list[str]) -> None:
-    p, folder = plan(tmp_path), tmp_path / "a"
-    folder.mkdir()
-    for name in left:
-        (folder / name).touch()
-    assert flown(p, folder) == flown(p, tmp_path / "b")
+def test_a_full_disk_is_one_line_and_costs_nothing(tmp_path: Path) -> None:
+    p = plan(tmp_path)
+    whole = flown(p, tmp_path / "whole")
+    for size_b in (100, 9_000, 17_000, 21_000):
+        folder, first, rest = tmp_path / str(size_b), Pretended(), Pretended()
+        one_line = pytest.raises(RunError, match=r": cannot be written: .*; what is finished is kept, the")
+        with no_file_beyond(size_b), one_line:
+            run_campaign(p, folder, first)
+        kept = rows_on_disk(folder)
+        assert kept == max(0, len(first.flown) - 1)  # the last one had no room
+        assert (kept > 0) == (size_b > 15_000)  # the plan comes first, of some 13 kB
+        run_campaign(p, folder, rest)
+        assert rest.flown == list(range(kept, 48))
+        assert table_bytes(folder) == whole
 
 
 FAILED = [2, 29, 30, 41]
 """In both parts, and at their edges."""
 
 
-class Failing(Pretended):
+def failing(stop_after: int | None = None) -> Pretended:
     """Some of its runs fail."""
-
-    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
-        for (row,) in super().results(code, tasks):
-            failed = row.run in FAILED
-            yield [
-                row._replace(status="failed", error="planted", fingerprint="", values=(None, None)) if failed else row
-            ]
+    return Pretended(stop_after=stop_after, change=lambda row: failed(row) if row.run in FAILED else row)
 
 
-def with_failures(p: CampaignPlan, folder: Path, stop_after: int | None = None) -> None:
-    """A campaign some of whose runs failed."""
-    with suppress(KeyboardInterrupt):
-        run_campaign(p, folder, Failing(stop_after=stop_after))
-
-
-@pytest.mark.parametrize("stop_after", [None, 35, 46])
-def test_failed_runs_are_flown_again_where_that_is_asked(tmp_path: Path, stop_after: int | None) -> None:
-    p, folder = plan(tmp_path), tmp_path / "a"
-    with_failures(p, folder, stop_after)
-    rest = Pretended()
-    done = run_campaign(p, folder, rest, retry_failed=True)
-    assert rest.flown == sorted({*FAILED, *range(stop_after or 48, 48)})
-    assert (done.finished, done.failed) == (48, 0)
-    assert table_bytes(folder) == flown(p, tmp_path / "b")
+def test_failed_runs_are_flown_again_where_that_is_asked(tmp_path: Path) -> None:
+    p = plan(tmp_path)
+    whole = flown(p, tmp_path / "whole")
+    for stop_after in (None, 35, 46):
+        folder, rest = tmp_path / str(stop_after), Pretended()
+        with suppress(KeyboardInterrupt):
+            run_campaign(p, folder, failing(stop_after))
+        done = run_campaign(p, folder, rest, retry_failed=True)
+        assert rest.flown == sorted({*FAILED, *range(stop_after or 48, 48)})
+        assert (done.finished, done.failed) == (48, 0)
+        assert table_bytes(folder) == whole
 
 
 def test_failed_runs_that_fail_again_stay_failed(tmp_path: Path) -> None:
     p, folder = plan(tmp_path), tmp_path / "a"
-    with_failures(p, folder)
+    run_campaign(p, folder, failing())
     before = table_bytes(folder)
-    again = Failing()
+    again = failing()
     done = run_campaign(p, folder, again, retry_failed=True)
     assert (again.flown, done.failed) == (FAILED, 4)
     assert table_bytes(folder) == before
@@ -206,7 +178,7 @@ def test_a_driver_that_is_killed_at_any_statement_loses_nothing(
 ) -> None:
     """SIGKILL before every statement in turn, of a retry and of a new campaign: no good row is lost or flown twice."""
     p, real = plan(tmp_path), sqlite3.connect
-    with_failures(p, tmp_path / "failed")
+    run_campaign(p, tmp_path / "failed", failing())
     whole = flown(p, tmp_path / "b")
     for begin, statements in (("failed", range(1, 16)), ("new", range(1, 40, 3))):
         for kill in statements:
@@ -248,38 +220,31 @@ def test_a_late_answer_for_a_run_that_is_finished_is_not_counted_twice(tmp_path:
 
 def test_folders_of_others_are_refused(tmp_path: Path) -> None:
     p, folder = plan(tmp_path), tmp_path / "a"
-    run_campaign(p, folder, Pretended())
-    before = table_bytes(folder)
-    wider = plan(tmp_path, CAMPAIGN.replace("low: 0.2", "low: 0.3"))
-    with pytest.raises(RunError, match=r"holds results of another campaign, its campaign\.vary differs; name another"):
-        run_campaign(wider, folder, Pretended())
-    with pytest.raises(RunError, match=r"holds results of another campaign, its base.duration_s differs"):
-        run_campaign(plan(tmp_path, base=BASE.replace("0.5", "0.6")), folder, Pretended())
-    with pytest.raises(
-        RunError, match=rf"a: holds results of Sortie {RELEASE}\+[0-9a-f]+, this is other; name another"
-    ):
-        run_campaign(CampaignPlan({**p.spec, "code": "other"}), folder, Pretended())
+    before = flown(p, folder)
+
+    def refused(p: CampaignPlan, folder: Path, why: str) -> None:
+        with pytest.raises(RunError, match=why):
+            run_campaign(p, folder, Pretended())
+
+    wider, longer = plan(tmp_path, CAMPAIGN.replace("low: 0.2", "low: 0.3")), BASE.replace("0.5", "0.6")
+    refused(wider, folder, r"holds results of another campaign, its campaign\.vary differs; name another")
+    refused(plan(tmp_path, base=longer), folder, r"holds results of another campaign, its base.duration_s differs")
+    other = CampaignPlan({**p.spec, "code": "other"})
+    refused(other, folder, rf"a: holds results of Sortie {RELEASE}\+[0-9a-f]+, this is other; name another")
     assert table_bytes(folder) == before
     change(folder, "UPDATE plan SET spec = replace(spec, '\"seed\": 5', '\"seed\": 7')")
-    with pytest.raises(RunError, match=r"holds results of another campaign, its campaign\.seed differs"):
-        run_campaign(p, folder, Pretended())
+    refused(p, folder, r"holds results of another campaign, its campaign\.seed differs")
     change(folder, "UPDATE plan SET spec = json_set(spec, '$.format', 0)")
-    with pytest.raises(RunError, match="holds results of format 0, must be 2"):
-        run_campaign(p, folder, Pretended())
+    refused(p, folder, "holds results of format 0, must be 2")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "thesis.tex").write_text("x")
-    with pytest.raises(
-        RunError, match=r"b: holds thesis.tex and no campaign.sqlite; name another folder for the campaign"
-    ):
-        run_campaign(p, tmp_path / "b", Pretended())
+    refused(p, tmp_path / "b", r"b: holds thesis.tex and no campaign.sqlite; name another folder for the campaign")
     (folder / FILE).write_text("a file of somebody else")
-    with pytest.raises(RunError, match=r"campaign\.sqlite: is broken \(file is not a database\); remove it to fly"):
-        run_campaign(p, folder, Pretended())
+    refused(p, folder, r"campaign\.sqlite: is broken \(file is not a database\); remove it to fly")
     (folder / FILE).unlink()
     with closing(sqlite3.connect(folder / FILE)) as db:
         db.execute("CREATE TABLE theirs (x)")
-    with pytest.raises(RunError, match=r"campaign\.sqlite: is broken \(no such table: plan\); remove it to fly"):
-        run_campaign(p, folder, Pretended())
+    refused(p, folder, r"campaign\.sqlite: is broken \(no such table: plan\); remove it to fly")
 
 
 @pytest.mark.slow
@@ -292,7 +257,7 @@ def test_it_stops_when_enough_is_known_whoever_finished_first(tmp_path: Path) ->
     order = list(range(600, 1000)) + list(range(600)) + list(range(1000, 2400))
     first = flown(p, tmp_path / "a")
     assert first == flown(p, tmp_path / "b", order=order)
-    # the drawn field itself is the metric: uniform on 0.8, so the interval needs n ≥ (1.96 × 0.231 / 0.05)² ≈ 82 draws
+
     count = pq.read_table(tmp_path / "a" / "runs").num_rows
     assert count % 120 == 0
     assert 600 <= count <= 840
@@ -305,44 +270,12 @@ def test_rows_have_their_columns(tmp_path: Path) -> None:
     p = plan(tmp_path)
     flown(p, tmp_path / "a")
     table = pq.read_table(tmp_path / "a" / "runs")
-    assert table.column_names == [
-        "run", "unit", "cell", "replication", "policy", "seed", "status", "error", "fingerprint", "key",
-        "fleet.battery.initial_soc", "fleet.formation.spacing_m", "bytes.data_sent", "energy_j.total",
-    ]  # fmt: skip
+    names = "run unit cell replication policy seed status error fingerprint key"
+    varied = ["fleet.battery.initial_soc", "fleet.formation.spacing_m"]
+    assert table.column_names == [*names.split(), *varied, "bytes.data_sent", "energy_j.total"]
     assert table["run"].to_pylist() == list(range(48))
     row = table.slice(31, 1).to_pylist()[0]
     assert row["key"] == p.key(31)
     assert row["fleet.battery.initial_soc"] == p.varied(row["cell"])["fleet.battery.initial_soc"]
-
-
-def test_polars_reads_it_with_one_line(tmp_path: Path) -> None:
     polars = pytest.importorskip("polars")
-    flown(plan(tmp_path), tmp_path / "a")
     assert polars.read_parquet(tmp_path / "a" / "runs" / "*.parquet").shape == (48, 14)
-
-
-DRIVER = """
-import sys
-from sortie.sim.cli.app import main
-sys.argv = ["sortie", "campaign", sys.argv[1], "--workers", "0", "--out", sys.argv[2], "--no-report"]
-main()
-"""
-
-
-@pytest.mark.slow
-def test_sigkill_of_the_driver_at_any_moment_leaves_no_trace(tmp_path: Path) -> None:
-    """Three kills while real sorties fly, each once some rows more are on disk; the table is the undisturbed one."""
-    campaign, folder = write(tmp_path), tmp_path / "a"
-    command = [sys.executable, "-c", DRIVER, str(campaign)]
-    for kill in range(3):
-        driver = subprocess.Popen([*command, str(folder)], stdout=subprocess.DEVNULL)
-        deadline = time.monotonic() + 600
-        while rows_on_disk(folder) < 9 * (kill + 1):
-            assert driver.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-        driver.send_signal(signal.SIGKILL)
-        assert driver.wait() == -signal.SIGKILL
-    subprocess.run([*command, str(folder)], check=True, stdout=subprocess.DEVNULL)
-    subprocess.run([*command, str(tmp_path / "b")], check=True, stdout=subprocess.DEVNULL)
-    assert table_bytes(folder) == table_bytes(tmp_path / "b")

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from campaign_examples import CAMPAIGN, Pretended, plan, rows_of
+from campaign_examples import CAMPAIGN, Pretended, failed, plan, report_lines, rows_of
 
 from sortie.sim.campaign.drive import run_campaign
+from sortie.sim.campaign.report import write_report
 from sortie.sim.campaign.rows import CampaignRows, read_rows
 from sortie.sim.campaign.winners import other_winners, rule, winner
 from sortie.sim.campaign.work import RunResult
 from sortie.sim.folders import RunError
 
+AP = "ap50.mission"
+
 
 def test_a_unit_that_is_not_whole_moves_no_mean(tmp_path: Path) -> None:
-    """Parts hold 30 rows, a draw at 22 grid points 44: what a campaign that was cut off has of the next draw is left out."""
+    """Parts hold 30 rows, a draw at 22 grid points 44: what a cut off campaign has of the next draw is left out."""
     counts = ", ".join(map(str, range(1, 23)))
     text = CAMPAIGN.replace(
         "fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", f"fleet.drones: {{kind: grid, values: [{counts}]}}"
@@ -28,23 +33,19 @@ def test_a_unit_that_is_not_whole_moves_no_mean(tmp_path: Path) -> None:
     def drones(run: int) -> float:
         return float(p.varied(p.at(run).cell)["fleet.drones"])
 
-    class Counting(Pretended):
-        def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
-            for rows in super().results(code, tasks):  # type: ignore[arg-type]
-                yield [r._replace(values=(drones(r.run), 0.0)) for r in rows]
+    def counting(stop_after: int) -> Pretended:
+        return Pretended(stop_after=stop_after, change=lambda row: row._replace(values=(drones(row.run), 0.0)))
 
     with pytest.raises(KeyboardInterrupt):
-        run_campaign(p, folder, Counting(stop_after=40))  # type: ignore[arg-type]
+        run_campaign(p, folder, counting(40))
     with pytest.raises(RunError, match="a: no draw is finished at all its grid points yet, go on with the campaign"):
         read_rows(folder)
     with pytest.raises(KeyboardInterrupt):
-        run_campaign(p, folder, Counting(stop_after=70))  # type: ignore[arg-type]
+        run_campaign(p, folder, counting(70))
     rows = read_rows(folder)
     assert (rows.all.num_rows, rows.table.num_rows) == (90, 88)
     assert rows.by_unit("bytes.data_sent") == pytest.approx(np.full((2, 2), 11.5))
     pytest.importorskip("matplotlib")
-    from sortie.sim.campaign.report import write_report
-
     told = write_report(folder).read_text()
     assert "2 of the runs are left out of all that follows: their draw is not finished at every grid point." in told
     assert "`stop_when` ended it" not in told
@@ -66,28 +67,21 @@ def test_a_failed_grid_point_takes_its_unit_with_it(tmp_path: Path) -> None:
 def test_a_policy_that_fails_where_it_is_hard_gains_nothing_by_it(tmp_path: Path) -> None:
     """It does worse by 1 everywhere, and fails in the two draws where all do worst."""
     pytest.importorskip("matplotlib")
-    from sortie.sim.campaign.report import write_report
-
     p, folder = plan(tmp_path), tmp_path / "a"
     hard = (0, 1)
 
-    class Picky(Pretended):
-        def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
-            for rows in super().results(code, tasks):  # type: ignore[arg-type]
-                yield [self.one(r) for r in rows]
+    def picky(row: RunResult) -> RunResult:
+        unit, policy = p.at(row.run).cell // 2, row.run % 2
+        if policy == 1 and unit in hard:
+            return failed(row)
+        return row._replace(values=(100.0 * (unit in hard) + policy, 0.0))
 
-        def one(self, r: RunResult) -> RunResult:
-            unit, policy = p.at(r.run).cell // 2, r.run % 2
-            if policy == 1 and unit in hard:
-                return RunResult(r.run, r.key, "failed", "ValueError: too hard", "", (None, None))
-            return r._replace(values=(100.0 * (unit in hard) + policy, 0.0))
-
-    run_campaign(p, folder, Picky())  # type: ignore[arg-type]
+    run_campaign(p, folder, Pretended(change=picky))
     rows = read_rows(folder)
     assert rows.by_unit("bytes.data_sent").mean(axis=0).tolist() == [0.0, 1.0]
     assert winner(rows, "bytes.data_sent") == "worked"
-    said = "2 of the draws are left out of all means, where all runs of a policy at a grid point failed (best-2(received_budget=0.1) 2): policies are"
-    assert said in write_report(folder).read_text()
+    said = "2 of the draws are left out of all means, where all runs of a policy at a grid point failed"
+    assert f"{said} (best-2(received_budget=0.1) 2): policies are" in write_report(folder).read_text()
 
 
 MISSES = CAMPAIGN.replace("metrics: [bytes.data_sent, energy_j.total]", "metrics: [deadline_miss_rate]").replace(
@@ -97,7 +91,6 @@ MISSES = CAMPAIGN.replace("metrics: [bytes.data_sent, energy_j.total]", "metrics
 
 def test_a_policy_that_sends_nothing_where_it_is_easy_loses_nothing_by_it(tmp_path: Path) -> None:
     """It misses 0.02 less wherever it sends; `silence` never sends, and takes nothing from the others."""
-    from sortie.sim.campaign.report import _lines
 
     def misses(fields: dict[str, float], policy: int) -> float | None:
         easy = fields["fleet.battery.initial_soc"] < 0.6
@@ -111,7 +104,7 @@ def test_a_policy_that_sends_nothing_where_it_is_easy_loses_nothing_by_it(tmp_pa
     assert winner(rows, "deadline_miss_rate") == "worked"
     assert other_winners(rows, "deadline_miss_rate") == []
     assert rule(rows, "deadline_miss_rate") is None, "no threshold gains, and none is hidden by the silent policy"
-    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    told = "\n".join(report_lines(rows, tmp_path))
     assert "| deadline_miss_rate (40 of 80 scenes) | – | 0.49 (all equal) | 0.51 (all equal) |" in told
     assert "A scene is one replication of a draw at a grid point." in told
     assert "| deadline_miss_rate | – | – |\n" in told, "differences from a silent policy"
@@ -132,41 +125,72 @@ def test_a_grid_point_without_a_value_of_one_policy_is_left_out_for_all(tmp_path
     assert means[:, 2] == pytest.approx(means[:, 1] + 0.1)
 
 
-def test_a_rule_is_between_the_policies_that_have_values(tmp_path: Path) -> None:
-    def misses(fields: dict[str, float], policy: int) -> float | None:
-        return None if policy == 0 else 0.2 + 0.1 * ((fields["fleet.battery.initial_soc"] > 0.6) == (policy == 1))
-
-    found = rule(rows_of(tmp_path, MISSES, misses, "deadline_miss_rate"), "deadline_miss_rate")
-    assert found is not None
-    assert (found.below, found.above) == ("worked", "best-2(received_budget=0.1)")
-
-
 def test_policies_that_never_have_a_value_in_the_same_scene_are_not_compared(tmp_path: Path) -> None:
-    from sortie.sim.campaign.report import _lines
-
     def misses(fields: dict[str, float], policy: int) -> float | None:
         return 0.5 if (fields["fleet.battery.initial_soc"] < 0.6) == (policy == 1) else None
 
     rows = rows_of(tmp_path, MISSES, misses, "deadline_miss_rate")
-    told = "\n".join(_lines(rows, tmp_path, {"varied.png": False, "pareto.png": False}))
+    told = "\n".join(report_lines(rows, tmp_path))
     assert "No scene can be compared by deadline_miss_rate: left out of what follows." in told
     assert "## Where the winner changes" not in told
 
 
 def test_a_policy_that_never_finishes_takes_no_other_with_it(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from sortie.sim.campaign.report import write_report
-
     p, folder = plan(tmp_path), tmp_path / "a"
 
-    class Broken(Pretended):
-        def results(self, code: str, tasks: object) -> object:  # type: ignore[override]
-            for rows in super().results(code, tasks):  # type: ignore[arg-type]
-                yield [
-                    RunResult(r.run, r.key, "failed", "ValueError: broken", "", (None, None)) if r.run % 2 else r
-                    for r in rows
-                ]
-
-    run_campaign(p, folder, Broken())  # type: ignore[arg-type]
+    run_campaign(p, folder, Pretended(change=lambda row: failed(row) if row.run % 2 else row))
     assert np.isnan(read_rows(folder).by_unit("bytes.data_sent")).tolist() == [[False, True]] * 6
     assert "No run of best-2(received_budget=0.1) finished." in write_report(folder).read_text()
+
+
+def rows_by_hand(values: list[tuple[int, int, int, float | None]], points: int) -> CampaignRows:
+    """Runs of (unit, grid point, policy, value), in their order; a run without a value has failed."""
+    made = pa.Table.from_pylist(
+        [
+            {"unit": u, "cell": u * points + g, AP: v, "status": "done" if v is not None else "failed", "x": float(u)}
+            for u, g, _, v in values
+        ]
+    )
+    units, policies = 1 + max(v[0] for v in values), 1 + max(v[2] for v in values)
+    plan = SimpleNamespace(policies=["a", "b"][:policies], grid=[{}] * points, cells=units * points, units=units)
+    plan.campaign = SimpleNamespace(vary=["x"])
+    return CampaignRows(plan, made, made["unit"].to_numpy(), np.array([v[2] for v in values]))  # type: ignore[arg-type]
+
+
+def test_a_mean_is_over_grid_points_and_each_of_them_over_its_replications() -> None:
+    """Policy a: 2 and 5. Policy b: 6 and 9, as a replication without a value of policy a counts for neither."""
+    first = [(0, 0, 0, 1.0), (0, 0, 1, 4.0), (0, 0, 0, 3.0), (0, 0, 1, 8.0)]
+    second = [(0, 1, 0, None), (0, 1, 1, 7.0), (0, 1, 0, 5.0), (0, 1, 1, 9.0)]
+    made = rows_by_hand([*first, *second], points=2)
+    assert made.by_unit(AP).tolist() == [[3.5, 7.5]]
+    counted, scenes = made.counted(AP)
+    assert (counted.tolist(), scenes) == ([True] * 4 + [False] * 2 + [True] * 2, 4)
+
+
+def test_a_unit_is_left_out_where_a_policy_is_lost_in_the_part_that_is_looked_at() -> None:
+    """In unit 1 policy b fails at the second grid point: the first point has the unit, and the whole has not."""
+    runs = [(u, g, p) for u in range(2) for g in range(2) for p in range(2)]
+    values = [(u, g, p, None if (u, g, p) == (1, 1, 1) else 10.0 * u + g + p / 10) for u, g, p in runs]
+    made = rows_by_hand(values, points=2)
+    assert made.by_unit(AP).tolist() == [[0.5, pytest.approx(0.6)]]
+    first = made.table["cell"].to_numpy() % 2 == 0
+    assert made.by_unit(AP, first).tolist() == [[0.0, 0.1], [10.0, 10.1]]
+
+
+def test_a_part_of_a_field_holds_its_lower_end_and_stands_at_the_mean_of_its_values() -> None:
+    """Nine values from 0 to 9, without 7 and with quartiles 2, 4 and 6; values of a grid are parts of their own."""
+    column = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 9.0]
+    made = rows_by_hand([(u, 0, 0, 0.5) for u in range(9)], points=1)
+    made = replace(made, table=made.table.set_column(4, "x", pa.array(column)))
+    parts = made.bins("x")
+    assert [label for label, _, _ in parts] == ["0 … 2", "2 … 4", "4 … 6", "6 … 9"]
+    assert [np.array(column)[mask].tolist() for _, _, mask in parts] == [[0, 1], [2, 3], [4, 5], [6, 8, 9]]
+    assert [place for _, place, _ in parts] == pytest.approx([0.5, 2.5, 4.5, 23 / 3])
+
+
+def test_a_grid_of_large_numbers_keeps_its_labels(tmp_path: Path) -> None:
+    seeds = "perception.scene.seed: {kind: grid, values: [12341, 12342]}"
+    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", seeds)
+    rows = rows_of(tmp_path, text, lambda fields, policy: policy)
+    assert [label for label, _, _ in rows.bins("perception.scene.seed")] == ["12341", "12342"]

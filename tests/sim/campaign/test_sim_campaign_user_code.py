@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from campaign_examples import BASE, CAMPAIGN, CLUSTER, table_bytes, write
+from campaign_examples import BASE, CAMPAIGN, write
 
 import sortie
 
@@ -58,26 +58,6 @@ def test_what_a_policy_does_is_one_failed_run(
         assert error in row["error"]
         assert row["seed"] is not None
     assert sortie.campaign(campaign, out=tmp_path / "a", workers=0).flown == 0, "a resume does not stop there again"
-
-
-@CLUSTER
-def test_a_cluster_gives_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    distributed = pytest.importorskip("distributed")
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(POLICY.format(what="hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"))
-    text = CAMPAIGN.replace('[worked, "best-2(received_budget=0.1)"]', "['mine.py:decide']").replace(
-        "{count: 6}", "{count: 2}"
-    )
-    campaign = write(tmp_path, text, BASE + "limits: {decision_s: 2}\n")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL"
-    ) as cluster:
-        done = [
-            sortie.campaign(campaign, out=tmp_path / name, scheduler=scheduler)
-            for name, scheduler in (("a", None), ("b", cluster.scheduler_address))
-        ]
-    assert done[0].failed == done[1].failed > 0
-    assert table_bytes(tmp_path / "a") == table_bytes(tmp_path / "b")
 
 
 def test_the_driver_runs_no_decision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

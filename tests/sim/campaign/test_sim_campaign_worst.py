@@ -31,52 +31,35 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here / "c"
 
 
-def test_they_are_the_worst_and_in_order(folder: Path) -> None:
+def test_they_are_the_worst_of_a_policy_or_of_all_and_in_order(folder: Path) -> None:
     rows = sortie.open_campaign(folder).rows.to_pylist()
     found = worst(folder, "bytes.data_delivered", 3)
     assert not found.more_is_worse
     assert [row["bytes.data_delivered"] for row in found.rows] == sorted(r["bytes.data_delivered"] for r in rows)[:3]
     assert found.varied == ["radio.tx_power_dbm"]
-
-
-def test_what_is_worse_may_be_said(folder: Path) -> None:
-    most = worst(folder, "bytes.data_delivered", 8, more_is_worse=True)
-    least = worst(folder, "bytes.data_delivered", 8)
-    values = [[row["bytes.data_delivered"] for row in found.rows] for found in (most, least)]
-    assert values[0] == values[1][::-1]
-    assert values[0][0] > 0
-
-
-def test_runs_of_one_policy(folder: Path) -> None:
+    most, least = (worst(folder, "bytes.data_delivered", 8, more_is_worse=more).rows for more in (True, None))
+    assert [row["bytes.data_delivered"] for row in most] == [row["bytes.data_delivered"] for row in least][::-1]
+    assert most[0]["bytes.data_delivered"] > 0
     assert {row["policy"] for row in worst(folder, "bytes.data_delivered", 8, "all-4").rows} == {"all-4"}
-
-
-def test_runs_without_a_value_are_left_out(folder: Path) -> None:
     assert {row["policy"] for row in worst(folder, "deadline_miss_rate", 8).rows} == {"all-4"}  # silence sends nothing
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("bytes.data_sent",), "bytes.data_sent: no metric of .*c, must be bytes.data_delivered, deadline_miss_rate, frame_s$"),
+def test_what_cannot_be_asked_is_told(folder: Path) -> None:
+    metrics = "bytes.data_delivered, deadline_miss_rate, frame_s"
+    for arguments, message in (
+        (("bytes.data_sent",), f"bytes.data_sent: no metric of .*c, must be {metrics}$"),
         (("frame_s",), "frame_s: whether more of it is worse is not known, say --most or --least$"),
         (("deadline_miss_rate", 3, "best-2"), "best-2: no policy of .*c, must be all-4, silence$"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_asked_is_told(folder: Path, arguments: tuple[str, ...], message: str) -> None:
-    with pytest.raises(RunError, match=message):
-        worst(folder, *arguments)  # type: ignore[arg-type]
+    ):
+        with pytest.raises(RunError, match=message):
+            worst(folder, *arguments)  # type: ignore[arg-type]
 
 
 def test_the_command_shows_them_and_flies_the_first_again(folder: Path) -> None:
-    said = CliRunner().invoke(
-        app, ["campaign", "worst", str(folder), "deadline_miss_rate", "--count", "2", "--fly", "1"]
-    )
+    command = ["campaign", "worst", str(folder), "deadline_miss_rate", "--count", "2", "--fly", "1"]
+    said = CliRunner().invoke(app, command)
     assert said.exit_code == 0, said.output
     first = worst(folder, "deadline_miss_rate", 1).rows[0]
     assert re.search(rf"--from-campaign \S+ --run {first['run']} --view", said.output)
-    assert (
-        sortie.open_run(folder / "worst" / f"run-{first['run']}")
-        .outcome["fingerprint"]
-        .startswith(first["fingerprint"])
-    )
+    again = sortie.open_run(folder / "worst" / f"run-{first['run']}").outcome
+    assert again["fingerprint"].startswith(first["fingerprint"])
