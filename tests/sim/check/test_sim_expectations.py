@@ -1,50 +1,192 @@
-"""What an outcome is held to."""
+"""What an outcome is held to: bounds, tolerances, means over replications, and decisions in a window."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import numpy as np
 import pytest
+import record_by_hand as by_hand
+from scipy import stats
 from sim_examples import example
 
-from sortie.scenarios.schema import Expectation
-from sortie.sim.check.expectations import check
+from sortie.scenarios.intervals import mean_interval
+from sortie.scenarios.schema import DecisionExpectation, Expectation
+from sortie.sim.check.expectations import Verdict, check
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 
 
-@pytest.mark.parametrize(
-    ("metric", "equals", "holds"),
-    [
-        ("drones.0.airborne", True, True),
-        ("drones.0.airborne", 1.0, False),
-        ("replication", 0.0, True),
-        ("replication", False, False),
-        ("scenario", "example", True),
-        ("duration_s", "0.5", False),
-        ("duration_s", 0.5, True),
-    ],
-)
-def test_a_truth_is_no_number(metric: str, equals: Any, holds: bool) -> None:
-    record = run_sortie(example("duration_s=0.5"))
-    held = record.scenario.model_copy(update={"expect": (Expectation(metric=metric, equals=equals),)})
-    (verdict,) = check(held, record, outcome(record))
-    assert verdict.holds is holds
+def judged(
+    expectation: Expectation | DecisionExpectation,
+    result: dict[str, Any],
+    replications: list[dict[str, Any]] | None = None,
+    record: Any = None,
+) -> Verdict:
+    """The verdict of one expectation."""
+    of_decisions = isinstance(expectation, DecisionExpectation)
+    held = {
+        "expect": () if of_decisions else (expectation,),
+        "expect_decisions": (expectation,) if of_decisions else (),
+    }
+    scenario = example().model_copy(update=held)
+    (verdict,) = check(scenario, record or by_hand.record(), result, replications or [])
+    return verdict
 
 
-@pytest.mark.parametrize(
-    ("metric", "holds"),
-    [
-        ("payload_fates.lost/no_link", True),
-        ("descriptor_drops.forged", True),
-        ("distrusted_by.0", True),
-        ("payload_fates.lost/no_lnk", False),
-        ("distrusted_by.99", False),
-        ("policies.decisions.other", False),
-    ],
-)
-def test_nothing_of_a_kind_is_a_count_of_zero_and_an_unknown_kind_fails(metric: str, holds: bool) -> None:
-    record = run_sortie(example("duration_s=0.5"))
-    held = record.scenario.model_copy(update={"expect": (Expectation(metric=metric, at_most=0),)})
-    (verdict,) = check(held, record, outcome(record))
-    assert (verdict.holds, verdict.got == "0") == (holds, holds)
+BOUNDS: list[tuple[dict[str, Any], bool]] = [
+    ({"equals": 5.0, "at_most": 9.0}, True),
+    ({"equals": 6.0, "at_most": 9.0}, False),  # the bound alone does not make it hold
+    ({"equals": 5.0, "at_least": 6.0}, False),
+    ({"at_least": 5.0, "at_most": 5.0}, True),
+    ({"equals": 500.0, "tolerance": 400.0}, False),
+    ({"equals": 5.0 + 1e-10}, True),
+    ({"at_least": 5.2, "tolerance": 0.3}, True),
+    ({"at_least": 5.4, "tolerance": 0.3}, False),
+    ({"at_most": 4.8, "tolerance": 0.3}, True),
+    ({"at_most": 4.8, "tolerance": 0.1}, False),
+    ({"equals": 4.9, "tolerance": 0.2}, True),
+    ({"equals": 4.9, "tolerance": 0.05}, False),
+]
+
+
+def test_every_bound_of_an_expectation_must_hold() -> None:
+    got = [(bounds, judged(Expectation(metric="m", **bounds), {"m": 5.0}).holds) for bounds, _ in BOUNDS]
+    assert got == BOUNDS
+
+
+TRUTHS: list[tuple[str, dict[str, Any], bool]] = [
+    ("drones.0.airborne", {"equals": True}, True),
+    ("drones.0.airborne", {"equals": 1.0}, False),
+    ("replication", {"equals": 0.0}, True),
+    ("replication", {"equals": False}, False),
+    ("scenario", {"equals": "by_hand"}, True),
+    ("duration_s", {"equals": "4.0"}, False),
+    ("duration_s", {"equals": 4.0}, True),
+    ("payload_fates.lost/no_link", {"at_most": 0}, True),
+    ("descriptor_drops.forged", {"at_most": 0}, True),
+    ("distrusted_by.0", {"at_most": 0}, True),
+    ("payload_fates.lost/no_lnk", {"at_most": 0}, False),
+    ("distrusted_by.99", {"at_most": 0}, False),
+    ("policies.decisions.other", {"at_most": 0}, False),
+]
+
+
+def test_a_truth_is_no_number_and_nothing_of_a_known_kind_is_a_count_of_zero() -> None:
+    result = outcome(by_hand.record())
+    got = [(metric, held, judged(Expectation(metric=metric, **held), result).holds) for metric, held, _ in TRUTHS]
+    assert got == TRUTHS
+
+
+def decisions() -> Any:
+    """One drone's decisions about two peers: a region at 1 s, none at 2 s."""
+    names = ("t_s", "peer", "representation", "rate_hz", "roi_radius_m", "reason")
+    rows = [
+        (1.0, 0, "features", 5.0, 32.0, "battery < 60 %"),
+        (2.0, 1, "detections", 2.0, math.nan, "goodput 4 < 5 Mb/s"),
+    ]
+    made = [{"drone": 2, **dict(zip(names, row, strict=True))} for row in rows]
+    return by_hand.record(tables=by_hand.tables_of({"directives": made}))
+
+
+DECIDED: list[tuple[dict[str, Any], bool]] = [
+    ({}, True),
+    ({"drone": 1}, False),
+    ({"from_s": 2.0, "until_s": 2.0}, True),
+    ({"from_s": 2.1, "until_s": 3.0}, False),
+    ({"from_s": 0.0, "until_s": 1.0}, True),
+    ({"from_s": 0.0, "until_s": 0.9}, False),
+    ({"peer": 1}, True),
+    ({"peer": 3}, False),
+    ({"peer": 1, "representation": "features"}, False),
+    ({"peer": 1, "representation": "detections"}, True),
+    ({"rate_at_most_hz": 2.0}, True),
+    ({"rate_at_most_hz": 1.9}, False),
+    ({"peer": 0, "roi": True}, True),
+    ({"peer": 0, "roi": False}, False),
+    ({"peer": 1, "roi": False}, True),
+    ({"peer": 1, "roi": True}, False),
+    ({"reason": "battery"}, True),
+    ({"peer": 1, "reason": "battery"}, False),
+    ({"representation": "features", "rate_at_most_hz": 5.0, "roi": True, "reason": "60 %"}, True),
+    ({"representation": "features", "rate_at_most_hz": 2.0}, False),  # each holds of a row, of no row both
+]
+
+
+def test_one_row_in_the_window_must_have_all_that_is_expected() -> None:
+    record, window = decisions(), {"drone": 2, "from_s": 0.0, "until_s": 3.0}
+    got = [(asked, judged(DecisionExpectation(**(window | asked)), {}, record=record).holds) for asked, _ in DECIDED]
+    assert got == DECIDED
+    assert judged(DecisionExpectation(**window), {}, record=record).got.startswith("1.00 s: 2 → 0 features")
+
+
+# Student's t of two degrees at 90 %, one-sided, is 1.8856: of 4, 5 and 6 the mean is surely above 5 − 1.0887
+MEANS: list[tuple[dict[str, float], list[float], bool, int]] = [
+    ({"at_least": 3.90}, [4.0, 5.0, 6.0], True, 0),
+    ({"at_least": 3.93}, [4.0, 5.0, 6.0], False, 0),
+    ({"at_most": 6.10}, [4.0, 5.0, 6.0], True, 0),
+    ({"at_most": 6.07}, [4.0, 5.0, 6.0], False, 2),
+    ({"at_least": 4.00, "tolerance": 0.1}, [4.0, 5.0, 6.0], True, 0),
+    ({"at_most": 6.00, "tolerance": 0.1}, [4.0, 5.0, 6.0], True, 0),
+    ({"at_most": 6.00, "tolerance": 0.05}, [4.0, 6.0, 5.0], False, 1),
+    ({"at_least": 4.50}, [6.0, 5.0, 4.0], False, 2),
+    ({"at_least": 3.90, "at_most": 6.10}, [4.0, 5.0, 6.0], True, 0),
+    ({"at_least": 3.90}, [4.0, 5.0, 6.0, -90.0], True, 0),  # more were flown for another expectation
+    ({"at_least": 5.0}, [5.0, 5.0, 5.0], True, 0),
+]
+
+
+def of_three(**bounds: float) -> Expectation:
+    return Expectation(metric="m", replications=3, confidence=0.9, **bounds)
+
+
+def test_a_mean_is_within_its_bound_by_one_end_of_its_interval() -> None:
+    wrong = {}
+    for bound, values, holds, shown in MEANS:
+        verdict = judged(of_three(**bound), {"m": -1.0}, [{"m": v} for v in values])
+        if (verdict.holds, verdict.replication) != (holds, shown) or not verdict.got.startswith("5"):
+            wrong[str(bound), str(values)] = verdict
+    assert wrong == {}
+    assert judged(of_three(at_least=5.0), {}, [{"m": 5.0}] * 3).expected == "m ≥ 5 with 90 % over 3"
+
+
+def test_a_mean_of_too_few_replications_or_of_one_without_the_metric_is_none() -> None:
+    for metric, replications, got in (
+        ("m", [{"m": 5.0}] * 2, "2 replications flown"),
+        ("m", [{"m": 6.0}, {"m": None}, {"m": 6.0}], "replication 1: None, no number"),
+        ("n", [{"m": 6.0}] * 3, "replication 0: n: "),
+    ):
+        asked = of_three(at_least=0.0).model_copy(update={"metric": metric})
+        verdict = judged(asked, {}, replications)
+        assert not verdict.holds
+        assert verdict.got.startswith(got)
+
+
+def test_the_limit_is_students() -> None:
+    values = np.random.default_rng(1).normal(3, 2, 12)
+    low = stats.ttest_1samp(values, 0, alternative="greater").confidence_interval(0.95).low
+    for bound, holds in ((low - 1e-6, True), (low + 1e-6, False)):
+        asked = Expectation(metric="m", at_least=bound, replications=12, confidence=0.95)
+        verdict = judged(asked, {}, [{"m": v} for v in values.tolist()])
+        assert verdict.holds is holds
+        assert verdict.got.startswith(f"{values.mean():.6g} [{low:.6g}, ")
+
+
+@pytest.mark.slow
+def test_a_mean_at_its_bound_is_called_shown_as_seldom_as_asked() -> None:
+    """With a true mean of 0 the expectation `≥ 0 with 90 %` is wrongly called held in 10 % of cases, within 3 σ."""
+    rng, cases = np.random.default_rng(2), 4000
+    held = sum(mean_interval(rng.normal(0, 1, 8), level=0.8).low >= 0 for _ in range(cases))
+    assert abs(held / cases - 0.1) < 3 * math.sqrt(0.09 / cases)
+
+
+def test_of_a_time_that_was_not_flown_nothing_is_held_to_be_so() -> None:
+    """Missions may be flown shortened: the phase at 3 s is not in the outcome, and no bound on it holds for that."""
+    late = "{metric: phases.1.data_rate_mbps, at_most: 1.0e9}"
+    scenario = example("duration_s=0.5", f"expect=[{late}]", "expect_decisions=[{drone: 0, from_s: 3, until_s: 4}]")
+    record = run_sortie(scenario)
+    assert [(v.holds, v.got) for v in check(scenario, record, outcome(record))] == [
+        (False, "phases.1.data_rate_mbps: phases has no '1', it has 0 … 0"),
+        (False, "no decision"),
+    ]

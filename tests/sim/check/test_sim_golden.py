@@ -40,7 +40,7 @@ def figures(result: dict[str, Any]) -> dict[str, float | str]:
 
 
 def same(name: str, a: float | str, b: float | str, *, network: bool) -> bool:
-    """Equal, or numbers that differ in their last bits only; `network`: boxes of another processor differ at the threshold."""
+    """Equal, or numbers that differ in their last bits only; with a `network`, boxes differ at the threshold."""
     if isinstance(a, str) or isinstance(b, str):
         return a == b
     of_boxes = network and name.startswith(("ap50.", "tracking.", "phases.", "mission.target_"))
