@@ -2,34 +2,35 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from rich.table import Table
 
 from sortie.scenarios.intervals import Estimate
 from sortie.scenarios.schema.conditions import ConditionSet
+from sortie.sim.folders import RunError
 from sortie.sim.ranking import board, rank
 from sortie.sim.ranking.flights import KEPT, METRICS, Flight, _Kept
-from sortie.sim.ranking.places import Control, PairDifference, Scored, Standing, differences, standings
+from sortie.sim.ranking.places import Control, PairDifference, Standing, standings
 from sortie.sim.ranking.rank import Ranked
 from sortie.sim.ranking.stored import made_now, read_results, save_results
 from sortie.sim.ranking.verdict import WORDS, Verified
 
-pytestmark = pytest.mark.slow
-
 FIGURES = {
-    "ap50.mission": 0.31, "ap50.full_scene": 0.42, "tracking.hota": 0.53, "bytes.data_sent": 4.5e6, "bytes.context_sent": 6.5e3,
-    "energy_j.total": 9000.0, "energy_j.fault": 1500.0, "energy_j.radio": 77.0, "deadline_miss_rate": 0.08,
-    "mission.target_detected_share": 0.61, "mission.target_in_view_share": 0.72, "mission.region_observed_share": 0.83,
-    "mission.flown_share": 0.94, "policies.violated_ticks": 5.0, "policies.invariant_violations": 6.0, "switches": 7.0,
-    "age_s.p99": 0.123, "policy_eval_us.p50": 20.0, "policy_eval_us.p99": 90.0,
-}  # fmt: skip
+    **{"ap50.mission": 0.31, "ap50.full_scene": 0.42, "tracking.hota": 0.53},
+    **{"bytes.data_sent": 4.5e6, "bytes.context_sent": 6.5e3, "deadline_miss_rate": 0.08},
+    **{"energy_j.total": 9000.0, "energy_j.fault": 1500.0, "energy_j.radio": 77.0},
+    **{"mission.target_detected_share": 0.61, "mission.target_in_view_share": 0.72},
+    **{"mission.region_observed_share": 0.83, "mission.flown_share": 0.94},
+    **{"policies.violated_ticks": 5.0, "policies.invariant_violations": 6.0, "switches": 7.0},
+    **{"age_s.p99": 0.123, "policy_eval_us.p50": 20.0, "policy_eval_us.p99": 90.0},
+}
 
 
 def flight(scale: float = 1.0, error: str = "") -> Flight:
@@ -52,18 +53,18 @@ def ranking() -> Ranked:
         PairDifference("theirs", "ours", Estimate(0.45, 0.35, 0.55, 2)),
     )
     flights = {
-        "theirs": {"poor": flight(), "rich": flight(1.5)}, "mine": {"poor": flight(0.5), "rich": flight(0.75)},
+        "theirs": {"poor": flight(), "rich": flight(1.5)},
+        "mine": {"poor": flight(0.5), "rich": flight(0.75)},
         "ours": {"poor": flight(0.25), "rich": flight(error="boom")},
-    }  # fmt: skip
+    }
     verified = {
-        "theirs": Verified(16, (), "proved", "tried"), "mine": Verified(16, (), "tried", "proved"),
+        "theirs": Verified(16, (), "proved", "tried"),
+        "mine": Verified(16, (), "tried", "proved"),
         "ours": Verified(16, ("stale views", "silence"), "proved", "refuted"),
-    }  # fmt: skip
-    return Ranked(
-        suite="small", digest="abc", sortie="1.2", stored="1.1", stale=False, speed=3.0, detector="surrogate", rows=rows,
-        pairs=pairs, flights=flights, verified=verified, entries=("mine", "ours"), taken=("theirs",), conditions=2,
-        control=None, width=1.0,
-    )  # fmt: skip
+    }
+    about = {"suite": "small", "digest": "abc", "sortie": "1.2", "stored": "1.1", "stale": False, "speed": 3.0}
+    asked = {"entries": ("mine", "ours"), "taken": ("theirs",), "conditions": 2, "control": None, "width": 1.0}
+    return Ranked(**about, **asked, detector="surrogate", rows=rows, pairs=pairs, flights=flights, verified=verified)
 
 
 def cells(table: Table) -> list[list[str]]:
@@ -72,9 +73,8 @@ def cells(table: Table) -> list[list[str]]:
 
 def test_each_table_has_each_figure_in_its_column() -> None:
     tables = [part for part in board.summary(ranking())._parts if isinstance(part, Table)]
-    assert [str(table.title) for table in tables] == [
-        "small (abc), 2 conditions, surrogate", "mission and cost, a sortie", "context, rules and time, a sortie",
-    ]  # fmt: skip
+    titles = ["small (abc), 2 conditions, surrogate", "mission and cost, a sortie"]
+    assert [str(table.title) for table in tables] == [*titles, "context, rules and time, a sortie"]
     assert [[str(c.header) for c in table.columns] for table in tables] == [
         ["place", "policy", "AP, 95 % interval", "mission", "full", "HOTA", "failed"],
         ["place", "policy", "found", "seen", "data", "missed", "energy"],
@@ -141,24 +141,21 @@ def test_the_surrogate_s_further_flights_are_counted_and_its_narrower_intervals_
 
 def test_the_json_has_every_figure_of_every_policy() -> None:
     made = json.loads(json.dumps(board.plain(ranking())))
-    assert {k: made[k] for k in ("suite", "digest", "sortie", "built_in_flown_with", "built_in_stale", "detector")} == {
-        "suite": "small", "digest": "abc", "sortie": "1.2", "built_in_flown_with": "1.1", "built_in_stale": False,
-        "detector": "surrogate",
-    }  # fmt: skip
+    about = {"suite": "small", "digest": "abc", "sortie": "1.2", "detector": "surrogate"}
+    about |= {"built_in_flown_with": "1.1", "built_in_stale": False}
+    assert {name: made[name] for name in about} == about
     assert made["asked_for"] == ["mine", "ours"]
     assert [p["policy"] for p in made["policies"]] == ["theirs", "mine", "ours"]
     for row, scale in zip(made["policies"], (1.0, 0.5, 0.25), strict=True):
-        assert {name: e["mean"] for name, e in row["figures"].items()} == {
-            name: pytest.approx(v * scale) for name, v in FIGURES.items()
-        }
+        means = {name: e["mean"] for name, e in row["figures"].items()}
+        assert means == pytest.approx({name: v * scale for name, v in FIGURES.items()})
         assert row["score"] == pytest.approx({"mean": 0.7 * scale, "low": 0.6 * scale, "high": 0.8 * scale, "count": 2})
     theirs, mine, ours = made["policies"]
     assert [p["place"] for p in (theirs, mine, ours)] == [[1, 1], [2, 3], [2, 3]]
     assert [p["decision_us"] for p in (theirs, mine, ours)] == [60.0, 10.0, 5.0]
     assert [p["failed"] for p in (theirs, mine, ours)] == [{}, {}, {"rich": "boom"}]
-    assert ours["verified"] == {
-        "rules": 16, "broken": ["stale views", "silence"], "contract": "proved", "monotone": "refuted",
-    }  # fmt: skip
+    broken = {"rules": 16, "broken": ["stale views", "silence"], "contract": "proved", "monotone": "refuted"}
+    assert ours["verified"] == broken
     assert made["differences"] == {
         "mine": {
             "theirs": pytest.approx({"mean": -0.3, "low": -0.4, "high": -0.2, "count": 2}),
@@ -188,22 +185,20 @@ def test_a_figure_has_a_point_a_policy_and_the_line_of_those_whom_none_beats(
         for line in axes.get_lines()
         if line.get_marker() == "o"
     ]
-    assert points == [
-        (pytest.approx(4.5), pytest.approx(0.7), "tab:blue"), (pytest.approx(2.25), pytest.approx(0.35), "tab:red"),
-        (pytest.approx(1.125), pytest.approx(0.175), "tab:red"),
-    ]  # fmt: skip
+    near = pytest.approx
+    reds = [(near(2.25), near(0.35), "tab:red"), (near(1.125), near(0.175), "tab:red")]
+    assert points == [(near(4.5), near(0.7), "tab:blue"), *reds]
     (front,) = (line for line in axes.get_lines() if line.get_drawstyle() == "steps-post")
     assert list(front.get_xdata()) == pytest.approx([1.125, 2.25, 4.5])  # type: ignore[arg-type]
     assert [text.get_text() for text in axes.texts] == ["1  theirs", "2–3  mine", "2–3  ours"]
 
 
-@pytest.mark.parametrize("contract", WORDS)
-@pytest.mark.parametrize("monotone", WORDS)
-def test_of_two_verdicts_the_weaker_is_shown(contract: str, monotone: str) -> None:
-    found = Verified(16, (), contract, monotone)
-    assert found.text == min(contract, monotone, key=WORDS.index)
-    assert found.keeps_all == ("refuted" not in (contract, monotone))
-    assert not Verified(16, ("x",), contract, monotone).keeps_all
+def test_of_two_verdicts_the_weaker_is_shown() -> None:
+    for contract, monotone in itertools.product(WORDS, WORDS):
+        found = Verified(16, (), contract, monotone)
+        assert found.text == min(contract, monotone, key=WORDS.index)
+        assert found.keeps_all == ("refuted" not in (contract, monotone))
+        assert not Verified(16, ("x",), contract, monotone).keeps_all
 
 
 def _suite(*names: str, metric: str = "full_scene") -> ConditionSet:
@@ -221,33 +216,13 @@ def test_a_standing_has_the_mean_of_each_figure_over_the_conditions_that_were_fl
     assert [r.policy for r in rows] == ["a", "b"]
     assert rows[0].failed == ("third",)
     for row, scale, count in zip(rows, (0.75, 0.3), (2, 3), strict=True):
-        assert {name: e.mean for name, e in row.figures.items()} == {
-            name: pytest.approx(v * scale) for name, v in FIGURES.items()
-        }
+        means = {name: e.mean for name, e in row.figures.items()}
+        assert means == pytest.approx({name: v * scale for name, v in FIGURES.items()})
         assert {e.count for e in row.figures.values()} == {count}
         assert row.energy_j == pytest.approx(7500 * scale)
     assert rows[0].score.mean == pytest.approx(0.42 * 1.5 / 3)
     assert pair.difference.mean == pytest.approx(0.42 * (1.5 - 0.9) / 3)
     assert (pair.policy, pair.other) == ("a", "b")
-
-
-def test_a_difference_subtracts_the_surrogate_s_own_difference_too() -> None:
-    a, b = (
-        Scored(np.array([0.5, 0.7]), np.array([0.4, 0.6, 0.2])),
-        Scored(np.array([0.1, 0.4]), np.array([0.1, 0.1, 0.1])),
-    )
-    off = a.minus(b)
-    assert (off.ap.tolist(), off.surrogate.tolist()) == (pytest.approx([0.4, 0.3]), pytest.approx([0.3, 0.5, 0.1]))
-    assert [(p.policy, p.other) for p in differences({"x": a, "y": b, "z": a})] == [("x", "y"), ("x", "z"), ("y", "z")]
-
-
-def test_widths_are_compared_pair_by_pair() -> None:
-    def pairs(*reach: float) -> list[PairDifference]:
-        return [PairDifference("a", "b", Estimate(0.1, 0.1 - r, 0.1 + r, 9)) for r in reach]
-
-    assert rank._width(pairs(0.1, 0.3, 0.2), pairs(0.2, 0.3, 0.1)) == pytest.approx(1.0)
-    assert rank._width(pairs(0.1, 0.3), pairs(0.4, 0.0)) == pytest.approx(0.25)
-    assert rank._width([], []) == 1.0
 
 
 # --- what is kept ---------------------------------------------------------------------------------------------------
@@ -264,15 +239,20 @@ def test_flights_come_back_from_disk_figure_by_figure(tmp_path: Path) -> None:
     assert {name for name, value in again["k3"].values.items() if value is not None} == {"switches"}
 
 
-def test_stored_results_come_back_figure_by_figure_and_policy_by_policy(tmp_path: Path) -> None:
+def test_stored_results_come_back_figure_by_figure_and_those_of_another_suite_do_not(tmp_path: Path) -> None:
     found = ranking()
     results = made_now("small", "abc", found.flights, found.verified)
-    save_results(results, tmp_path)
+    path = save_results(results, tmp_path)
     back = read_results("folder/small.yaml", "abc", tmp_path)
     assert back == results
     assert back is not None
     assert back.flights["ours"]["rich"] == flight(error="boom")
     assert back.verified["ours"].monotone == "refuted"
+    assert read_results("small", "abd", tmp_path) is None
+    assert read_results("other", "abc", tmp_path) is None
+    path.write_text(path.read_text()[:-9])
+    with pytest.raises(RunError, match=r"small\.json: is damaged"):
+        read_results("small", "abc", tmp_path)
 
 
 def test_stored_results_are_compared_with_a_flight_of_the_reference_in_the_first_condition(

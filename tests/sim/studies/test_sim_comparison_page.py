@@ -36,14 +36,3 @@ def test_the_page_has_each_policy_in_the_table_and_in_every_figure(compared: sor
     assert all(f">{policy}</text>" in accuracy for policy in ("worked", "silence"))
     means = [s.outcome["ap50"]["full_scene"] for s in compared.sorties if s.policy == "silence"]
     assert f">{sum(means) / 2:.3g}</text>" in html.split("</figure>")[0]
-
-
-def test_a_policy_s_name_is_text(tmp_path: Path) -> None:
-    def sly(view: sortie.FleetView) -> list[sortie.Directive]:
-        return []
-
-    sly.__name__ = "<b>sly"
-    again = sortie.compare(example("duration_s=1", "fleet.drones=2"), [sly], seeds=1)
-    html = again.report(tmp_path / "sly.html").read_text("utf-8")
-    assert "<b>sly" not in html
-    assert "&lt;b&gt;sly" in html

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import json
-import sys
 from pathlib import Path
 
 import pytest
-from rich.console import Console
+from cli_examples import command
 from sim_examples import Seer
 
-from sortie.policies.catalogue.adaptive import read_model
 from sortie.policies.registry import POLICIES
 from sortie.scenarios.reading.load import ScenarioError, condition_sets, library, load, load_conditions
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli import conditions as commands
-from sortie.sim.cli.app import main
 from sortie.sim.folders import RunError
 from sortie.sim.studies.both_detectors import torch_answers
 from sortie.sim.studies.conditions import Cell, best_fixed, fly_all, scenario_of, summarise
@@ -42,40 +38,32 @@ def held_out(name: str) -> ConditionSet:
     return conditions
 
 
-@pytest.mark.parametrize("name", SETS)
-def test_the_held_out_conditions_load_under_every_policy_at_their_budget(name: str) -> None:
-    assert name in condition_sets()
-    assert name not in library()
-    conditions = held_out(name)
-    for condition in conditions.conditions:
-        for policy in POLICIES:
+def test_the_held_out_conditions_load_under_every_policy_at_their_budget_and_none_is_in_two_sets() -> None:
+    sets = {name: held_out(name) for name in SETS}
+    for name, conditions in sets.items():
+        assert name in condition_sets()
+        assert name not in library()
+        for condition, policy in itertools.product(conditions.conditions, POLICIES):
             scenario = scenario_of(conditions, condition, policy)
             assert set(scenario.policy.params.values()) <= {condition.budget}
-        assert (condition.metric == "mission") == (scenario.mission.phases[0].phase == "track")
-
-
-def test_no_held_out_condition_is_one_of_another_set() -> None:
-    for first, second in itertools.combinations([held_out(name).conditions for name in SETS], 2):
+            assert (condition.metric == "mission") == (scenario.mission.phases[0].phase == "track")
+    for first, second in itertools.combinations([each.conditions for each in sets.values()], 2):
         assert not {c.name for c in first} & {c.name for c in second}
         assert not {c.budget for c in first} & {c.budget for c in second}
 
 
-def test_an_unknown_field_of_a_condition_is_named(tmp_path: Path) -> None:
+def test_what_is_wrong_with_a_set_is_named(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
-    path.write_text(SMALL.replace("budget: 0.02", "budget: 2"))
-    with pytest.raises(ScenarioError, match=r"conditions\.0\.budget"):
-        load_conditions(path)
-    path.write_text(SMALL.replace("name: rich", "name: poor"))
-    with pytest.raises(ScenarioError, match="'poor', must be named once"):
-        load_conditions(path)
-
-
-def test_the_old_key_is_named_with_its_new_one(tmp_path: Path) -> None:
-    path = tmp_path / "c.yaml"
-    path.write_text(SMALL.replace("conditions:", "contexts:"))
-    for read in (load_conditions, load):
-        with pytest.raises(ScenarioError, match=r"c\.yaml:4: contexts: unknown key, it is now called conditions"):
-            read(path)
+    for old, new, words in (
+        ("budget: 0.02", "budget: 2", r"conditions\.0\.budget"),
+        ("name: rich", "name: poor", "'poor', must be named once"),
+        ("conditions:", "contexts:", r"c\.yaml:4: contexts: unknown key, it is now called conditions"),
+    ):
+        path.write_text(SMALL.replace(old, new))
+        with pytest.raises(ScenarioError, match=words):
+            load_conditions(path)
+    with pytest.raises(ScenarioError, match=r"c\.yaml:4: contexts: unknown key, it is now called conditions"):
+        load(path)
 
 
 def cell(policy: str, condition: str, ap: float) -> Cell:
@@ -92,11 +80,8 @@ def test_gains_are_over_the_best_fixed_policy_and_the_oracle_takes_the_best_of_e
     assert by_name["learned"].gain[1:] == pytest.approx((0.1, 0.1)), "the same gain in every condition"
     assert by_name["learned"].of_oracle == pytest.approx(1.2 / 1.0)
     assert by_name["best-2"].gain[1] < 0 < by_name["best-2"].gain[2]
-
-
-def test_gains_are_over_a_fixed_policy_also_where_another_is_as_good() -> None:
-    rows = summarise([cell(p, f"c{k}", a) for p in ("adaptive", "all-4") for k, a in enumerate((0.4, 0.2))])
-    assert best_fixed(rows) == "all-4"
+    alike = summarise([cell(p, f"c{k}", a) for p in ("adaptive", "all-4") for k, a in enumerate((0.4, 0.2))])
+    assert best_fixed(alike) == "all-4", "also where another is as good"
 
 
 def test_a_condition_without_a_car_counts_for_nothing() -> None:
@@ -122,27 +107,9 @@ def test_conditions_without_a_detector_are_refused_before_anything_flies(tmp_pat
     path.write_text(SMALL.replace("detector=surrogate", "detector=none"))
     conditions = load_conditions(path)
     assert conditions is not None
-    with pytest.raises(
-        RunError, match=r"condition poor: perception\.detector is none, conditions are compared by accuracy"
-    ):
+    told = r"condition poor: perception\.detector is none, conditions are compared by accuracy"
+    with pytest.raises(RunError, match=told):
         fly_all(conditions, ["all-4"], progress=lambda policy, k: pytest.fail("flown"))
-
-
-def test_compare_prints_every_policy_over_the_conditions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, out = tmp_path / "small.yaml", tmp_path / "out.json"
-    path.write_text(SMALL)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["sortie", "compare", str(path), "--policies", "all-4,boxes", "--out", str(out)])
-        patch.setenv("COLUMNS", "200")
-        with pytest.raises(SystemExit) as stop:
-            main()
-    assert not stop.value.code
-    printed = capsys.readouterr().out
-    assert "over all-4" in printed
-    kept = json.loads(out.read_text())
-    assert [r["policy"] for r in kept["summary"]] == ["all-4", "boxes"]
-    assert len(kept["cells"]) == 4
-    assert all(0 < c["ap"] < 1 and c["data_bytes"] > 0 for c in kept["cells"])
 
 
 def test_conditions_name_those_in_which_drones_left_the_air_and_take_policies_with_parameters(
@@ -150,18 +117,15 @@ def test_conditions_name_those_in_which_drones_left_the_air_and_take_policies_wi
 ) -> None:
     """A drone is lost half-way: of two drones' 2 s each, 3 s are flown."""
     path, out = tmp_path / "small.yaml", tmp_path / "out.json"
-    lost = "{name: lost, budget: 0.1, set: ['duration_s=2', 'fleet.drones=2', 'events=[{kind: drone_lost, at_s: 1, drone: 1}]']}"
+    event = "{kind: drone_lost, at_s: 1, drone: 1}"
+    lost = f"{{name: lost, budget: 0.1, set: ['duration_s=2', 'fleet.drones=2', 'events=[{event}]']}}"
     path.write_text(f"{SMALL.partition('  - {name: rich')[0]}  - {lost}\n")
     policies = "silence,best-2(received_budget=0.3)"
-    monkeypatch.setattr(sys, "argv", ["sortie", "compare", str(path), "--policies", policies, "--out", str(out)])
     monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert not stop.value.code
+    assert command("compare", path, "--policies", policies, "--out", out) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert (
-        "not all drones flew all the time in lost (75.0 % of drone-seconds flown): AP is of those that fly" in printed
-    )
+    told = "not all drones flew all the time in lost (75.0 % of drone-seconds flown): AP is of those that fly"
+    assert told in printed
     shares = {(c["policy"], c["condition"]): c["flown_share"] for c in json.loads(out.read_text())["cells"]}
     assert shares == pytest.approx({(p, c): s for p in policies.split(",") for c, s in (("poor", 1.0), ("lost", 0.75))})
 
@@ -174,11 +138,8 @@ def test_a_single_condition_has_no_interval(
     path.write_text(SMALL.partition("  - {name: rich")[0])
     cells = [cell(policy, "poor", ap) for policy, ap in (("all-4", 0.25), ("boxes", 0.375))]
     monkeypatch.setattr(commands, "fly_all", lambda *_, **__: cells)
-    monkeypatch.setattr(sys, "argv", ["sortie", "compare", str(path), "--policies", "all-4,boxes", "--out", str(out)])
     monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert not stop.value.code
+    assert command("compare", path, "--policies", "all-4,boxes", "--out", out) == 0
     printed = capsys.readouterr().out
     assert "+12.5" in printed
     assert "[" not in printed
@@ -199,25 +160,3 @@ def test_conditions_are_scored_by_torch_over_the_surrogates_traffic(
     assert [c.data_bytes for c in theirs] == [c.data_bytes for c in ours]
     assert all(c.ap > 0.9 for c in theirs)
     assert Seer.asked == 2 * 2 * 5 * 6  # policies, conditions, drones, moments
-
-
-def test_the_tables_fit_a_narrow_terminal() -> None:
-    """As many policies side by side as there is room for; no figure is cut off."""
-    conditions = held_out("conditions")
-    policies = list(POLICIES)
-    cells = [cell(p, c.name, 0.1 + 0.001 * k) for k, p in enumerate(policies) for c in conditions.conditions]
-    tables = list(commands._by_condition(conditions, policies, cells, 80))
-    assert [str(c.header) for t in tables for c in t.columns if c.header not in ("condition", "budget")] == policies
-    console = Console(width=80, record=True, file=io.StringIO())
-    for table in tables:
-        console.print(table)
-    printed = console.export_text()
-    assert "…" not in printed
-    assert len(tables) < len(policies) / 2, "several policies a table"
-
-
-def test_a_model_that_does_not_fit_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "model.json"
-    path.write_text(json.dumps({"mean": [0] * 5, "scale": [1] * 5, "weights": [[0] * 6] * 2}))
-    with pytest.raises(ValueError, match=r"must have 3 arms of 1 \+ 5 finite weights"):
-        read_model(path)

@@ -1,4 +1,4 @@
-"""One name is one experiment: `best-2` flown and `best-2` evaluated on the same frames give the same bytes and the same AP."""
+"""One name is one experiment: flown and evaluated on the same frames, `best-2` gives the same bytes and the same AP."""
 
 from __future__ import annotations
 
@@ -37,23 +37,18 @@ DELAY_S = 0.095
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A frame a second. Each frame stands for the half second before and after, so a payload is of the frame it is fused in."""
+    """A frame a second, each for the half second before and after: a payload is of the frame it is fused in."""
     return record_flight(
         example(*FLIGHT), tmp_path_factory.mktemp("recording") / "flight.npz", features=False, every=10
     )
 
 
 def flown(recording: Path, policy: str, params: str) -> SortieRecord:
-    return run_sortie(
-        example(
-            *FLIGHT, "perception.detector=recorded", f"perception.recording={recording}",
-            f"policy.name={policy}", f"policy.params={{{params}}}",
-        )
-    )  # fmt: skip
+    recorded = ("perception.detector=recorded", f"perception.recording={recording}")
+    return run_sortie(example(*FLIGHT, *recorded, f"policy.name={policy}", f"policy.params={{{params}}}"))
 
 
-@pytest.mark.parametrize("name", ["all-4", "best-2", "worst-2"])
-@pytest.mark.parametrize("budget", [0.0006, 0.02])
+@pytest.mark.parametrize(("name", "budget"), [("all-4", 0.02), ("best-2", 0.0006), ("worst-2", 0.02)])
 def test_flown_and_evaluated_sharing_agree(recording: Path, name: str, budget: float) -> None:
     record = flown(recording, name, f"received_budget: {budget}")
     condition = Sharing(budget, name)

@@ -40,25 +40,19 @@ def test_a_recording_is_shown_and_evaluated(tmp_path: Path) -> None:
     assert (tmp_path / "all.parquet").is_file()
 
 
-def test_wrong_questions_are_told(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["recording", "show", str(tmp_path / "none.npz")])
-    assert isinstance(done.exception, RecordingError)
-    assert "no such recording" in str(done.exception)
-    done = CliRunner().invoke(app, ["recording", "evaluate", str(small(tmp_path / "m.npz")), "--conditions", "most@2"])
-    assert "condition is 'most@2', must be like" in str(done.exception)
-
-
-@pytest.mark.parametrize("tau", ["0.001", "nan", "1.5"])
-def test_a_threshold_that_cannot_be_is_told_before_anything_is_evaluated(
-    tau: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_questions_are_told_before_anything_is_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    evaluate = ["recording", "evaluate", str(small(tmp_path / "m.npz"))]
     monkeypatch.setattr("sortie.perception.evaluation.evaluate_recording", lambda *_, **__: pytest.fail("evaluated"))
-    done = CliRunner().invoke(app, ["recording", "evaluate", str(small(tmp_path / "m.npz")), "--tau", tau])
-    assert str(done.exception) == f"tau is {tau}, must be 0.01 to 1"
+    for command, words in (
+        (["recording", "show", str(tmp_path / "none.npz")], "no such recording"),
+        ([*evaluate, "--conditions", "most@2"], "condition is 'most@2', must be like"),
+        *(([*evaluate, "--tau", tau], f"tau is {tau}, must be 0.01 to 1") for tau in ("0.001", "nan", "1.5")),
+    ):
+        assert words in str(CliRunner().invoke(app, command).exception)
 
 
 def test_sharing_gains_over_silence_on_a_recording(tmp_path: Path) -> None:
-    """The made model sees 45 m far, so that peers know cars that the ego does not; and the same flight twice is the same."""
+    """The made model sees 45 m far: peers know cars that the ego does not. The same flight twice is the same."""
     path = record_flight(example(*SHORT), tmp_path / "flight.npz", features=False)
     flight = (*SHORT, RECORDED, f"perception.recording={path}")
     sharing = example(*flight, "policy.name=all-4", "policy.params={received_budget: 0.05}")

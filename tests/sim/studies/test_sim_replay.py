@@ -13,8 +13,6 @@ from sim_examples import PATIENT
 import sortie
 from sortie.policies.catalogue.worked import worked
 from sortie.policies.contract import Directive, FleetView, Representation
-from sortie.policies.registry import POLICIES
-from sortie.sim.studies.replayed import NO_PEER
 
 pytestmark = pytest.mark.slow
 
@@ -28,13 +26,13 @@ def fly(**fields: object) -> sortie.Run:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> sortie.Run:
-    """In the drop drone 1 hears hardly a descriptor: patient links go on sending, so that its policy decides throughout."""
+    """In the drop drone 1 hears hardly a descriptor: patient links go on sending, and its policy decides throughout."""
     patient = dict(field.split("=") for field in PATIENT)
     flown = sortie.fly("track_target", {**SHORT, **DROP, **{field: float(n) for field, n in patient.items()}})
     return sortie.open_run(flown.save(tmp_path_factory.mktemp("replay") / "run", recording=False))
 
 
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("policy", ["worked", "best-2", "adaptive", "vantage", "deputies", "silence"])
 def test_the_policy_that_flew_decides_alike(policy: str, tmp_path: Path) -> None:
     flown = sortie.fly("track_target", {**SHORT, **DROP}, policy=policy)
     again = sortie.replay(sortie.open_run(flown.save(tmp_path / "run", recording=False)))
@@ -54,24 +52,6 @@ def test_each_policy_of_a_flight_decides_where_it_did() -> None:
     assert again.same
     assert again.policy.count("best-2") == 2
     assert "vantage" in again.policy
-
-
-def test_the_policies_of_makes_decide_again_for_their_drones() -> None:
-    """In a fleet that meets most of what membership and clocks have to offer."""
-    make = {"name": "other", "drones": [1, 3], "policy": "best-2", "policy_params": {"received_budget": 0.1}}
-    events = [
-        {"kind": "clock_skew", "at_s": 0.5, "drone": 3, "skew_s": 1.5},
-        {"kind": "drone_joins", "at_s": 1, "drone": 3},
-        {"kind": "drone_lost", "at_s": 1, "drone": 1},
-        {"kind": "drone_joins", "at_s": 2.05, "drone": 1},
-        {"kind": "drone_leaves", "at_s": 3, "drone": 1},
-    ]
-    shield = {"policy.invariants": "any_link(representation >= detections and rate_hz >= 2)", "policy.shield": True}
-    run = fly(**{"fleet.makes": [make], "events": events, **shield})
-    again = sortie.replay(run)
-    assert again.same
-    assert "best-2" in again.policy
-    assert not sortie.replay(run, "silence").same
 
 
 def counting() -> Callable[[FleetView], list[Directive]]:
@@ -107,9 +87,8 @@ def test_a_difference_says_where_in_what_and_why(run: sortie.Run) -> None:
     hasty.__qualname__ = "hasty[old]"
     again = sortie.replay(run, hasty)
     assert not again.same
-    assert {(d.drone, d.peer, d.fields, d.replayed_reason) for d in again.differences} == {
-        (1, 0, ("rate_hz",), "hasty")
-    }
+    found = {(d.drone, d.peer, d.fields, d.replayed_reason) for d in again.differences}
+    assert found == {(1, 0, ("rate_hz",), "hasty")}
     first = again.differences[0]
     assert 2.0 <= first.t_s < 2.1
     assert first.decision == 20
@@ -123,27 +102,9 @@ def test_a_difference_says_where_in_what_and_why(run: sortie.Run) -> None:
     assert "The recorded world does not answer" in text
 
 
-def test_other_reasons_alone_are_no_difference(run: sortie.Run) -> None:
-    def wordy(view: FleetView) -> list[Directive]:
-        return [d._replace(reason="because") for d in worked(view, rho=0.25)]
-
-    assert sortie.replay(run, wordy).same
-
-
 def test_a_missing_directive_is_one_that_sends_nothing() -> None:
     flown = sortie.fly("track_target", SHORT, policy="silence")
     assert sortie.replay(flown, lambda view: []).same
-
-
-def test_a_viewpoint_that_differs_is_a_difference() -> None:
-    looks = {"mission.target": {"waypoints_m": [[-60, 60], [200, 60]]}, "fleet.formation.spacing_m": 14}
-    phases = [{"at_s": 0, "phase": "track", "region": {"radius_m": 32}}]
-    flown = sortie.fly("track_target", {**SHORT, **looks, "mission.phases": phases}, policy="vantage")
-    asked = [d for d in sortie.replay(flown, "vantage(received_budget=0.02)").differences if d.peer == NO_PEER]
-    assert not asked
-    moved = [d for d in sortie.replay(flown, "worked").differences if d.peer == NO_PEER]
-    assert moved
-    assert {(d.fields, d.replayed) for d in moved} == {(("viewpoint",), "its slot")}
 
 
 def test_the_command_is_a_test_for_ci(run: sortie.Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -170,6 +131,6 @@ def test_what_cannot_be_replayed_is_refused_in_one_line(
     with pytest.raises(sortie.RunError, match="counts' decided in flight, a function"):
         sortie.replay(by_function)
     with pytest.raises(sortie.PolicyError, match=r"at 1\.\d+ s: .*on drone \d raises ZeroDivisionError"):
-        sortie.replay(run, lambda view: [Directive(view.ego, 1 // (view.me.stamp_ns < 1e9), reason="x")] * 0)  # type: ignore[union-attr]
+        sortie.replay(run, lambda view: [Directive(view.ego, 1 // (view.me.stamp_ns < 1e9), reason="x")] * 0)
     with pytest.raises(sortie.RunError, match="must be a Run"):
         sortie.replay("runs/x")  # type: ignore[arg-type]
