@@ -7,7 +7,6 @@ import logging
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel
 from typer.testing import CliRunner
 
 import sortie
@@ -35,32 +34,28 @@ def say(*arguments: str) -> tuple[int, str]:
     return said.exit_code, str(said.exception) if isinstance(said.exception, SortieError) else said.output
 
 
-def test_a_new_scenario_keeps_its_own_expectations(here: Path) -> None:
-    code, _ = say("new", "mine")
-    assert code == 0
+def test_a_new_scenario_keeps_its_own_expectations_and_has_its_schema_beside_it(here: Path) -> None:
+    """A schema of an older version is replaced."""
+    assert say("new", "mine")[0] == 0
     assert load("mine.yaml").name == "mine"
     (checked,) = sortie.check("mine.yaml")
     assert (len(checked.verdicts), checked.failed) == (2, [])
+    assert (here / "mine.yaml").read_text().splitlines()[0].endswith("$schema=sortie.schema.json")
+    schema = here / "sortie.schema.json"
+    newest = json.loads(schema.read_text("utf-8"))
+    assert newest["title"] == "Scenario"
+    schema.write_text(json.dumps({**newest, "properties": {"fleet": newest["properties"]["fleet"]}}))
+    assert say("new", "another")[0] == 0
+    assert json.loads(schema.read_text("utf-8")) == newest
 
 
-def test_the_schema_beside_it_is_the_one_its_first_line_names(here: Path) -> None:
-    say("new", "mine")
-    first = (here / "mine.yaml").read_text().splitlines()[0]
-    assert first.endswith("$schema=sortie.schema.json")
-    assert json.loads((here / "sortie.schema.json").read_text())["title"] == "Scenario"
-
-
-def test_a_file_that_is_there_stays(here: Path) -> None:
+def test_a_file_that_is_there_stays_and_a_name_that_no_scenario_may_have_is_refused(here: Path) -> None:
     (here / "mine.yaml").write_text("name: older\n")
     assert say("new", "mine")[1] == "mine.yaml: is there already, choose another name or delete it"
     assert (here / "mine.yaml").read_text() == "name: older\n"
-
-
-def test_a_name_that_no_scenario_may_have(here: Path) -> None:
-    assert say("new", "My Flight")[1] == (
-        "'My Flight': no name of a scenario, must be 1 to 64 small letters, digits and _"
-    )
-    assert list(here.iterdir()) == []
+    must = "no name of a scenario, must be 1 to 64 small letters, digits and _"
+    assert say("new", "My Flight")[1] == f"'My Flight': {must}"
+    assert [p.name for p in here.iterdir()] == ["mine.yaml"]
 
 
 def test_everything_that_is_wrong_is_said_at_once(here: Path) -> None:
@@ -81,7 +76,8 @@ def test_everything_that_is_wrong_is_said_at_once(here: Path) -> None:
 def test_what_a_file_names_and_is_not_there_is_said(here: Path) -> None:
     (here / "own.py").write_text("def loss(d, a, b, ghz, *, db=1.0):\n    return d\n")
     (here / "s.yaml").write_text(
-        "name: s\nradio: {path_loss: own.py:loss, path_loss_params: {decibel: 3}, link: own.py:Link, trace: links.csv}\n"
+        "name: s\nradio: {path_loss: own.py:loss, path_loss_params: {decibel: 3}, link: own.py:Link, trace: links.csv}"
+        "\n"
         "perception: {detector: gone.py:D}\nfleet: {airframe: {power_model: momentum}}\n"
         "policy: {name: own.py:loss, params: {db: 2}}\nmetrics: {m: {model: own.py:loss, params: {x: 1}}}\n"
     )
@@ -104,9 +100,8 @@ def test_every_file_of_the_library_is_read() -> None:
 
 
 def test_a_campaign_and_a_set_of_conditions_are_read_as_what_they_are(here: Path) -> None:
-    (here / "c.yaml").write_text(
-        "campaign: c\nbase: track_target\nmetrics: [bytes.data_sent]\nvary: {radio.tx_power: {kind: uniform, low: 0, high: 1}}\n"
-    )
+    vary = "vary: {radio.tx_power: {kind: uniform, low: 0, high: 1}}"
+    (here / "c.yaml").write_text(f"campaign: c\nbase: track_target\nmetrics: [bytes.data_sent]\n{vary}\n")
     (here / "s.yaml").write_text("conditions: []\n")
     code, text = say("check", "--syntax", "c.yaml", "s.yaml")
     assert code == 1
@@ -120,39 +115,23 @@ def test_the_first_issue_alone_is_the_error_of_a_flight() -> None:
     assert len(caught.value.issues) == 4
 
 
-def test_what_the_file_does_after_a_shorter_end_is_left_out_with_a_line(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_happens_after_the_end_is_left_out_with_a_line_or_is_an_error_where_it_was_meant(
+    here: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     whole = load("paper_replay")
     with caplog.at_level(logging.WARNING, "sortie"):
         short = load("paper_replay", {"duration_s": 5})
     assert len(whole.events) > len(short.events) == sum(event.at_s < 5 for event in whole.events)
-    left = len(whole.events) - len(short.events)
-    assert (
-        f"events: {left} of {len(whole.events)} begin at duration_s = 5 or later, and are left out" in caplog.messages
-    )
-
-
-def test_an_event_that_the_same_override_sets_after_the_end_is_an_error() -> None:
+    left = f"{len(whole.events) - len(short.events)} of {len(whole.events)}"
+    assert f"events: {left} begin at duration_s = 5 or later, and are left out" in caplog.messages
     late = "events=[{kind: jam, at_s: 9, position_m: [0, 0, 0]}]"
-    with pytest.raises(ScenarioError, match=r"events.0.at_s: 9, must be below duration_s = 5"):
-        load("paper_replay", ["duration_s=5", late])
-
-
-def test_a_file_with_an_event_after_its_own_end_is_an_error(here: Path) -> None:
     (here / "a.yaml").write_text("name: a\nduration_s: 5\nevents: [{kind: drone_lost, at_s: 9, drone: 1}]\n")
-    with pytest.raises(ScenarioError, match=r"events.0.at_s: 9, must be below duration_s = 5"):
-        load("a.yaml")
+    for name, sets in (("paper_replay", ["duration_s=5", late]), ("a.yaml", [])):
+        with pytest.raises(ScenarioError, match=r"events.0.at_s: 9, must be below duration_s = 5"):
+            load(name, sets)
 
 
-@pytest.mark.parametrize(("what", "model"), SCHEMAS.items())
-def test_there_is_a_schema_for_each_kind_of_file(what: str, model: type[BaseModel]) -> None:
-    code, text = say("list", what)
-    assert (code, json.loads(text)["title"]) == (0, model.__name__)
-
-
-def test_a_note_is_printed_once_however_many_policies_fly(caplog: pytest.LogCaptureFixture) -> None:
-    """The next command prints it again."""
-    flights = ["compare", "paper_replay", "--policies", "boxes,silence", "--seeds", "1", "--set", "duration_s=1"]
-    for times in (1, 2):
-        done = CliRunner().invoke(app, [*flights, "--set", "perception.detector=none"])
-        assert done.exit_code == 0, done.output
-        assert sum("are left out" in text for text in caplog.messages) == times
+def test_there_is_a_schema_for_each_kind_of_file() -> None:
+    for what, model in SCHEMAS.items():
+        code, text = say("list", what)
+        assert (code, json.loads(text)["title"]) == (0, model.__name__)
