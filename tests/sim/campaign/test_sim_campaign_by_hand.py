@@ -108,14 +108,6 @@ def test_the_report_s_tables_have_each_policy_s_means_in_its_column(tmp_path: Pa
     assert f"- {SPACING} 40" not in text
 
 
-def test_a_policy_that_another_beats_in_cost_and_accuracy_is_not_on_the_front(tmp_path: Path) -> None:
-    flown = rows(tmp_path)
-    sent = flown.table.schema.get_field_index("bytes.data_sent")
-    less = flown.table.set_column(sent, "bytes.data_sent", pa.array(9000.0 - flown.values("bytes.data_sent")))
-    text = told(CampaignRows(flown.plan, less, flown.unit, flown.policy), tmp_path)
-    assert "- ap50.mission against bytes.data_sent: no policy is better in both than silence\n" in text
-
-
 def test_failed_runs_are_counted_listed_and_taken_out_with_their_replication(tmp_path: Path) -> None:
     """Run 4 is `worked` in the second replication: what is left are 1300 and 1500 B, and 2300 and 2700 B."""
     flown = rows(tmp_path, {4: "ValueError: planted"})

@@ -125,26 +125,16 @@ def test_the_last_attempt_of_a_run_that_kills_its_process_is_alone(monkeypatch: 
     assert asked == [False, False, False, True]
 
 
-def test_rows_that_came_are_kept_when_another_run_cannot_fly(tmp_path: Path) -> None:
-    """A worker with other code raises; what the others flew comes first."""
-    p = plan(tmp_path)
-    with open_engine(1) as engine:
-        rows = engine.results(p.code, iter([(3, p.task(3))]))
-        assert [row.run for row in next(rows)] == [3]
-        assert list(rows) == []
-        assert isinstance(engine, Processes)
-        engine._landed.put(RunError("planted"))
-        engine._landed.put(fly_batch(p.code, [(4, p.task(4))])[0][0])
-        late = engine.results(p.code, iter([(5, p.task(5)), (6, p.task(6))]))
-        assert [row.run for row in next(late)] == [4]
-        with pytest.raises(RunError, match="planted"):
-            next(late)
-
-
-def test_a_worker_with_other_code_flies_nothing(tmp_path: Path) -> None:
+def test_a_worker_with_other_code_or_another_torch_flies_nothing(tmp_path: Path) -> None:
     p = plan(tmp_path)
     with pytest.raises(RunError, match=rf"this worker runs Sortie {RELEASE}\+[0-9a-f]+, the campaign is of other"):
         run_campaign(CampaignPlan({**p.spec, "code": "other"}), tmp_path / "a", InProcess())
+    torch = plan(tmp_path, base=BASE.replace("detector: none", "detector: torch")).code
+    assert torch == codes_here()[1] != plan(tmp_path).code
+    assert fly_batch(torch, [])[0] == fly_batch(plan(tmp_path).code, [])[0] == []
+    other = f"{codes_here()[0]} torch 1.0"
+    with pytest.raises(RunError, match=r"this worker runs Sortie \S+ torch \S+, the campaign is of \S+ torch 1\.0"):
+        fly_batch(other, [])
 
 
 def test_a_worker_that_sees_another_policy_file_flies_nothing(tmp_path: Path) -> None:
@@ -157,15 +147,6 @@ def test_a_worker_that_sees_another_policy_file_flies_nothing(tmp_path: Path) ->
         policy.write_text(FAULTY.format(what="pass # edited"))
         with pytest.raises(RunError, match=r"mine.py: is not the file that the campaign was begun with"):
             fly_batch(p.code, [(2, p.task(2))])
-
-
-def test_a_worker_flies_with_its_own_torch_alone(tmp_path: Path) -> None:
-    torch = plan(tmp_path, base=BASE.replace("detector: none", "detector: torch")).code
-    assert torch == codes_here()[1] != plan(tmp_path).code
-    assert fly_batch(torch, [])[0] == fly_batch(plan(tmp_path).code, [])[0] == []
-    other = f"{codes_here()[0]} torch 1.0"
-    with pytest.raises(RunError, match=r"this worker runs Sortie \S+ torch \S+, the campaign is of \S+ torch 1\.0"):
-        fly_batch(other, [])
 
 
 def test_a_failing_run_is_recorded_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -243,12 +243,6 @@ def test_one_draw_gives_no_interval(tmp_path: Path) -> None:
     assert "One draw gives no interval: ask for more, by `sample.count`." in told
 
 
-def test_figures_of_an_interval_share_their_prefix() -> None:
-    assert prefixed(2317.0, 962.4, 3672.0) == ["2.317 k", "0.9624 k", "3.672 k"]
-    assert prefixed(0.00149, 0.00078, 0.007) == ["0.00149", "0.00078", "0.007"]
-    assert prefixed(math.nan, 12.0) == ["–", "12"]
-
-
 def test_a_folder_without_finished_parts_has_no_report(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run_campaign(plan(tmp_path), tmp_path / "a", Pretended(stop_after=3))
@@ -269,7 +263,10 @@ def test_a_metric_of_ones_own_has_a_table_by_varied_field_and_models_have_short_
     assert "| radio.path_loss | rain.py:model(db=3) |" in told
 
 
-def test_names_that_would_be_alike_stay_long() -> None:
+def test_names_that_would_be_alike_stay_long_and_figures_of_an_interval_share_their_prefix() -> None:
     alike = ["/a/rain.py:Rain", "/b/rain.py:Rain"]
     assert short_names(alike) == {name: name for name in alike}
     assert short_names([*alike[:1], "level"]) == {"/a/rain.py:Rain": "rain.py:Rain", "level": "level"}
+    assert prefixed(2317.0, 962.4, 3672.0) == ["2.317 k", "0.9624 k", "3.672 k"]
+    assert prefixed(0.00149, 0.00078, 0.007) == ["0.00149", "0.00078", "0.007"]
+    assert prefixed(math.nan, 12.0) == ["–", "12"]

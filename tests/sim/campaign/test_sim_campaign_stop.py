@@ -70,10 +70,13 @@ def test_a_unit_counts_once_it_is_whole() -> None:
     assert not stop(12, half_width=1.0, at_least=4).enough(table(WIDE))
 
 
-def test_a_policy_that_lacks_values_has_fewer_units() -> None:
+def test_a_policy_that_lacks_values_has_fewer_units_and_every_policy_must_be_known() -> None:
     lacking: Values = [WIDE[0], [[0.5, 0.5], [None, None], [0.51, None]]]
     assert not stop(12, half_width=1.0).enough(table(lacking))
     assert stop(12, half_width=1.0, at_least=2).enough(table(lacking))
+    three: Values = [[[0.4], [0.6], [0.8]], [[0.5], [0.7], [0.91]], [[0.1], [0.6], [0.9]]]
+    assert not stop(9, 3, half_width=0.1, difference=True).enough(table(three))
+    assert stop(6, 2, half_width=0.1, difference=True).enough(table(three[:2]))
 
 
 def test_differences_are_of_one_unit_and_of_the_scenes_that_both_policies_have() -> None:
@@ -86,12 +89,6 @@ def test_differences_are_of_one_unit_and_of_the_scenes_that_both_policies_have()
         assert stop(runs, half_width=wanted * 1.0001, difference=True).enough(table(values))
         assert not stop(runs, half_width=wanted * 0.9999, difference=True).enough(table(values))
     assert not stop(6, half_width=wanted * 1.0001).enough(table(below))
-
-
-def test_of_three_policies_every_difference_is_narrow_enough() -> None:
-    three: Values = [[[0.4], [0.6], [0.8]], [[0.5], [0.7], [0.91]], [[0.1], [0.6], [0.9]]]
-    assert not stop(9, 3, half_width=0.1, difference=True).enough(table(three))
-    assert stop(6, 2, half_width=0.1, difference=True).enough(table(three[:2]))
 
 
 def test_values_that_are_all_equal_end_a_campaign_from_thirty_units_on() -> None:

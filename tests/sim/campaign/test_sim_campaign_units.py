@@ -187,10 +187,3 @@ def test_a_part_of_a_field_holds_its_lower_end_and_stands_at_the_mean_of_its_val
     assert [label for label, _, _ in parts] == ["0 … 2", "2 … 4", "4 … 6", "6 … 9"]
     assert [np.array(column)[mask].tolist() for _, _, mask in parts] == [[0, 1], [2, 3], [4, 5], [6, 8, 9]]
     assert [place for _, place, _ in parts] == pytest.approx([0.5, 2.5, 4.5, 23 / 3])
-
-
-def test_a_grid_of_large_numbers_keeps_its_labels(tmp_path: Path) -> None:
-    seeds = "perception.scene.seed: {kind: grid, values: [12341, 12342]}"
-    text = CAMPAIGN.replace("fleet.formation.spacing_m: {kind: grid, values: [20, 40]}", seeds)
-    rows = rows_of(tmp_path, text, lambda fields, policy: policy)
-    assert [label for label, _, _ in rows.bins("perception.scene.seed")] == ["12341", "12342"]

@@ -132,16 +132,13 @@ def test_a_rule_found_on_every_second_unit_is_judged_on_the_others() -> None:
     assert found.gain == mean_interval(gains, possible(AP).of_differences())
 
 
-def test_a_threshold_leaves_an_eighth_on_either_side() -> None:
+def test_a_threshold_leaves_an_eighth_on_either_side_and_who_has_no_value_is_never_first() -> None:
     """Of 32 cells b is better in the first two, or in the last four alone."""
     x = {"x": np.arange(32.0)}
     low = np.column_stack([np.zeros(32), np.where(np.arange(32) < 2, 10.0, -1.0)])
     high = np.column_stack([np.zeros(32), np.where(np.arange(32) >= 28, 1.0, -1.0)])
     assert _best(x, low) == ("x", 3.5, 1, 0)
     assert _best(x, high) == ("x", 27.5, 0, 1)
-
-
-def test_the_first_is_by_the_mean_and_a_policy_without_values_is_never_first() -> None:
     assert _first(np.array([[1.0, 2.5, NAN], [1.0, 0.0, NAN]])) == 1
     assert _first(np.array([[-1.0, NAN], [-2.0, NAN]])) == 0
 

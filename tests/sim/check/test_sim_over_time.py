@@ -107,32 +107,32 @@ def test_a_flight_of_a_course_enforces_what_the_loop_enforces(policy: str, shiel
     assert after in (0, 1), "after the course, the flight has one more decision, at which a break may end"
 
 
-@pytest.mark.parametrize(
-    ("name", "line", "outcome"),
-    [
-        ("silent_when_tired", "when peers >= 1: within 1.5 s: any_link(rate_hz > 0)", "refuted"),
-        ("two_rates", "when peers >= 1: within 1.5 s: any_link(rate_hz > 0)", "proved"),
-        ("two_rates", "within 0.5 s: rate_hz > 0", "refuted"),  # the dwell time after take-off
-        ("two_rates", "climbs_in(dwell) <= 1", "proved"),
-        ("flips", "climbs_in(4) <= 1", "refuted"),
-        ("by_charge", "climbs_in(dwell) <= 1", "tried"),
-        ("own_region", "climbs_in(dwell) <= 1", "proved"),
-        ("one_of_two_regions", "switches_in(0.5) <= 2", "refuted"),
-    ],
-)
-def test_the_verdict_of_a_line_about_time(name: str, line: str, outcome: str, file: Path) -> None:
-    reference = f"{file}:{name}"
-    subject = Subject(resolve(reference), reference, {})
+VERDICTS = [
+    ("silent_when_tired", "when peers >= 1: within 1.5 s: any_link(rate_hz > 0)", "refuted"),
+    ("two_rates", "when peers >= 1: within 1.5 s: any_link(rate_hz > 0)", "proved"),
+    ("two_rates", "within 0.5 s: rate_hz > 0", "refuted"),  # the dwell time after take-off
+    ("two_rates", "climbs_in(dwell) <= 1", "proved"),
+    ("flips", "climbs_in(4) <= 1", "refuted"),
+    ("by_charge", "climbs_in(dwell) <= 1", "tried"),
+    ("own_region", "climbs_in(dwell) <= 1", "proved"),
+    ("one_of_two_regions", "switches_in(0.5) <= 2", "refuted"),
+]
+
+
+def test_the_verdict_of_a_line_about_time(file: Path) -> None:
     base = loads("name: base", overrides=["policy.dwell_s=1.0"])
-    (verdict,) = judge_over_time(subject, parse(line), drones=2, scenario=base, courses=150)
-    assert verdict.outcome == outcome, verdict.what
-    if outcome == "refuted":
-        assert verdict.scenario is not None
-        assert run_sortie(verdict.scenario).totals["invariant_violations"] > 0
-        assert "of a course: →1 " in verdict.what
-    else:
-        assert "150 courses of up to 2 drones keep it, at a dwell time of 1 s" in verdict.what
-        assert ("all sequences of views of up to 2 drones" in verdict.what) == (outcome == "proved")
+    for name, line, outcome in VERDICTS:
+        reference = f"{file}:{name}"
+        subject = Subject(resolve(reference), reference, {})
+        (verdict,) = judge_over_time(subject, parse(line), drones=2, scenario=base, courses=150)
+        assert verdict.outcome == outcome, (name, line, verdict.what)
+        if outcome == "refuted":
+            assert verdict.scenario is not None
+            assert run_sortie(verdict.scenario).totals["invariant_violations"] > 0
+            assert "of a course: →1 " in verdict.what
+        else:
+            assert "150 courses of up to 2 drones keep it, at a dwell time of 1 s" in verdict.what
+            assert ("all sequences of views of up to 2 drones" in verdict.what) == (outcome == "proved")
 
 
 A_BREAK = "a sequence of views breaks it"
@@ -225,21 +225,20 @@ def decide(view):
 """
 
 
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [("LookupError('gone')", "raises LookupError: gone"), ("SystemExit(3)", "exit code 3, must return")],
-)
-def test_a_policy_that_fails_in_a_course_is_refuted_by_a_flight_of_it(error: str, said: str, tmp_path: Path) -> None:
-    path = tmp_path / "mine.py"
-    path.write_text(RAISES.format(limit=0.3137, error=error))
-    subject = Subject(resolve(f"{path}:decide"), f"{path}:decide", {})
-    (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=2)
-    assert verdict.outcome == "refuted", verdict.what
-    assert verdict.what.startswith("the policy fails after ")
-    assert said in verdict.what
-    assert verdict.scenario is not None
-    with pytest.raises(PolicyError, match=re.escape(said)):
-        run_sortie(verdict.scenario)
+def test_a_policy_that_fails_in_a_course_is_refuted_by_a_flight_of_it(tmp_path: Path) -> None:
+    for number, (error, said) in enumerate(
+        (("LookupError('gone')", "raises LookupError: gone"), ("SystemExit(3)", "exit code 3, must return"))
+    ):
+        path = tmp_path / f"mine{number}.py"
+        path.write_text(RAISES.format(limit=0.3137, error=error))
+        subject = Subject(resolve(f"{path}:decide"), f"{path}:decide", {})
+        (verdict,) = judge_over_time(subject, parse("climbs_in(dwell) <= 1"), drones=2)
+        assert verdict.outcome == "refuted", verdict.what
+        assert verdict.what.startswith("the policy fails after ")
+        assert said in verdict.what
+        assert verdict.scenario is not None
+        with pytest.raises(PolicyError, match=re.escape(said)):
+            run_sortie(verdict.scenario)
 
 
 def test_an_error_of_the_contract_keeps_its_text_in_the_loop() -> None:

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from sortie.sim.check.checking import check_scenario
 from sortie.sim.check.discovery import is_scenario
 from sortie.sim.check.expectations import Verdict
-from sortie.sim.check.golden import differences, golden_path, with_relative_files, write_golden
+from sortie.sim.check.golden import differences, golden_path, write_golden
 from sortie.sim.check.junit import Suite, junit
 from sortie.sim.check.once import Flown, flown_once
 from sortie.sim.cli.app import app
@@ -93,27 +93,6 @@ def test_a_golden_outcome_holds_wherever_the_project_lies(tmp_path: Path, monkey
         (golden,) = check_scenario(path).verdicts
         assert golden.got == "the same"
     assert str(tmp_path) not in golden_path(first / "own.yaml").read_text()
-
-
-def test_a_file_whose_name_begins_with_another_file_s_name_is_renamed_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    for name in ("a.py", "a.py.txt"):
-        Path(name).touch()
-    given = {"own_files": {"a.py": "1", "a.py.txt": "2"}, "policy": "a.py:decide", "n": 3}
-    assert with_relative_files(tmp_path, given, ["a.py", "a.py.txt", "not_there.py"]) == {
-        "own_files": {"here/a.py": "1", "here/a.py.txt": "2"},
-        "policy": "here/a.py:decide",
-        "n": 3,
-    }
-    Path("b").mkdir()
-    Path("c.py").touch()
-    assert with_relative_files(tmp_path, {"x": "b", "y": "b/../c.py"}, ["b", "b/../c.py"]) == {
-        "x": "here/b",
-        "y": "here/c.py",
-    }
 
 
 def test_golden_tolerances_are_the_files_own_and_stay(tmp_path: Path) -> None:

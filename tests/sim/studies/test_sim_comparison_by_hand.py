@@ -177,9 +177,6 @@ def test_a_count_that_one_sortie_lacks_is_zero_in_the_table_and_a_figure_is_null
     table = Comparison(both.sorties, both.gains).table
     assert table["payload_fates.lost/retries"].to_pylist() == [1, 0]
     assert table["ap50.mission"].to_pylist() == [pytest.approx(0.502), None]
-
-
-def test_a_count_that_a_run_lacks_is_zero_among_its_metrics() -> None:
     metrics = Metrics({"battery.0": 1.0, "payload_fates.delivered": 3})
     assert metrics["payload_fates.lost/no_link"] == metrics["distrusted_by.0"] == 0
     with pytest.raises(UnknownMetricError):
