@@ -10,10 +10,12 @@ from sim_examples import example
 from typer.testing import CliRunner
 
 from sortie.policies.staleness import LinkHealth
+from sortie.scenarios.schema import Scenario
 from sortie.sim.cli.app import app
 from sortie.sim.folders import RunError
 from sortie.sim.live import session
 from sortie.sim.live.bench import FleetReports
+from sortie.sim.live.context import Trace, traces
 from sortie.sim.live.reports import Report
 from sortie.sim.live.result import LiveResult
 from sortie.sim.live.session import fly_live
@@ -86,3 +88,8 @@ def refusal_of(*arguments: str) -> str:
     error = CliRunner().invoke(app, ["live", *arguments]).exception
     assert isinstance(error, RunError)
     return str(error)
+
+
+def short_traces(scenario: Scenario) -> list[Trace]:
+    """Of the first two minutes, in place of `traces`: the scenario is long so that no busy host flies to its end."""
+    return list(traces(scenario.model_copy(update={"duration_s": 120.0})))

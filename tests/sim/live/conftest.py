@@ -18,7 +18,10 @@ def _busy_machine() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         for module, name in (
-            (session, "CONNECT_S"), (session, "LAST_REPORT_S"), (session, "EXIT_S"), (watchdog, "LOAD_S"),
-        ):  # fmt: skip
+            (session, "CONNECT_S"),
+            (session, "LAST_REPORT_S"),
+            (session, "EXIT_S"),
+            (watchdog, "LOAD_S"),
+        ):
             patch.setattr(module, name, 600.0)
         yield

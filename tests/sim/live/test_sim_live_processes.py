@@ -7,6 +7,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from memory_bus import MemoryBus
@@ -77,20 +78,19 @@ def test_a_process_that_begins_within_a_frame_begins_with_it(fly: Callable[..., 
     assert result["begin_s"] == pytest.approx(0.3)
 
 
-@pytest.mark.parametrize(
-    ("raised", "kind"),
-    [(RunError("no vehicle"), RunError), (PolicyError("no policy"), PolicyError), (OSError("no port"), RunError)],
-)
 def test_what_stops_a_process_is_raised_by_the_flight_as_what_it_is(
-    monkeypatch: pytest.MonkeyPatch, fly: Callable[..., dict[str, Any]], raised: Exception, kind: type[Exception]
+    monkeypatch: pytest.MonkeyPatch, fly: Callable[..., dict[str, Any]]
 ) -> None:
-    def fails(*_: object, **__: object) -> None:
-        raise raised
-
-    monkeypatch.setattr(drone, "Watchdog", fails)
     monkeypatch.setattr(drone.signal, "signal", lambda *_: None)
-    ours, its = multiprocessing.Pipe()
-    drone.fly_one(SimpleNamespace(scenario=example(), drone=0, fallback=None, decide_within_s=None), its)  # type: ignore[arg-type]
-    with pytest.raises(kind, match=f"^{raised}$") as found:
-        fly([ours.recv()], [Ready(1)])
-    assert found.type is kind
+    for raised, kind in (
+        (RunError("no vehicle"), RunError),
+        (PolicyError("no policy"), PolicyError),
+        (OSError("no port"), RunError),
+    ):
+        monkeypatch.setattr(drone, "Watchdog", Mock(side_effect=raised))
+        ours, its = multiprocessing.Pipe()
+        orders: Any = SimpleNamespace(scenario=example(), drone=0, fallback=None, decide_within_s=None)
+        drone.fly_one(orders, its)
+        with pytest.raises(kind, match=f"^{raised}$") as found:
+            fly([ours.recv()], [Ready(1)])
+        assert found.type is kind
