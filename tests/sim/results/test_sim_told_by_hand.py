@@ -1,7 +1,7 @@
 """What is printed and drawn of one sortie, every figure in its own place.
 
-The outcome has another number in each place, so that a figure that is printed under another's name is found. Figures over
-time are those of the record of a few rows.
+The outcome has another number in each place, so that a figure that is printed under another's name is found. Figures
+over time are those of the record of a few rows.
 """
 
 from __future__ import annotations
@@ -59,51 +59,47 @@ def test_the_summary_has_every_figure_under_its_own_name() -> None:
     }
 
 
-def test_metrics_of_one_s_own_are_in_the_summary_and_on_the_page() -> None:
-    made = told_outcome() | {"metrics": {"first_s": 1.25, "none": None}}
-    shown = dict(cells(summary.outcome_table(made)))
+def test_rows_without_anything_to_say_are_left_out_and_custom_metrics_are_added() -> None:
+    own = told_outcome() | {"metrics": {"first_s": 1.25, "none": None}}
+    shown = dict(cells(summary.outcome_table(own)))
     assert (shown["metrics.first_s"], shown["metrics.none"]) == ("1.25", "–")
-    assert report._tiles(made)[-2:] == [
-        ("metrics.first_s", "1.25", "a metric of your own"), ("metrics.none", "–", "a metric of your own"),
-    ]  # fmt: skip
-
-
-def test_rows_without_anything_to_say_are_left_out() -> None:
+    tiles = [("metrics.first_s", "1.25", "a metric of your own"), ("metrics.none", "–", "a metric of your own")]
+    assert report._tiles(own)[-2:] == tiles
     made = told_outcome() | {"descriptor_drops": {}, "own_files": {}}
-    made["mission"] |= {"flown_share": 1.0, "region_observed_share": None, "target_detected_share": None}
-    made["mission"]["target_in_view_share"] = None
-    made["people"]["located_share"] = None
-    made["disagreement"]["share"] = None
+    nothing = dict.fromkeys(("region_observed_share", "target_detected_share", "target_in_view_share"))
+    made["mission"] |= {"flown_share": 1.0, **nothing}
+    made["people"]["located_share"] = made["disagreement"]["share"] = None
     made["ap50"]["detector"] = "none"
-    names = [name for name, _ in cells(summary.outcome_table(made))]
-    assert names == [
-        "context plane", "descriptors lost", "data plane", "deadlines", "energy", "charge left", "switches", "decision",
-        "wall time", "fingerprint",
-    ]  # fmt: skip
+    left = "context plane, descriptors lost, data plane, deadlines, energy, charge left, switches, decision, wall time"
+    assert [name for name, _ in cells(summary.outcome_table(made))] == [*left.split(", "), "fingerprint"]
+
+
+def test_a_large_fleet_and_a_slow_flight_are_shown_as_such() -> None:
+    made = told_outcome() | {"wall_s": 73.0, "realtime_factor": 0.0274}
+    drone = made["drones"]["0"]
+    made["drones"] = {str(i): drone | {"soc": 0.5 + i / 100, "airborne": i != 3} for i in range(25)}
+    made["drones"]["7"] |= {"soc": 0.2}
+    shown = dict(cells(summary.outcome_table(made)))
+    assert shown["charge left"] == "lowest 20.0 % (drone 7), median 62.0 %; 1 of 25 drones down"
+    assert shown["wall time"] == "73.00 s, 0.027 × real time"
+
+
+def change(t_s: float, drone: int, reason: str = "r", to: str = "features", peers: Any = None) -> dict[str, Any]:
+    peers = peers or [drone + 1, drone + 2]
+    return {"t_s": t_s, "drone": drone, "from": "nothing", "to": to, "reason": reason, "peers": peers}
+
+
+def transitions(changes: list[dict[str, Any]], events: list[dict[str, Any]] | None = None) -> Table:
+    return summary.transitions_table(told_outcome() | {"frame_s": 0.1, "transitions": changes, "events": events or []})
 
 
 def test_decisions_of_one_frame_are_one_row_and_events_stand_among_them() -> None:
-    def change(t_s: float, drone: int, reason: str = "r", to: str = "features") -> dict[str, Any]:
-        return {
-            "t_s": t_s,
-            "drone": drone,
-            "from": "nothing",
-            "to": to,
-            "reason": reason,
-            "peers": [drone + 1, drone + 2],
-        }
-
-    made = told_outcome() | {
-        "frame_s": 0.1,
-        "transitions": [
-            change(0.51, 4), change(0.55, 2), change(0.58, 3, "other"), change(0.59, 1, to="raw"), change(0.6, 1),
-        ],
-        "events": [
-            {"t_s": 0.57, "drone": 3, "kind": "drone_lost", "text": "fell silent"},
-            {"t_s": 0.2, "drone": -1, "kind": "jam", "text": "a jammer"},
-        ],
-    }  # fmt: skip
-    table = summary.transitions_table(made)
+    changes = [change(0.51, 4), change(0.55, 2), change(0.58, 3, "other"), change(0.59, 1, to="raw"), change(0.6, 1)]
+    events = [
+        {"t_s": 0.57, "drone": 3, "kind": "drone_lost", "text": "fell silent"},
+        {"t_s": 0.2, "drone": -1, "kind": "jam", "text": "a jammer"},
+    ]
+    table = transitions(changes, events)
     assert cells(table) == [
         ["0.20", "fleet", "jam", "a jammer"],
         ["0.51", "2→3,4  4→5,6", "nothing → features", "r"],
@@ -117,44 +113,27 @@ def test_decisions_of_one_frame_are_one_row_and_events_stand_among_them() -> Non
 
 def test_of_many_links_that_do_alike_the_first_are_shown_and_the_others_counted() -> None:
     """In order of the drones' numbers, and each drone once."""
-    changes = [
-        {"t_s": 0.5, "drone": drone, "from": "a", "to": "b", "reason": "r", "peers": peers}
-        for drone, peers in ((10, list(range(20, 40))), (9, [3]), (9, [1, 2]), (100, [0]))
-    ]
-    table = summary.transitions_table(told_outcome() | {"frame_s": 0.1, "transitions": changes, "events": []})
-    ((_, who, _, _),) = cells(table)
-    assert who == "9→1,2,3  10→20,21,22,23,24,25,26,27,28,29,30,31,32,33,34,35,36,37,38,39  100→0"
-    table = summary.transitions_table(
-        told_outcome() | {"frame_s": 0.1, "transitions": [*changes, changes[0] | {"drone": 0}], "events": []}
-    )
-    ((_, who, _, _),) = cells(table)
-    assert who == "0→20,21,22,23,24,25,26,27,28,29,30,31,32,33,34,35,36,37,38,39  9→1,2,3  10→20  and 20 more"
+    links = ((10, list(range(20, 40))), (9, [3]), (9, [1, 2]), (100, [0]))
+    changes = [change(0.5, drone, peers=peers) for drone, peers in links]
+    ((_, who, _, _),) = cells(transitions(changes))
+    twenty = ",".join(str(k) for k in range(20, 40))
+    assert who == f"9→1,2,3  10→{twenty}  100→0"
+    ((_, who, _, _),) = cells(transitions([*changes, changes[0] | {"drone": 0}]))
+    assert who == f"0→{twenty}  9→1,2,3  10→20  and 20 more"
+    for count in (24, 25, 30):
+        table = transitions([change(k / 2, 0) for k in range(count)])
+        assert [row[0] for row in cells(table)] == [f"{k / 2:.2f}" for k in range(24)]
+        assert table.caption == (None if count == 24 else f"and {count - 24} more in outcome.json")
 
 
-def test_of_a_large_fleet_the_lowest_charge_is_shown_and_how_many_are_down() -> None:
-    drone = told_outcome()["drones"]["0"]
-    drones = {str(i): drone | {"soc": 0.5 + i / 100, "airborne": i != 3} for i in range(25)} | {
-        "7": drone | {"soc": 0.2}
-    }
-    shown = dict(cells(summary.outcome_table(told_outcome() | {"drones": drones})))
-    assert shown["charge left"] == "lowest 20.0 % (drone 7), median 62.0 %; 1 of 25 drones down"
-
-
-def test_a_flight_slower_than_real_time_is_shown_as_such() -> None:
-    shown = dict(cells(summary.outcome_table(told_outcome() | {"wall_s": 73.0, "realtime_factor": 0.0274})))
-    assert shown["wall time"] == "73.00 s, 0.027 × real time"
-
-
-@pytest.mark.parametrize("count", [24, 25, 30])
-def test_of_many_decisions_the_first_are_shown_and_the_others_counted(count: int) -> None:
-    changes = [{"t_s": k / 2, "drone": 0, "from": "a", "to": "b", "reason": "r", "peers": [1]} for k in range(count)]
-    table = summary.transitions_table(told_outcome() | {"frame_s": 0.1, "transitions": changes, "events": []})
-    assert [row[0] for row in cells(table)] == [f"{k / 2:.2f}" for k in range(24)]
-    assert table.caption == (None if count == 24 else f"and {count - 24} more in outcome.json")
+LOST_TO = (
+    "5.0 % collisions with payloads, 3.0 % collisions with descriptors, 2.0 % own transmissions, 1.0 % hidden senders"
+)
 
 
 def test_the_page_s_tiles_are_the_outcome_s() -> None:
-    assert report._tiles(told_outcome()) == [
+    made = told_outcome()
+    assert report._tiles(made) == [
         ("Flown", "91.1 %", "of drone-seconds"),
         ("Accuracy, mission disc", "0.502", "0.204 with grounded drones blind"),
         ("Accuracy, full scene", "0.401", "0.303 with grounded drones blind"),
@@ -167,16 +146,9 @@ def test_the_page_s_tiles_are_the_outcome_s() -> None:
         ("Data delivered", "14.0 kB", "of 22.0 kB sent"),
         ("Deadlines missed", "12.2 %", "channel busy 13.3 %"),
         ("Context plane", "1.1 kB", "4.8 % of all bytes"),
-        (
-            "Descriptors lost", "11.1 %",
-            "5.0 % collisions with payloads, 3.0 % collisions with descriptors, 2.0 % own transmissions, 1.0 % hidden senders",
-        ),
+        ("Descriptors lost", "11.1 %", LOST_TO),
         ("Energy", "11.6 kJ", "least charge left 62.0 %"),
-    ]  # fmt: skip
-
-
-def test_tiles_of_a_fleet_that_flew_to_the_end_name_the_detector() -> None:
-    made = told_outcome()
+    ]
     made["mission"]["flown_share"] = 1.0
     for calibration, by in (("abc", "the surrogate abc"), (None, "the surrogate detector")):
         made["ap50"]["calibration"] = calibration
@@ -242,10 +214,11 @@ def test_batteries_are_drawn_in_percent_drone_by_drone() -> None:
 def test_goodput_is_the_mean_over_links_that_were_measured_and_over_each_second() -> None:
     """Drone 1 never measured anything in the third second, and drone 0 was silent in the fourth."""
     three = record().scenario.model_copy(update={"fleet": record().scenario.fleet.model_copy(update={"drones": 3})})
-    said = [
-        (0.2, 0, [10.0, 30.0]), (0.7, 0, [40.0, 0.0]), (0.9, 1, [5.0, 7.0]), (1.0, 0, [2.0, 4.0]), (2.5, 1, [0.0, 0.0]),
-        (2.6, 0, [8.0, 8.0]), (3.999, 1, [9.0, 0.0]),
-    ]  # fmt: skip
+    published = {
+        0: {0.2: [10.0, 30.0], 0.7: [40.0, 0.0], 1.0: [2.0, 4.0], 2.6: [8.0, 8.0]},
+        1: {0.9: [5.0, 7.0], 2.5: [0.0, 0.0], 3.999: [9.0, 0.0]},
+    }
+    said = sorted((t_s, d, links) for d, each in published.items() for t_s, links in each.items())
     descriptors = [{"t_s": t_s, "drone": d, "goodput_mbps": links} for t_s, d, links in said]
     flown = replace(with_rows(descriptors=descriptors), scenario=three)
     assert curves(report_figures._goodput, flown) == {
@@ -257,14 +230,18 @@ def test_goodput_is_the_mean_over_links_that_were_measured_and_over_each_second(
 
 def test_traffic_is_drawn_in_the_second_in_which_it_ended_by_kind_and_fate() -> None:
     """Mb/s: of 125,000 B in one second, 1. The payload that came in part is what arrived and what was lost."""
-    sent = [
-        {"t_done_s": t_s, "drone": 0, "peer": 1, "representation": what, "status": fate, "reason": "fragment_lost" if fate in ("lost", "partial") else "", "payload_bytes": size, "arrived_bytes": come}
-        for t_s, what, fate, size, come in (
-            (0.5, "features", "delivered", 125_000, 125_000), (0.9, "features", "lost", 250_000, 0), (1.0, "features", "delivered", 500_000, 500_000),
-            (1.5, "features", "partial", 375_000, 250_000), (2.5, "detections", "delivered", 12_500, 12_500),
-            (math.nan, "features", "in_flight", 999_999, 0),
-        )
-    ]  # fmt: skip
+    ended = [  # when, what, fate, bytes, and how many of them arrived
+        (0.5, "features", "delivered", 125_000, 125_000),
+        (0.9, "features", "lost", 250_000, 0),
+        (1.0, "features", "delivered", 500_000, 500_000),
+        (1.5, "features", "partial", 375_000, 250_000),
+        (2.5, "detections", "delivered", 12_500, 12_500),
+        (math.nan, "features", "in_flight", 999_999, 0),
+    ]
+    names = ("t_done_s", "representation", "status", "payload_bytes", "arrived_bytes")
+    sent = [dict(zip(names, row, strict=True), drone=0, peer=1) for row in ended]
+    for row in sent:
+        row["reason"] = "fragment_lost" if row["status"] in ("lost", "partial") else ""
     flown = with_rows(transmissions=sent)
     assert curves(report_figures._traffic, flown) == {
         "features delivered": [(1, 1.0), (2, 6.0), (3, 0.0), (4, 0.0)],
@@ -312,10 +289,11 @@ def test_the_map_shows_each_drone_s_own_way_and_where_it_ended() -> None:
 
 def test_a_lane_shows_the_richest_of_a_drone_s_links_until_it_is_down() -> None:
     """Drone 1 sends boxes to drone 0 from 0.5 s and features to nobody; it is down from 3 s on."""
+    usual = {"rho": 0.1, "roi_radius_m": math.nan, "rate_hz": 10.0}
     ordered = [
-        {"t_s": t_s, "drone": d, "peer": 1 - d, "representation": what, "rho": 0.1, "roi_radius_m": math.nan, "rate_hz": 10.0}
-        for t_s, d, what in ((0.5, 1, "detections"), (1.5, 0, "features"), (2.5, 0, "nothing"))
-    ]  # fmt: skip
+        {"t_s": t_s, "drone": drone, "peer": 1 - drone, "representation": what, **usual}
+        for t_s, drone, what in ((0.5, 1, "detections"), (1.5, 0, "features"), (2.5, 0, "nothing"))
+    ]
     axes: Axes = Figure().add_subplot()
     report_figures._lanes(axes, with_rows(directives=ordered, transmissions=[]))
     bars = []

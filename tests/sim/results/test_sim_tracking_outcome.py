@@ -3,79 +3,63 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import cache
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from recorded import recorded
 
 from sortie.perception.classes import CAR, TRUCK
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.surrogate.detector import SurrogateDetector
 from sortie.perception.types import Capture
 from sortie.scenarios.reading.load import load
-from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.tracking_outcome import tracking_outcome
 
 
-@cache
-def flown(detector: str = "surrogate") -> SortieRecord:
-    return run_sortie(load("track_target", [f"perception.detector={detector}", "duration_s=12"]))
+def with_tables(**tables: pa.Table) -> SortieRecord:
+    record = recorded("surrogate")
+    return dataclasses.replace(record, tables={**record.tables, **tables})
 
 
-def with_table(record: SortieRecord, name: str, table: pa.Table) -> SortieRecord:
-    return dataclasses.replace(record, tables={**record.tables, name: table})
-
-
-def as_seen(truths: pa.Table) -> pa.Table:
-    """A detector that finds every car where it is."""
-    return truths.drop_columns(["car"]).append_column("score", pa.array(np.full(truths.num_rows, 0.9)))
-
-
-def test_it_stands_in_the_outcome() -> None:
-    value = outcome(flown())["tracking"]
-    assert 0.0 < value["hota"] < value["ass_a"] < 1.0
-    assert 0.0 < value["det_a"] < 1.0
+def with_cars(numbers: np.ndarray) -> SortieRecord:
+    truths = recorded("surrogate").tables["truths"]
+    return with_tables(truths=truths.set_column(truths.column_names.index("car"), "car", pa.array(numbers, pa.int32())))
 
 
 def test_cars_that_change_places_cost_association_and_no_detection() -> None:
-    record = flown()
+    record = recorded("surrogate")
+    before = outcome(record)["tracking"]
+    assert 0.0 < before["hota"] < before["ass_a"] < 1.0
+    assert 0.0 < before["det_a"] < 1.0
     truths = record.tables["truths"]
-    late = truths["t_s"].to_numpy() > 6.0
-    car = truths["car"].to_numpy()
-    swapped = np.where(late, car + 100_000, car)
-    other = with_table(record, "truths", truths.set_column(truths.column_names.index("car"), "car", pa.array(swapped)))
-    before, after = tracking_outcome(record), tracking_outcome(other)
+    late, car = truths["t_s"].to_numpy() > 3.0, truths["car"].to_numpy()
+    after = tracking_outcome(with_cars(np.where(late, car + 100_000, car)))
     assert after["ass_a"] < 0.8 * before["ass_a"]
     assert after["det_a"] == pytest.approx(before["det_a"], rel=0.1)
 
 
 def test_a_vehicle_that_is_taken_for_one_of_another_class_is_not_followed() -> None:
-    record = flown()
-    truths = record.tables["truths"]
-    found, classes = as_seen(truths), [np.full(truths.num_rows, kind, np.int8) for kind in (CAR, TRUCK)]
+    truths = recorded("surrogate").tables["truths"]
+    every_car = truths.drop_columns(["car"]).append_column("score", pa.array(np.full(truths.num_rows, 0.9)))
+    cars, trucks = (np.full(truths.num_rows, kind, np.int8) for kind in (CAR, TRUCK))
 
-    def judged(there: np.ndarray, told: np.ndarray) -> dict[str, float | None]:
-        tables = {
-            "truths": truths.append_column("kind", pa.array(there)),
-            "detections": found.append_column("kind", pa.array(told)),
-        }
-        return tracking_outcome(dataclasses.replace(record, tables={**record.tables, **tables}))
+    def judged(there: np.ndarray, found: np.ndarray) -> dict[str, float | None]:
+        kinds = {"truths": (truths, there), "detections": (every_car, found)}
+        return tracking_outcome(
+            with_tables(**{name: table.append_column("kind", pa.array(k)) for name, (table, k) in kinds.items()})
+        )
 
-    cars, trucks = classes
-    assert judged(cars, cars) == judged(trucks, trucks) == tracking_outcome(with_table(record, "detections", found))
+    assert judged(cars, cars) == judged(trucks, trucks) == tracking_outcome(with_tables(detections=every_car))
     assert judged(trucks, cars) == judged(cars, trucks) == {"hota": 0.0, "det_a": 0.0, "ass_a": 0.0}
 
 
 def test_without_identities_or_a_detector_there_is_none() -> None:
-    record = flown()
-    truths = record.tables["truths"]
-    unknown = pa.array(np.full(truths.num_rows, -1, np.int32))
-    nameless = with_table(record, "truths", truths.set_column(truths.column_names.index("car"), "car", unknown))
+    nameless = with_cars(np.full(recorded("surrogate").tables["truths"].num_rows, -1))
     nothing = {"hota": None, "det_a": None, "ass_a": None}
-    assert tracking_outcome(nameless) == tracking_outcome(flown("none")) == nothing
+    assert tracking_outcome(nameless) == tracking_outcome(recorded("base")) == nothing
 
 
 def test_a_car_has_the_number_that_the_scene_gives_it() -> None:

@@ -1,16 +1,13 @@
-"""What stands between a record and its readers: the facts that explain a metric, a run's folder, slices of traffic, discs, sightings, rosters and views."""
+"""What stands between a record and its readers, by hand: slices of traffic, discs, sightings, rosters and views."""
 
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import record_by_hand as by_hand
 import simpy
@@ -19,90 +16,33 @@ from sim_examples import example
 
 from sortie.policies.contract import Directive, Disc, FleetView, Representation, Roster
 from sortie.policies.staleness import LinkHealth
-from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.folders import RunError
 from sortie.sim.results import rosters
 from sortie.sim.results.accuracy import score
 from sortie.sim.results.box_rows import fusion_blocks, fusions_of
 from sortie.sim.results.disagreement import measure
-from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.flown_scene import scene_of, vehicles
 from sortie.sim.results.link_traffic import LinkTraffic
 from sortie.sim.results.mission_outcome import _flown, _lately
 from sortie.sim.results.outcome import outcome
-from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
+from sortie.sim.results.record import AgentNotes, Recorder
 from sortie.sim.results.regions import Regions
-from sortie.sim.results.run_folder import OtherRunError, ensure_usable, load, save
 from sortie.sim.results.sightings import sightings
 from sortie.sim.results.spool import InTime, in_blocks
 from sortie.sim.results.views import Decision, Journal, decisions
 
-FATES = "payloads: 6 delivered, 3 expired/deadline_queued, 1 lost/retries of 10, medium 13 % busy"
-FUSED = "0.8 peers' payloads a fusion, 0.26 s old at the median"
-GONE = "left the air: drone 1 at 2 s (low)"
-LOST = "descriptors lost: 5.0 % collisions with payloads, 3.0 % collisions with descriptors, 2.0 % own transmissions, 1.0 % hidden senders"
-REFUSED = "descriptors refused: 2 replay, 1 bad_tag"
-SPENT = "energy rotor 8.1 kJ, compute 2.3 kJ, radio 1.2 kJ"
-EVER = "decided because of 'b' ×2, 'a' ×1; happened: 1 s jam, 2 s landed"
-
-
-@pytest.mark.parametrize(
-    ("metric", "facts"),
-    [
-        ("ap50.mission", [GONE, FUSED, FATES]),
-        ("mission.flown_share", [GONE, FUSED]),
-        ("data_age_s.p50", [FUSED, FATES]),
-        ("phases.0.data_rate_mbps", [FUSED, FATES]),
-        ("bytes.data_sent", [FATES]),
-        ("deadline_miss_rate", [FATES]),
-        ("medium_busy_fraction", [FATES]),
-        ("context.lost", [LOST]),
-        ("age_s.p99", [LOST, REFUSED]),
-        ("descriptor_drops.replay", [REFUSED]),
-        ("energy_j.total", [SPENT]),
-        ("battery.1", [SPENT]),
-        ("drones.1.soc", [SPENT]),
-        ("switches", []),
-    ],
-)
-def test_a_metric_is_explained_by_the_facts_that_it_hangs_on(metric: str, facts: list[str]) -> None:
-    rows = by_hand.rows()
-    rows["events"] = [
-        {"t_s": 1.0, "drone": -1, "kind": "jam", "text": "on"},
-        {"t_s": 2.0, "drone": 1, "kind": "landed", "text": "low"},
-    ]
-    rows["directives"] = [row | {"reason": reason} for row, reason in zip(rows["directives"], "bab", strict=True)]
-    told = by_hand.told_outcome() | {"descriptor_drops": {"bad_tag": 1, "replay": 2, "other_fleet": 0}}
-    # 0.8 peers: three fusions of 1, 2 and 1 payloads, and one of none
-    rows["fusions"].append(rows["fusions"][2] | {"t_s": 3.9})
-    assert explain_metric(metric, by_hand.record(tables=by_hand.tables_of(rows)), told) == "; ".join([*facts, EVER])
-
-
-def test_of_many_who_left_the_air_the_first_are_named() -> None:
-    rows = by_hand.rows()
-    kinds = ("landed", "drone_lost", "power_lost", "landed", "drone_joins", "landed")
-    rows["events"] = [{"t_s": k + 0.5, "drone": k, "kind": kind, "text": "t"} for k, kind in enumerate(kinds)]
-    rows["directives"] = []
-    told = explain_metric("mission.flown_share", by_hand.record(tables=by_hand.tables_of(rows)), by_hand.told_outcome())
-    assert told.startswith(
-        "left the air: drone 0 at 0.5 s (t), drone 1 at 1.5 s (t), drone 2 at 2.5 s (t) and 2 more; "
-    )
-    assert told.endswith("happened: 0.5 s landed, 1.5 s drone_lost, 2.5 s power_lost")
-
-
 # --- rows in blocks and slices -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 4, 20])
-def test_blocks_hold_every_fusion_once_and_all_of_one_time_together(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sortie.sim.results.box_rows.BLOCK_FUSIONS", size)
+def test_blocks_hold_every_fusion_once_and_all_of_one_time_together(monkeypatch: pytest.MonkeyPatch) -> None:
     t_s = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 2.0, 3.0, 3.0, 3.0, 3.0])
-    blocks = list(fusion_blocks(t_s))
-    assert [k for here, _ in blocks for k in range(len(t_s))[here]] == list(range(len(t_s)))
-    firsts = [t_s[here][0] for here, _ in blocks]
-    assert [until_s for _, until_s in blocks] == [*firsts[1:], math.inf]
-    assert len(set(t_s.tolist())) == sum(len(set(t_s[here].tolist())) for here, _ in blocks)
+    for size in (1, 2, 3, 4, 20):
+        monkeypatch.setattr("sortie.sim.results.box_rows.BLOCK_FUSIONS", size)
+        blocks = list(fusion_blocks(t_s))
+        assert [k for here, _ in blocks for k in range(len(t_s))[here]] == list(range(len(t_s)))
+        firsts = [t_s[here][0] for here, _ in blocks]
+        assert [until_s for _, until_s in blocks] == [*firsts[1:], math.inf]
+        assert len(set(t_s.tolist())) == sum(len(set(t_s[here].tolist())) for here, _ in blocks)
 
 
 def test_behind_the_last_fusion_blocks_without_one_go_on_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,20 +59,17 @@ def test_rows_belong_to_the_fusion_of_their_time_and_their_drone() -> None:
     assert fusions_of(keys, {name: values[:0] for name, values in rows.items()}).tolist() == []
 
 
-def _pieces(values: list[float], cuts: list[int]) -> dict[str, pa.Table]:
-    parts = [values[a:b] for a, b in zip([0, *cuts], [*cuts, len(values)], strict=True)]
-    return {"x": pa.table({"t_s": pa.chunked_array([pa.array(p, pa.float64()) for p in parts])})}
-
-
-@pytest.mark.parametrize("cuts", [[], [1], [2, 4], [3], [1, 2, 3, 4, 5]])
-def test_a_table_comes_in_time_and_in_blocks_however_it_is_cut(cuts: list[int]) -> None:
+def test_a_table_comes_in_time_and_in_blocks_however_it_is_cut() -> None:
     values = [0.0, 1.0, 1.0, 2.0, 3.0, 3.0]
-    table = InTime(_pieces(values, cuts), "x")
-    assert [table.before(t)["t_s"].to_pylist() for t in (0.0, 1.0, 1.5, 2.0, 3.0, math.inf)] == [
-        [], [0.0], [1.0, 1.0], [], [2.0], [3.0, 3.0],
-    ]  # fmt: skip
-    blocks = [piece["t_s"].to_pylist() for piece in in_blocks(_pieces(values, cuts), "x", ["t_s"], 4)]
-    assert blocks == [values[:4], values[4:]]
+    for cuts in ([], [1], [2, 4], [3], [1, 2, 3, 4, 5]):
+        parts = [values[a:b] for a, b in zip([0, *cuts], [*cuts, len(values)], strict=True)]
+        chunks = pa.chunked_array([pa.array(part, pa.float64()) for part in parts])
+        tables = {"x": pa.table({"t_s": chunks})}
+        table = InTime(tables, "x")
+        before = [table.before(t)["t_s"].to_pylist() for t in (0.0, 1.0, 1.5, 2.0, 3.0, math.inf)]
+        assert before == [[], [0.0], [1.0, 1.0], [], [2.0], [3.0, 3.0]]
+        blocks = [piece["t_s"].to_pylist() for piece in in_blocks(tables, "x", ["t_s"], 4)]
+        assert blocks == [values[:4], values[4:]]
 
 
 DESCRIBED = [(0.5, 0, 10.0), (1.0, 1, 20.0), (1.5, 0, 30.0), (3.0, 0, 40.0)]
@@ -163,19 +100,21 @@ def _traffic_in(slices: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarr
     return np.concatenate(goodput), np.concatenate(recent)
 
 
-@pytest.mark.parametrize(
-    "slices",
-    [[(0, 4)], [(0, 1), (1, 2), (2, 3), (3, 4)], [(0, 2), (2, 4)], [(0, 0.75), (0.75, 0.95), (0.95, 4)]],
-)
-def test_a_link_carried_what_was_settled_in_the_second_before(slices: list[tuple[float, float]]) -> None:
+def test_a_link_carried_what_was_settled_in_the_second_before() -> None:
     """Frames each half second; also where a slice has no frame, what came in it counts."""
-    goodput, recent = _traffic_in(slices)
-    assert goodput[:, 0, 1].tolist() == [0, 0, 10, 10, 30, 30, 30, 40]
-    assert goodput[:, 1, 0].tolist() == [0, 0, 0, 20, 20, 20, 20, 20]
-    kilobytes = recent / 8e-6 / 1e3
-    assert kilobytes[:, 0, 1] == pytest.approx([0, 1, 4, 3, 0, 0, 0.7, 0.7])
-    assert kilobytes[:, 1, 0] == pytest.approx([0, 0, 0.5, 0.5, 0, 0, 0, 0])
-    assert not recent[:, [0, 1], [0, 1]].any()
+    for slices in (
+        [(0, 4)],
+        [(0, 1), (1, 2), (2, 3), (3, 4)],
+        [(0, 2), (2, 4)],
+        [(0, 0.75), (0.75, 0.95), (0.95, 4)],
+    ):
+        goodput, recent = _traffic_in(slices)
+        assert goodput[:, 0, 1].tolist() == [0, 0, 10, 10, 30, 30, 30, 40]
+        assert goodput[:, 1, 0].tolist() == [0, 0, 0, 20, 20, 20, 20, 20]
+        kilobytes = recent / 8e-6 / 1e3
+        assert kilobytes[:, 0, 1] == pytest.approx([0, 1, 4, 3, 0, 0, 0.7, 0.7])
+        assert kilobytes[:, 1, 0] == pytest.approx([0, 0, 0.5, 0.5, 0, 0, 0, 0])
+        assert not recent[:, [0, 1], [0, 1]].any()
 
 
 def test_a_scene_is_made_of_all_the_ways_that_were_flown() -> None:
@@ -202,9 +141,8 @@ def test_a_fusion_at_the_begin_of_a_time_is_of_it_and_one_at_its_end_is_not() ->
     assert pool.ap(2.5, 3.5) == pool.ap(2.4, 3.4)
     assert pool.ap(3.5) == 1.0
     assert pool.ap(0.5, 2.5) != pool.ap(2.5, 3.5)
-    assert list(score(by_hand.record(), [0], begin_s=2.5).pools[0, "full_scene"].by_fusion()) == [
-        (2.5, 0), (2.5, 1), (3.5, 0),
-    ]  # fmt: skip
+    late = score(by_hand.record(), [0], begin_s=2.5).pools[0, "full_scene"]
+    assert list(late.by_fusion()) == [(2.5, 0), (2.5, 1), (3.5, 0)]
 
 
 def test_people_about_a_drone_that_is_gone_are_no_cars_that_it_missed() -> None:
@@ -261,79 +199,6 @@ def test_a_roster_is_the_latest_from_its_instant_on_and_kept_where_it_changes() 
     assert rosters.of({})(0, 1.0) is None
 
 
-# --- a run's folder --------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def flown() -> SortieRecord:
-    return run_sortie(example("duration_s=0.5", "mission.phases=[{at_s: 0, phase: search}]", "fleet.drones=2"))
-
-
-def test_a_folder_takes_the_same_sortie_again_and_no_other(tmp_path: Path, flown: SortieRecord) -> None:
-    path = tmp_path / "run"
-
-    def ensure(scenario: Scenario = flown.scenario, seed: int = flown.seed, replication: int = 0) -> None:
-        ensure_usable(path, scenario, seed, replication, replace=False)
-
-    ensure()  # nothing there
-    save(flown, path)
-    ensure()
-    params = flown.scenario.policy.model_copy(update={"params": {"rho": 0.5}})
-    others: list[dict[str, Any]] = [
-        {"seed": 9}, {"replication": 2}, {"scenario": flown.scenario.model_copy(update={"policy": params})}
-    ]  # fmt: skip
-    for other in others:
-        with pytest.raises(
-            OtherRunError, match=re.escape(f"{path}: holds another run; choose another folder, or repl")
-        ):
-            ensure(**other)
-    ensure_usable(path, flown.scenario, 9, 0, replace=True)
-
-
-def test_a_damaged_run_is_replaced_only_where_that_is_asked(tmp_path: Path, flown: SortieRecord) -> None:
-    path = save(flown, tmp_path / "run")
-    (path / "outcome.json").write_text("{}")
-    with pytest.raises(RunError, match=r"run: the run is damaged: outcome.json: fingerprint is None"):
-        ensure_usable(path, flown.scenario, flown.seed, 0, replace=False)
-    with pytest.raises(OtherRunError):
-        save(flown, path)
-    save(flown, path, replace=True)
-    assert load(path).fingerprint == flown.fingerprint
-
-
-def test_a_run_comes_back_whole(tmp_path: Path, flown: SortieRecord, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also in many row groups, and with all that is told beside the tables."""
-    monkeypatch.setattr("sortie.sim.results.spool._ROW_GROUP_BYTES", 100)
-    states = flown.tables["states"]
-    cut = {**flown.tables, "states": pa.concat_tables([states.slice(k, 2) for k in range(0, states.num_rows, 2)])}
-    told = replace(flown, tables=cut, calibration="fit 7", metrics={"m": None, "n": 2.0}, own_files={"a": "b"})
-    save(told, tmp_path / "run")
-    back = load(tmp_path / "run")
-    for name in ("policy", "seed", "replication", "version", "detector", "calibration", "metrics", "own_files"):
-        assert getattr(back, name) == getattr(told, name)
-    assert (back.totals, back.wall) == (flown.totals, flown.wall)
-    assert back.fingerprint == flown.fingerprint
-    assert back.tables["states"].equals(states.combine_chunks())
-
-
-def test_a_run_that_lacks_a_table_that_its_scenario_keeps_is_damaged(tmp_path: Path) -> None:
-    kept = ("record.views=true", "record.beliefs=true", "context.roster=true", "record.disagreement=true")
-    scenario = example("duration_s=0.3", "mission.phases=[{at_s: 0, phase: search}]", "fleet.drones=2", *kept)
-    save(run_sortie(scenario), tmp_path / "run")
-    assert {"views", "beliefs", "rosters", "disagreement"} < load(tmp_path / "run").tables.keys()
-    for name in ("views", "view_descriptors", "view_directives", "beliefs", "rosters", "disagreement", "states"):
-        file = tmp_path / "run" / f"{name}.parquet"
-        whole = file.read_bytes()
-        file.unlink()
-        with pytest.raises(ValueError, match=f"the run is damaged: .*{name}.parquet"):
-            load(tmp_path / "run")
-        first = pq.read_schema(pa.BufferReader(whole)).names[0]
-        pq.write_table(pq.read_table(pa.BufferReader(whole)).drop_columns([first]), file)
-        with pytest.raises(ValueError, match=f"{name}.parquet has no column {first}"):
-            load(tmp_path / "run")
-        file.write_bytes(whole)
-
-
 # --- what is written down and read back ------------------------------------------------------------
 
 
@@ -346,11 +211,10 @@ def test_a_directive_is_kept_as_it_is_enforced_beside_what_was_asked() -> None:
     )
     notes.directive(1.5, asked, enforced, LinkHealth.DEGRADED, "why")
     (row,) = recorder.finish()["directives"].to_pylist()
-    assert row == {
-        "t_s": 1.5, "drone": 2, "peer": 1, "representation": "detections", "rho": 0.25, "roi_x_m": 1.0, "roi_y_m": 2.0,
-        "roi_radius_m": 3.0, "rate_hz": 4.0, "deadline_s": 0.2, "fusion_weight": 0.5, "duty_percent": enforced.duty_percent,
-        "asked": "features", "asked_rate_hz": 10.0, "link": "degraded", "reason": "why", "policy": "policy of 2",
-    }  # fmt: skip
+    kept = {"representation": "detections", "rho": 0.25, "rate_hz": 4.0, "deadline_s": 0.2, "fusion_weight": 0.5}
+    disc = {"roi_x_m": 1.0, "roi_y_m": 2.0, "roi_radius_m": 3.0, "duty_percent": enforced.duty_percent}
+    was = {"asked": "features", "asked_rate_hz": 10.0, "link": "degraded", "reason": "why", "policy": "policy of 2"}
+    assert row == {"t_s": 1.5, "drone": 2, "peer": 1, **kept, **disc, **was}
 
 
 def test_what_is_kept_beside_the_record_is_no_part_of_its_fingerprint() -> None:
@@ -394,25 +258,23 @@ def test_an_episode_in_which_one_would_once_not_send_is_one_about_sending() -> N
     assert episode.duration_s == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize("block", [1, 2, 3, 9])
 def test_a_look_counts_for_its_frames_and_the_last_frame_does_as_the_one_before(
-    block: int, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Looks before each of five frames: drone 0 looks in each, drone 1 in the first alone, drone 2 in the one before the last."""
-    monkeypatch.setattr("sortie.sim.results.mission_outcome.BLOCK_FRAMES", block)
+    """Looks before each of five frames: drone 0 looks in each, 1 in the first, 2 in the one before the last."""
     looks = np.array([[0, 0, 0], [1, 1, 0], [2, 1, 0], [3, 1, 0], [4, 1, 1]], np.int32)
 
     def looked(frames: int) -> Any:
-        rows = {
-            "t_s": np.repeat(np.arange(frames) / 10, 3),
-            "airborne": [True] * 3 * frames,
-            "looks": looks[:frames].ravel(),
-        }
-        return _flown({"states": pa.table(rows)}, 3)[2]
+        t_s, airborne = np.repeat(np.arange(frames) / 10, 3), [True] * 3 * frames
+        states = pa.table({"t_s": t_s, "airborne": airborne, "looks": looks[:frames].ravel()})
+        return _flown({"states": states}, 3)[2]
 
-    assert _lately(looked(5), 1).T.tolist() == [[True] * 5, [True] + [False] * 4, [False] * 3 + [True] * 2]
-    assert _lately(looked(5), 2).T.tolist() == [[True] * 5, [True] * 2 + [False] * 3, [False] * 3 + [True] * 2]
-    assert _lately(looked(1), 3).tolist() == [[True] * 3]
+    for block in (1, 2, 3, 9):
+        monkeypatch.setattr("sortie.sim.results.mission_outcome.BLOCK_FRAMES", block)
+        first, last = [True] + [False] * 4, [False] * 3 + [True] * 2
+        assert _lately(looked(5), 1).T.tolist() == [[True] * 5, first, last]
+        assert _lately(looked(5), 2).T.tolist() == [[True] * 5, [True] * 2 + [False] * 3, last]
+        assert _lately(looked(1), 3).tolist() == [[True] * 3]
 
 
 def test_accuracy_is_sampled_no_oftener_than_frames_come_and_fused_as_the_detector_that_flew() -> None:
@@ -433,17 +295,15 @@ def test_accuracy_is_sampled_no_oftener_than_frames_come_and_fused_as_the_detect
     assert outcome(slow)["ap50"]["sample_rate_hz"] == 0.5
 
 
-@pytest.mark.parametrize("duration_s", [2.0, 4.0])
-def test_a_phase_that_the_end_cuts_short_ends_with_the_sortie(duration_s: float) -> None:
-    """The plan begins its second phase at 3 s and its third one at 10 s."""
-    phases = "mission.phases=[{at_s: 0, phase: search}, {at_s: 3, phase: track}, {at_s: 10, phase: search}]"
-    record = run_sortie(example(f"duration_s={duration_s}", phases))
-    flown = outcome(record)["phases"]
-    ends_s = [3.0, duration_s] if duration_s > 3 else [duration_s]
-    assert [phase["end_s"] for phase in flown] == ends_s
-    begin_s = flown[-1]["begin_s"]
-    rows = record.tables["transmissions"].select(["captured_s", "payload_bytes"]).to_pylist()
-    sent_bytes = sum(row["payload_bytes"] for row in rows if row["captured_s"] >= begin_s)
-    rate_mbps = sent_bytes * 8e-6 / (duration_s - begin_s)
-    assert flown[-1]["data_rate_mbps"] == pytest.approx(rate_mbps)
-    assert rate_mbps > 0
+def test_a_phase_that_the_end_cuts_short_ends_with_the_sortie() -> None:
+    """The plan begins its second phase at 1.5 s and its third one at 10 s."""
+    phases = "mission.phases=[{at_s: 0, phase: search}, {at_s: 1.5, phase: track}, {at_s: 10, phase: search}]"
+    for duration_s, ends_s in ((1.0, [1.0]), (2.0, [1.5, 2.0])):
+        record = run_sortie(example(f"duration_s={duration_s}", phases, "fleet.drones=2"))
+        flown = outcome(record)["phases"]
+        assert [phase["end_s"] for phase in flown] == ends_s
+        begin_s = flown[-1]["begin_s"]
+        rows = record.tables["transmissions"].select(["captured_s", "payload_bytes"]).to_pylist()
+        sent_bytes = sum(row["payload_bytes"] for row in rows if row["captured_s"] >= begin_s)
+        assert flown[-1]["data_rate_mbps"] == pytest.approx(sent_bytes * 8e-6 / (duration_s - begin_s))
+        assert sent_bytes > 0
