@@ -1,7 +1,7 @@
 """Twelve flights that many tests read: each is flown once for all workers, and kept until the code changes.
 
-`recorded("base")` gives the record of a flight. The first worker that asks flies it and saves the run's folder; all others
-read that. A folder is named by the flight, the scenario's text and the code, so that no record of older code is read.
+`recorded("base")` gives the record of a flight. The first worker that asks flies it and saves the run's folder; all
+others read that. A folder is named by the flight, the scenario's text and the code, so that no record of older code is read.
 A test that patches the code, passes a policy as a function or needs other settings flies by itself, and says why.
 """
 
@@ -57,7 +57,7 @@ FLIGHTS: dict[str, Callable[[], Scenario]] = {
         "{kind: cell_failure, drone: 0, at_s: 6},"
         "{kind: battery_fault, drone: 3, at_s: 6, lost_fraction: 1}]",
     ),
-    # drone 3 joins at 2 s, drone 2 goes home at 1 s, drone 1 is away from 1 s to 4 s; all that a record may keep is kept
+    # drone 3 joins at 2 s, drone 2 goes home at 1 s, drone 1 is away from 1 s to 4 s; all that can be kept is
     "members": lambda: example(
         "context.roster=true",
         "fleet.formation.altitude_m=30",

@@ -230,7 +230,7 @@ def test_an_interrupted_step_is_flown_and_the_next_one_is_that_of_an_uninterrupt
     with pytest.raises(KeyboardInterrupt):
         e.step(all_share(e, 1))
     other.step(all_share(other, 1))
-    e._flight._spent_j = dict(other._flight._spent_j)  # type: ignore[union-attr] # its energy would count in the next step
+    e._flight._spent_j = dict(other._flight._spent_j)  # type: ignore[union-attr]
     for _ in range(2):
         assert_same_step(e.step(all_share(e, 1)), other.step(all_share(other, 1)))
 
@@ -371,7 +371,8 @@ def test_a_region_lies_where_the_ego_sees_it_whoever_publishes_it(monkeypatch: p
     flight = object.__new__(_Flight)
     fusions = pa.table({"drone": pa.array([], pa.int32())})
     sent = pa.table({"drone": [0, 0, 1], "peer": [1, 1, 0], "payload_bytes": [10**6, 2 * 10**6, 7 * 10**6]})
-    flight._new, flight._mission, flight._scenario = {"fusions": fusions, "transmissions": sent}, None, None  # type: ignore[assignment]
+    flight._new, flight._mission = {"fusions": fusions, "transmissions": sent}, None
+    flight._scenario = None  # type: ignore[assignment]
     monkeypatch.setattr(env_room, "matched", lambda record, mission: {})
     monkeypatch.setattr(flight, "_spent_of", lambda drone: 0.0)
     assert flight.earned(0).reward == pytest.approx(-3 * env_room.COST_PER_MB)

@@ -1,4 +1,4 @@
-"""Which code made a record: what changes the version, what leaves it alone, and which files of a user a record names."""
+"""Which code made a record: what changes the version, what leaves it alone, and which files of a user it names."""
 
 from __future__ import annotations
 

@@ -1,10 +1,12 @@
-"""Models that `test_sim_own_models.py` and `test_sim_knobs.py` fly."""
+"""Models and a policy of one's own that tests of the engine fly."""
 
 import sys
 
 import numpy as np
 
 from sortie.perception.types import Boxes
+from sortie.policies.catalogue.baselines import everyone
+from sortie.policies.contract import Reposition, looks_from
 from sortie.radio.channel.pathloss import free_space_loss_db
 
 
@@ -118,7 +120,7 @@ class Storm:
         if self.wrong == "loss":
             fleet.set_loss_db(-1.0)
         if self.wrong == "loss_nan":
-            fleet.set_loss_db(np.where(np.eye(5, k=1), np.nan, 3.0))
+            fleet.set_loss_db(np.where(np.eye(len(fleet.airborne), k=1), np.nan, 3.0))
         if self.wrong == "drone":
             fleet.lose(99)
         if self.wrong == "loss_of_each":
@@ -212,3 +214,16 @@ class Goes:
         name = self.do[min(len(self.views) // 8, len(self.do) - 1)]
         arguments = {"GoTo": self.place, "Velocity": self.place}.get(name, ())
         return getattr(self.steering, name)(*arguments)
+
+
+def nearer(view):
+    me, middle = view.me, view.descriptors.get(0)
+    if me is None or middle is None or view.ego == 0:
+        return None
+    return Reposition(*((a + b) / 2 for a, b in zip(me.position_m[:2], middle.position_m[:2], strict=True)))
+
+
+@looks_from(nearer)
+def crossing(view):
+    """Everybody asks to be half as far from drone 0."""
+    return everyone(view, received_budget=0.02)

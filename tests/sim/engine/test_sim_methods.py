@@ -1,27 +1,37 @@
-"""Prior methods in flight: each flies in a comparison, and what it asks first takes airtime and is counted."""
+"""Prior methods and representations in flight: what each sends or asks first takes airtime and is counted."""
 
 from __future__ import annotations
-
-import json
-from pathlib import Path
 
 import pyarrow.compute as pc
 import pytest
 from sim_examples import example
-from typer.testing import CliRunner
 
+from sortie.perception.errors import InputError
 from sortie.policies.catalogue.prior import METHODS
-from sortie.sim.cli.app import app
+from sortie.scenarios.representation import BOXES, NAME_OF, REPRESENTATION_OF, Representation
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.export.messages import directives
 from sortie.sim.results.outcome import outcome
+from sortie.sim.results.palette import SENT
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.report_figures import SENT as REPORT
 from sortie.sim.studies.compare import Contender, compare
+
+FEW = ("fleet.drones=3", "mission.phases=[{}]")
+
+
+def flown(policy: str, *more: str) -> SortieRecord:
+    """A short flight of its own: the recorded ones fly the worked policy."""
+    return run_sortie(example("duration_s=2", *FEW, f"policy={{name: {policy}}}", *more))
+
+
+def kinds(record: SortieRecord) -> set[str]:
+    return set(record.tables["transmissions"]["representation"].to_pylist())
 
 
 def test_every_method_flies_in_a_comparison() -> None:
-    rows, _ = compare(
-        [Contender(name, example(f"policy.name={name}", "policy.params={}", "duration_s=3")) for name in METHODS], [1]
-    )
-    sent = {r.policy: r.outcome["bytes"]["data_sent"] for r in rows}
+    contenders = [Contender(m, example("duration_s=1.5", *FEW, f"policy={{name: {m}}}")) for m in METHODS]
+    sent = {r.policy: r.outcome["bytes"]["data_sent"] for r in compare(contenders, [1])[0]}
     assert all(sent.values())
     assert sent["fixed-compression"] < sent["where2comm-style"] < sent["v2vnet-style"] == sent["disconet-style"]
     assert sent["who2com-style"] < sent["disconet-style"]
@@ -30,27 +40,17 @@ def test_every_method_flies_in_a_comparison() -> None:
 @pytest.mark.filterwarnings("error")
 def test_where_there_is_nothing_to_find_there_is_no_gain() -> None:
     """Not a gain of NaN, which JSON has no word for."""
-    bare = [
-        "perception.detector=surrogate",
-        "duration_s=2",
-        "mission.target=null",
-        "mission.phases=[{at_s: 0, phase: search}]",
-    ]
-    bare += [f"perception.scene.{name}=0" for name in ("parked_density", "moving_cars_per_km")]
-    rows, gains = compare(
-        [Contender(name, example(f"policy.name={name}", "policy.params={}", *bare)) for name in ("silence", "all-4")],
-        [1],
-    )
-    assert [r.outcome["ap50"]["scored_fusions"] for r in rows] == [20, 20]
+    empty = "perception={detector: surrogate, scene: {parked_density: 0, moving_cars_per_km: 0}}"
+    sets = ("duration_s=1", *FEW, "mission.target=null", empty)
+    contenders = [Contender(name, example(*sets, f"policy={{name: {name}}}")) for name in ("silence", "all-4")]
+    rows, gains = compare(contenders, [1])
+    assert [r.outcome["ap50"]["scored_fusions"] for r in rows] == [6, 6]
     assert [r.gain for r in rows] == [{"full_scene": None, "mission": None}] * 2
     assert gains == ()
 
 
-def test_a_handshake_takes_airtime_and_stands_in_the_outcome() -> None:
-    plain, asking = (
-        run_sortie(example("policy.name=where2comm-style", f"policy.params={{rho: 0.02, rounds: {rounds}}}"))
-        for rounds in (1, 2)
-    )
+def test_a_handshake_takes_airtime_stands_in_the_outcome_and_is_no_payload() -> None:
+    plain, asking = (flown("where2comm-style", f"policy.params={{rho: 0.02, rounds: {rounds}}}") for rounds in (1, 2))
     sent = asking.tables["transmissions"]
     asked = sent.filter(pc.equal(sent["representation"], "handshake"))
     assert set(asked["payload_bytes"].to_pylist()) == {8192}
@@ -60,37 +60,38 @@ def test_a_handshake_takes_airtime_and_stands_in_the_outcome() -> None:
     assert second["bytes"]["handshakes_sent"] == asked.num_rows * 8192
     assert second["bytes"]["data_sent"] == pc.sum(sent["payload_bytes"]).as_py()
     assert second["medium_busy_fraction"] > first["medium_busy_fraction"]
-    # every drone asks every peer it has heard, once a frame: 20 links, the first frames apart
-    assert asked.num_rows == pytest.approx(20 * 60, rel=0.05)
+    # every drone asks every peer it has heard, once a frame: 6 links, the first frames apart
+    assert asked.num_rows == pytest.approx(6 * 20, rel=0.06)
+    served = flown("who2com-style", "perception.detector=surrogate")
+    assert {k for ks in served.tables["fusions"]["representations"].to_pylist() for k in ks} == {"features"}
+    assert kinds(served) == {"features", "handshake"}
 
 
-def test_a_handshake_is_no_payload() -> None:
-    """The stand-in for Who2com serves each drone by one other: whatever is asked of the rest, only its maps are fused."""
-    record = run_sortie(
-        example(
-            "policy.name=who2com-style", "policy.params={rho: 0.05}", "perception.detector=surrogate", "duration_s=3"
-        )
-    )
-    kinds = {k for ks in record.tables["fusions"]["representations"].to_pylist() for k in ks}
-    assert kinds == {"features"}
-    assert set(record.tables["transmissions"]["representation"].to_pylist()) == {"features", "handshake"}
+def test_uncertain_boxes_fly_by_the_surrogate_and_count_36_bytes_each() -> None:
+    record = flown("uncertain-boxes", "perception.detector=surrogate")
+    rows = record.tables["transmissions"].to_pylist()
+    assert kinds(record) == {"uncertain_boxes"}
+    assert all(r["payload_bytes"] == 76 + 36 * r["boxes"] for r in rows)
+    assert any(r["boxes"] > 5 for r in rows)
+    assert {how for r in record.tables["fusions"].to_pylist() for how in r["representations"]} == {"uncertain_boxes"}
+    assert {d.representation for _, d in directives(record)} >= {Representation.UNCERTAIN_BOXES}
+    assert outcome(record)["ap50"]["full_scene"] is not None
 
 
-@pytest.mark.slow
-def test_own_fusion_flies_the_methods_own_network(tmp_path: Path) -> None:
-    """The stand-ins for V2VNet and DiscoNet send alike; with their own fusions they see otherwise."""
+def test_codes_are_traffic_of_exact_size_and_the_surrogate_refuses_them() -> None:
+    record = flown("codes", "perception.code_bytes=5", "policy.params={received_budget: 0.05}")
+    rows = record.tables["transmissions"].to_pylist()
+    assert kinds(record) == {"codes"}
+    assert {r["cells"] for r in rows} == {409, 410} or {r["cells"] for r in rows} <= {102, 103, 204, 205, 409, 410}
+    assert all(r["payload_bytes"] == 76 + 8 + 5 * r["cells"] + r["index_bytes"] for r in rows)
+    words = r"the surrogate cannot estimate what codes do: .* Set perception.detector to torch"
+    with pytest.raises(InputError, match=words):
+        flown("codes", "perception.detector=surrogate")
 
-    def seen(*more: str) -> dict[str, float]:
-        path = tmp_path / "outcomes.json"
-        settings = ["duration_s=1.5", "perception.detector=torch", "mission.phases=[{at_s: 0, phase: search}]"]
-        flags = [arg for s in settings for arg in ("--set", s)]
-        command = ["compare", "track_target", "--policies", "v2vnet-style(rho=0.02),disconet-style(rho=0.02)"]
-        done = CliRunner().invoke(app, [*command, *flags, "--out", str(path), *more])
-        assert done.exit_code == 0, done.output
-        return {s["policy"]: s["outcome"]["ap50"]["full_scene"] for s in json.loads(path.read_text())["sorties"]}
 
-    one, own = seen(), seen("--own-fusion")
-    assert one["v2vnet-style(rho=0.02)"] == one["disconet-style(rho=0.02)"]
-    assert len({one["v2vnet-style(rho=0.02)"], *own.values()}) == 3, (
-        "DiscoNet's is that which was trained as V2VNet's was"
-    )
+def test_every_representation_has_its_colours_and_its_way_on_the_air() -> None:
+    sent = set(REPRESENTATION_OF) - {"none"}
+    assert sent <= set(SENT)
+    assert sent <= set(REPORT)
+    assert len({SENT[name] for name in sent}) == len({REPORT[name] for name in sent}) == len(sent)
+    assert {NAME_OF[r] for r in BOXES} == {"tracks", "detections", "uncertain_boxes"}

@@ -1,4 +1,4 @@
-"""Missions for groups of drones, and several targets: who is told what, who is scored where, and what the scene holds."""
+"""Missions for groups, and several targets: what drones publish, who is scored where, what the scene has."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pyarrow.compute as pc
 import pytest
+from recorded import recorded
 from sim_examples import example
 
 from sortie.perception.metrics.ap import average_precision
@@ -16,52 +17,56 @@ from sortie.scenarios.schema import Scene, Target
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.accuracy import matched
+from sortie.sim.results.mission_outcome import sees_ground
 from sortie.sim.results.outcome import outcome
-from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
 
-TWO = (
-    "perception.detector=surrogate",
-    "mission.target={waypoints_m: [[-20, -1.75], [200, -1.75]], speed_mps: 4}",
-    "mission.more_targets=[{waypoints_m: [[0, 30], [0, 200]], speed_mps: 3}]",
-    "mission.phases=[{phase: track, region: {radius_m: 30}}]",
-    "mission.groups=[{drones: [3, 4], phases: ["
-    "{phase: search, region: {centre_m: [50, 60], radius_m: 20}}, {at_s: 3, phase: track, target: 1, region: {radius_m: 25}}]}]",
-)
 FIRST, SECOND = Target(waypoints_m=((0, 0), (30, 0))), Target(waypoints_m=((0, 5), (0, 50)), speed_mps=2.0)
 BOUNDS = (-50.0, -50.0, 50.0, 50.0)
 
 
-@pytest.fixture(scope="module")
-def record() -> SortieRecord:
-    return run_sortie(example(*TWO))
-
-
-def test_each_drone_publishes_its_groups_phase_and_region(record: SortieRecord) -> None:
-    rows = record.tables["descriptors"].to_pylist()
-    assert {r["drone"]: r["phase"] for r in rows if r["t_s"] < 2.9} == dict.fromkeys(range(3), "track") | {
-        3: "search", 4: "search",
-    }  # fmt: skip
+def test_each_drone_publishes_its_group_s_phase_and_region() -> None:
+    rows = recorded("mission_groups").tables["descriptors"].to_pylist()
+    early = {r["drone"]: r["phase"] for r in rows if r["t_s"] < 2.9}
+    assert early == {0: "track", 1: "track", 2: "track", 3: "search", 4: "search"}
     assert {r["phase"] for r in rows if r["t_s"] > 3.1} == {"track"}
-    plan = MissionPlan(record.scenario.mission, 5)
-    assert plan.group_of == [0, 0, 0, 1, 1]
-    now = plan.at(5.0)
-    assert (now[0].target, now[1].target) == (0, 1)
-    assert now[1].target_xy == pytest.approx((0.0, 45.0))
-    assert now[1].region is not None
-    assert (now[1].region.x_m, now[1].region.radius_m) == (0.0, 25)
 
 
-def test_a_mission_for_everyone_in_a_group_is_the_fleets_mission() -> None:
+def test_each_group_has_its_own_phase_region_and_target() -> None:
+    phases = "[{phase: search, target: 1}, {at_s: 2, phase: track, target: 1, region: {radius_m: 20}}]"
+    others = "{waypoints_m: [[0, 0], [60, 0]], speed_mps: 3}, {waypoints_m: [[0, 50], [0, 90]], speed_mps: 2}"
+    second = "{drones: [3], phases: [{phase: track, target: 2, region: {radius_m: 10}}]}"
+    groups = f"mission.groups=[{{drones: [1, 2], phases: {phases}}}, {second}]"
+    plan = MissionPlan(example(f"mission.more_targets=[{others}]", groups).mission, 5)
+    assert plan.group_of == [0, 1, 1, 2, 0]
+    for t_s in (0.0, 2.0, 4.0):
+        now = plan.at(t_s)
+        assert now[0].target_xy == pytest.approx((-60 + 5 * t_s, -1.75))
+        assert now[1].target_xy == pytest.approx((3 * t_s, 0.0))
+        assert now[2].target_xy == pytest.approx((0.0, 50 + 2 * t_s))
+        assert [now[g].target for g in range(3)] == [0, 1, 2]
+        assert now[1].phase == ("search" if t_s < 2 else "track")
+        assert now[2].region == pytest.approx((0.0, 50 + 2 * t_s, 10.0))
+        assert now[1].region == (None if t_s < 2 else pytest.approx((3 * t_s, 0.0, 20.0)))
+    plain = MissionPlan(example().mission, 2)
+    phases_at = [plain.at(t_s)[0].phase for t_s in (2.9, 3.0 - 1e-12, 3.0)]
+    assert phases_at == ["search", "track", "track"], "a phase begins with its frame whatever the clock rounds"
+
+
+def test_a_mission_for_everyone_in_a_group_is_the_fleet_s_mission() -> None:
+    """Two short flights of their own."""
     phases = "[{phase: track, region: {radius_m: 30}}]"
-    plain = outcome(run_sortie(example(*TWO[:2], f"mission.phases={phases}")))
-    grouped = outcome(run_sortie(example(*TWO[:2], f"mission.groups=[{{drones: [0, 1, 2, 3, 4], phases: {phases}}}]")))
-    assert grouped["ap50"] == plain["ap50"]
-    assert grouped["mission"] == plain["mission"]
-    assert grouped["bytes"] == plain["bytes"]
+    plain, grouped = (
+        outcome(run_sortie(example("duration_s=2", "fleet.drones=3", "perception.detector=surrogate", mission)))
+        for mission in (f"mission.phases={phases}", f"mission.groups=[{{drones: [0, 1, 2], phases: {phases}}}]")
+    )
+    assert [grouped[name] for name in ("ap50", "mission", "bytes")] == [
+        plain[name] for name in ("ap50", "mission", "bytes")
+    ]
 
 
-def test_ap_of_the_mission_is_of_each_drones_own_region(record: SortieRecord) -> None:
+def test_ap_of_the_mission_is_of_each_drone_s_own_region() -> None:
+    record = recorded("mission_groups")
     regions = Regions(record.tables["mission"], record.scenario.mission)
     disc = regions.at([2.5, 2.5, 5.0], [0, 4, 4])
     assert disc[1].tolist() == [50, 60, 20]
@@ -76,26 +81,18 @@ def test_ap_of_the_mission_is_of_each_drones_own_region(record: SortieRecord) ->
     assert outcome(record)["ap50"]["mission"] == pytest.approx(average_precision(list(frames.values())))
 
 
-def test_shares_of_targets_are_weighed_by_the_time_in_which_each_is_tracked(record: SortieRecord) -> None:
-    seen = outcome(record)["mission"]
-    alone = []
-    for k, begin_s in enumerate((0.0, 3.0)):
-        target = record.scenario.mission.targets[k]
-        points = ", ".join(f"[{x}, {y}]" for x, y in target.waypoints_m)
-        one = outcome(
-            run_sortie(
-                example(
-                    *TWO[:1],
-                    f"mission.target={{waypoints_m: [{points}], speed_mps: {target.speed_mps}}}",
-                    "mission.phases=[{phase: track}]"
-                    if begin_s == 0
-                    else "mission.phases=[{phase: search}, {at_s: 3, phase: track}]",
-                )
-            )
-        )["mission"]
-        alone.append((one["target_in_view_share"], record.scenario.duration_s - begin_s))
-    total = sum(lasts for _, lasts in alone)
-    assert seen["target_in_view_share"] == pytest.approx(sum(share * lasts for share, lasts in alone) / total)
+def test_shares_of_targets_are_weighed_by_the_time_in_which_each_is_tracked() -> None:
+    """Counted again: of each frame in which its group tracks it, whether some drone has a target in view."""
+    record = recorded("mission_groups")
+    states = record.tables["states"].to_pandas()
+    seen, tracked = 0, [row for row in record.tables["mission"].to_pylist() if row["phase"] == "track"]
+    for row in tracked:
+        here = states[np.isclose(states.t_s, row["t_s"])]
+        places_m = np.tile([[row["target_x_m"], row["target_y_m"]]], (5, 1, 1))
+        poses = here[["x_m", "y_m", "z_m"]].to_numpy(), here[["qx", "qy", "qz", "qw"]].to_numpy()
+        seen += bool(sees_ground(places_m, *poses).any())
+    assert len(tracked) == 60 + 30
+    assert outcome(record)["mission"]["target_in_view_share"] == pytest.approx(seen / len(tracked))
 
 
 def test_a_second_target_is_a_car_of_the_scene_for_every_detector() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import namedtuple
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -33,19 +34,18 @@ def free(monkeypatch: pytest.MonkeyPatch, memory: float = 1e12, disk: float = 1e
     monkeypatch.setattr(scratch, "folder", lambda: "/scratch")
 
 
-@pytest.mark.parametrize("detector", ["none", "surrogate"])
-@pytest.mark.parametrize("drones", [2, 12])
-def test_the_record_lies_between_the_counts(drones: int, detector: str) -> None:
-    flown = scenario(12, drones, detector)
-    need = needs(flown)
-    bytes_of = {name: table.nbytes for name, table in run_sortie(flown).tables.items()}
-    certain = sum(bytes_of[name] for name in ("states", "descriptors", "receptions", "mission", "people", "medium"))
-    floats = module.AIRFRAME_FLOATS * drones + sum(
-        module.math.prod(shape) for shape in module.shapes_of(drones).values()
-    )
-    motion = 8 * floats * flown.frames
-    assert need.least_disk - motion == pytest.approx(certain, rel=0.05)
-    assert sum(bytes_of.values()) <= (need.most_disk - motion) / 2
+def test_the_record_lies_between_the_counts() -> None:
+    """Short flights of their own, of two sizes."""
+    for drones, detector in ((2, "surrogate"), (12, "none")):
+        flown = scenario(6, drones, detector)
+        need = needs(flown)
+        bytes_of = {name: table.nbytes for name, table in run_sortie(flown).tables.items()}
+        certain = sum(bytes_of[name] for name in ("states", "descriptors", "receptions", "mission", "people", "medium"))
+        shapes = module.shapes_of(drones).values()
+        floats = module.AIRFRAME_FLOATS * drones + sum(module.math.prod(shape) for shape in shapes)
+        motion = 8 * floats * flown.frames
+        assert need.least_disk - motion == pytest.approx(certain, rel=0.05)
+        assert sum(bytes_of.values()) <= (need.most_disk - motion) / 2
 
 
 def test_needs_rise_with_duration_and_drones() -> None:
@@ -65,27 +65,27 @@ def test_links_within_earshot_are_counted_for_large_fleets() -> None:
     assert needs(loud).memory - needs(quiet).memory == pytest.approx(1000 * 999 * 20 * 32, rel=0.2)
 
 
-@pytest.mark.parametrize(
-    ("need", "words", "sure"),
-    [
-        (Needs(int(3e9), 1, 1), "needs 3.0 GB of memory, 2.0 GB are free", True),
-        (Needs(1, int(5e9), int(9e9)), "needs at least 5.0 GB of disk, 4.0 GB are free in /scratch", True),
-        (Needs(1, 1, int(9e9)), "may need up to 9.0 GB of disk, 4.0 GB are free in /scratch", False),
-        (Needs(1, 1, int(4e9)), "", False),
-    ],
-)
-def test_what_is_short_is_said(
-    need: Needs, words: str, sure: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+SHORT_OF: list[tuple[Needs, str, bool]] = [
+    (Needs(int(3e9), 1, 1), "needs 3.0 GB of memory, 2.0 GB are free", True),
+    (Needs(1, int(5e9), int(9e9)), "needs at least 5.0 GB of disk, 4.0 GB are free in /scratch", True),
+    (Needs(1, 1, int(9e9)), "may need up to 9.0 GB of disk, 4.0 GB are free in /scratch", False),
+    (Needs(1, 1, int(4e9)), "", False),
+]
+"""A need, what is short, and whether that is sure."""
+
+
+def test_what_is_short_is_named_and_refused_where_it_is_sure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     free(monkeypatch, memory=2e9, disk=4e9)
-    assert module.shortage(need, tmp_path / "runs/a") == (words, sure)
-    assert ensure_room(scenario(), need, tmp_path, force=True) == words
-    if not sure:
-        assert ensure_room(scenario(), need, tmp_path) == words
-        return
-    with pytest.raises(RunError) as error:
-        ensure_room(scenario(), need, tmp_path)
-    assert str(error.value) == f"track_target: {words}; make room, set TMPDIR to another disk, or fly it with --force"
+    for need, words, sure in SHORT_OF:
+        assert module.shortage(need, tmp_path / "runs/a") == (words, sure)
+        assert ensure_room(scenario(), need, tmp_path, force=True) == words
+        if not sure:
+            assert ensure_room(scenario(), need, tmp_path) == words
+            continue
+        with pytest.raises(RunError) as error:
+            ensure_room(scenario(), need, tmp_path)
+        ending = "make room, set TMPDIR to another disk, or fly it with --force"
+        assert str(error.value) == f"track_target: {words}; {ending}"
 
 
 def test_fly_refuses_without_force(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -105,8 +105,8 @@ def test_fly_refuses_without_force(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     refused = CliRunner().invoke(app, asked)
     assert refused.exit_code == 1
     assert not (tmp_path / "run").exists()
-    told = " ".join(str(refused.exception or refused.output).split())
-    assert "of memory, 1 MB are free; make room, set TMPDIR to another disk, or fly it with --force" in told
+    line = " ".join(str(refused.exception or refused.output).split())
+    assert "of memory, 1 MB are free; make room, set TMPDIR to another disk, or fly it with --force" in line
     flown = CliRunner().invoke(app, [*asked, "--force"])
     assert flown.exit_code == 0, flown.output
     assert (tmp_path / "run/outcome.json").is_file()
@@ -143,7 +143,8 @@ def test_a_fast_flight_is_measured_for_some_seconds_and_a_short_one_is_not_told_
 def test_fly_and_check_tell_how_long_they_take(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(module, "LONG_S", 0.0)
     monkeypatch.setattr(module, "MEASURED_WALL_S", 0.0)
-    monkeypatch.setitem(module.Forecast.__init__.__kwdefaults__, "clock", count(0.0, 0.01).__next__)  # type: ignore[index]
+    defaults: Any = module.Forecast.__init__.__kwdefaults__
+    monkeypatch.setitem(defaults, "clock", count(0.0, 0.01).__next__)
     monkeypatch.chdir(tmp_path)
     short = ["track_target", "--set", "duration_s=3", "--set", "perception.detector=none"]
     flown = CliRunner().invoke(app, ["fly", *short, "--no-recording", "--out", "run"])

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 from sim_examples import example
 
 from sortie.scenarios.reading.load import build
@@ -28,7 +27,8 @@ def events(*settings: str) -> list[tuple[float, int, str]]:
 
 def crossing(altitude_m: float) -> str:
     at = LINE.replace("60", str(altitude_m))
-    return f"fleet.groups=[{{drones: [1], {at}, route: {{waypoints_m: [[20, 0], [-20, 0]], speed_mps: 8, turn_time_s: 1}}}}]"
+    route = "route: {waypoints_m: [[20, 0], [-20, 0]], speed_mps: 8, turn_time_s: 1}"
+    return f"fleet.groups=[{{drones: [1], {at}, {route}}}]"
 
 
 def test_two_groups_that_fly_head_on_are_named_once() -> None:
@@ -52,19 +52,16 @@ def test_a_drone_over_a_ground_station_is_named_and_two_stations_are_not() -> No
     ]
 
 
-@pytest.mark.parametrize(
-    ("fleet", "pairs"),
-    [
+def test_who_may_meet() -> None:
+    for fleet, pairs in (
         ({"drones": 3}, set()),
         ({"drones": 3, "groups": [{"drones": [1, 2]}]}, {(0, 1), (0, 2)}),
         ({"drones": 3, "groups": [{"drones": [1, 2], "mobility": "gauss_markov"}]}, {(0, 1), (0, 2), (1, 2)}),
         ({"drones": 3, "mobility": "random_waypoint"}, {(0, 1), (0, 2), (1, 2)}),
         ({"drones": 3, "ground": [{"drone": 1}, {"drone": 2}]}, {(0, 1), (0, 2)}),
-    ],
-)
-def test_who_may_meet(fleet: dict[str, object], pairs: set[tuple[int, int]]) -> None:
-    apart = strangers(build({"name": "a", "fleet": fleet}).fleet)
-    assert {(int(a), int(b)) for a, b in zip(*apart.nonzero(), strict=True) if a < b} == pairs
+    ):
+        apart = strangers(build({"name": "a", "fleet": fleet}).fleet)
+        assert {(int(a), int(b)) for a, b in zip(*apart.nonzero(), strict=True) if a < b} == pairs
 
 
 SIX = {"drones": 6, "groups": [{"drones": [1]}, {"drones": [2, 5]}], "ground": [{"drone": 3}, {"drone": 4}]}
@@ -85,9 +82,11 @@ def noted(fleet: dict[str, object], *frames: Sequence[float], down: str = "", de
     told: list[str] = []
     frame, drones = 0, [SimpleNamespace(airborne=True) for _ in frames[0]]
     world: Any = SimpleNamespace(
-        motion=SimpleNamespace(position_m=place), drones=drones, homebound=set(map(int, descends.split())),
+        motion=SimpleNamespace(position_m=place),
+        drones=drones,
+        homebound=set(map(int, descends.split())),
         note=lambda drone, kind, text: told.append(f"{frame}: {drone}-{text.split(',')[0][-1]} {text.split()[0]}"),
-    )  # fmt: skip
+    )
     watch = Separation(build({"name": "by_hand", "fleet": fleet}), world)
     for frame in range(len(frames)):
         for number, drone in enumerate(drones):
@@ -99,35 +98,30 @@ def noted(fleet: dict[str, object], *frames: Sequence[float], down: str = "", de
 PAIR = {"drones": 2, "groups": [{"drones": [1]}]}
 
 
-@pytest.mark.parametrize(
-    ("apart_m", "down", "told"),
-    [
-        # nearer than 5 m is a meeting, 5 m are none, and jitter up to 6 m is no second one
-        ([9.0, 5.0, 4.9, 5.1, 5.9, 4.9, 3.0], "", ["2: 0-1 4.9"]),
-        # from 6 m on the pair has parted: the next meeting is another one, as often as it happens
-        ([4.0, 5.9, 4.1, 6.0, 4.2, 9.0, 4.3, 5.0], "", ["0: 0-1 4.0", "4: 0-1 4.2", "6: 0-1 4.3"]),
-        # one that parted needs no wider berth than one that never met
-        ([4.0, 6.1, 5.1, 5.5], "", ["0: 0-1 4.0"]),
-        # either of the two on the ground is no meeting, whichever it is, and both together are none
-        ([4.0] * 4, "0:0 1:1 2:0 2:1", ["3: 0-1 4.0"]),
-        # who takes off again beside another meets it anew
-        ([4.0] * 4, "1:1", ["0: 0-1 4.0", "2: 0-1 4.0"]),
-    ],
-)
-def test_a_meeting_of_two_is_noted_once_by_hand(apart_m: list[float], down: str, told: list[str]) -> None:
-    """Frame by frame."""
-    assert noted(PAIR, *((0.0, x_m) for x_m in apart_m), down=down) == told
+MEETINGS: list[tuple[list[float], str, list[str]]] = [
+    # nearer than 5 m is a meeting, 5 m are none, and jitter up to 6 m is no second one
+    ([9.0, 5.0, 4.9, 5.1, 5.9, 4.9, 3.0], "", ["2: 0-1 4.9"]),
+    # from 6 m on the pair has parted: the next meeting is another one, as often as it happens
+    ([4.0, 5.9, 4.1, 6.0, 4.2, 9.0, 4.3, 5.0], "", ["0: 0-1 4.0", "4: 0-1 4.2", "6: 0-1 4.3"]),
+    # one that parted needs no wider berth than one that never met
+    ([4.0, 6.1, 5.1, 5.5], "", ["0: 0-1 4.0"]),
+    # either of the two on the ground is no meeting, whichever it is, and both together are none
+    ([4.0] * 4, "0:0 1:1 2:0 2:1", ["3: 0-1 4.0"]),
+    # who takes off again beside another meets it anew
+    ([4.0] * 4, "1:1", ["0: 0-1 4.0", "2: 0-1 4.0"]),
+]
+"""Frame by frame: how far apart two drones are, who is on the ground, and what is noted."""
+
+
+def test_a_meeting_of_two_is_noted_once_by_hand() -> None:
+    got = [noted(PAIR, *((0.0, x_m) for x_m in apart_m), down=down) for apart_m, down, _ in MEETINGS]
+    assert got == [told for *_, told in MEETINGS]
 
 
 def test_of_many_that_meet_each_pair_is_noted_once_by_its_lower_number() -> None:
-    """Members of one group and two stations are no pairs. All but the pairs of 2 and 5 and of 3 and 4 meet: 13 of 15."""
+    """Members of one group and two stations are no pairs: all but 2 with 5 and 3 with 4 meet."""
     crowd = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
-    every = [
-        f"{a}-{b} {(b - a) / 10:.1f}"
-        for a in range(6)
-        for b in range(a + 1, 6)
-        if (a, b) not in {(2, 5), (3, 4)}
-    ]  # fmt: skip
+    every = [f"{a}-{b} {(b - a) / 10:.1f}" for a in range(6) for b in range(a + 1, 6) if (a, b) not in {(2, 5), (3, 4)}]
     assert noted(SIX, crowd, crowd) == [f"0: {pair}" for pair in every]
 
 
