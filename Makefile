@@ -50,7 +50,7 @@ test-lowest: ## test the lowest versions that pyproject.toml allows, without tor
 	$(PYTHON) -m venv --clear .venv-lowest
 	.venv-lowest/bin/python -m pip install --quiet uv
 	.venv-lowest/bin/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct \
-		-e '.[mavlink,ros2,verify]' 'pytest>=8.2' 'hypothesis>=6.100' 'pytest-benchmark>=5' 'pyulog>=1.1' 'shapely>=2.0.6' 'networkx>=3.3'
+		-e '.[mavlink,ros2,verify]' 'pytest>=8.2' 'hypothesis>=6.100' 'pytest-benchmark>=5' 'pyulog>=1.1' 'shapely>=2.0.6' 'networkx>=3.3' 'filelock>=3.12'
 	.venv-lowest/bin/sortie fly track_target --set perception.detector=surrogate --set duration_s=5 --out .venv-lowest/run
 	@# the one left out counts the operations of the torch network
 	.venv-lowest/bin/python -m pytest -m 'not slow' tests/scenarios tests/policies tests/radio tests/fleet --ignore tests/fleet/test_fleet_computer.py
