@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from sortie.fleet import coverage_loops
 from sortie.fleet.chart import Chart
 from sortie.fleet.coverage import (
     CELL_M,
@@ -26,10 +27,11 @@ from sortie.fleet.coverage import (
     views,
 )
 from sortie.perception.geometry import FULL, USUAL, Cameras
+from sortie.perception.scene import height_field, sight_loops
 from sortie.perception.scene.height_field import CAR_TOP_M
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.policies.catalogue.coverage_cells import Cells, seen_well, well_cells
-from sortie.policies.contract import Coverage, Descriptor
+from sortie.policies.contract import COVERAGE_CELLS, Coverage, Descriptor
 from sortie.scenarios.schema import Scene
 
 BOUNDS = (-100.0, -100.0, 100.0, 100.0)
@@ -260,3 +262,8 @@ def test_a_chart_holds_whatever_is_claimed() -> None:
         chart.fold([heard])
         known |= seen_well(heard)
     chart.fold([claim(bytes([255]) * 64, 3e38, -3e38)])
+
+
+def test_the_compiled_loops_have_the_constants_of_the_raster() -> None:
+    assert (coverage_loops._CELLS, coverage_loops._WELL) == (COVERAGE_CELLS, Coverage.WELL)
+    assert (sight_loops._RES_M, sight_loops._STEP_M) == (height_field.RES_M, height_field.STEP_M)

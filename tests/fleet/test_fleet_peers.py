@@ -57,6 +57,20 @@ def heard(mine: PeerMemory, peer: int, t_s: float) -> None:
     assert mine.hear(Opened(descriptor(peer, t_s), None, 0), t_s) is None
 
 
+def test_probes_count_the_descriptors_heard_and_missed() -> None:
+    mine = memory()
+    for k in range(30):
+        if k % 5:  # every fifth is missed
+            heard(mine, 1, 0.003 * (k % 2) + 0.1 * k)
+
+    def share(now_s: float) -> float | None:
+        return heard_share(filled(mine, (0.0, 0.0), now_s)[0])
+
+    assert share(2.93) == pytest.approx(0.8)
+    assert share(3.42) == pytest.approx(0.5)  # 3.0 and four more are missed by now
+    assert filled(mine, (0.0, 0.0), 3.98) == (SILENT_MBPS, 0.0) == filled(mine, (0.0, 0.0), 1e6)
+
+
 def test_probes_stand_where_nothing_was_measured_and_have_no_rate() -> None:
     """Whoever one is: a slot is of the peer that it is of."""
     for me in range(5):

@@ -9,10 +9,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+import pytest
 from fleet_examples import DESCRIPTOR, grid_on_a_plain
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sortie.fleet import trust
 from sortie.fleet.coverage import (
     View,
     pack_grid,
@@ -30,6 +32,7 @@ from sortie.fleet.trust import (
     judge,
     split_arrivals,
 )
+from sortie.perception.geometry import Cameras
 from sortie.policies.contract import (
     COVERAGE_CELL_M,
     Coverage,
@@ -223,6 +226,18 @@ def test_who_looks_and_sees_nothing_is_doubted_in_any_form_that_has_a_grid() -> 
     known = {i: honest(i)._replace(coverage_grid=bytes(64)) for i in (0, 1)}
     for form, doubted in ((Form(), True), (Form(grid_cells=8), True), (Form(grid_cells=0), False)):
         assert (judge({}, 0, known, {}, form, {1})[1].strikes == 1) is doubted
+
+
+def test_a_claim_is_counted_once_whoever_made_the_record_of_its_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted: list[int] = []
+    count = trust._count
+    monkeypatch.setattr(trust, "_count", lambda claims, *rest: counted.append(len(claims)) or count(claims, *rest))
+    claims = [honest(i, 20.0 * i) for i in range(4)]
+    first = trust._count_cells(claims, 0.0, [Cameras(60.0) for _ in claims])
+    assert trust._count_cells(claims, 0.0, [Cameras(60.0) for _ in claims]) == first
+    assert counted == [4]
+    trust._count_cells(claims, 0.0, [Cameras(61.0) for _ in claims])
+    assert counted == [4, 4]
 
 
 # --- goodput ----------------------------------------------------------------------------------------------

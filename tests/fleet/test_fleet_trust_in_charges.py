@@ -10,6 +10,7 @@ from agent_rig import descriptor, memory
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sortie.fleet import trust, trust_loops
 from sortie.fleet.messages.compact import Form
 from sortie.fleet.plane import equipment_of
 from sortie.fleet.standings import UNJUDGED, Standing, Standings
@@ -234,3 +235,8 @@ def test_the_compiled_loop_finds_what_the_formula_finds(data: st.DataObject) -> 
             assert now.strikes == (min(was.strikes + 1, 6) if doubt and i else max(was.strikes - 1, 0))
             assert now.reason == (doubt if doubt and i else was.reason)
             assert now.least_soc == min(was.least_soc, socs[i])
+
+
+def test_the_compiled_loop_has_the_constants_of_the_formula() -> None:
+    for name in ("RISE", "PERCENT", "FALL", "FALL_SHARE", "LONG_SILENCE"):
+        assert getattr(trust_loops, f"_{name}") == getattr(trust, name)
