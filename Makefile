@@ -25,7 +25,7 @@ $(LIGHT): pyproject.toml constraints.txt
 		|| { $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt torch \
 		&& $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[torch,view]'; }
 	@echo 'compiling loops, which later runs reuse: a minute on slow cores'
-	@$(BIN)/sortie fly track_target --set duration_s=2 --set 'mission.phases=[{phase: search}]' --out $(VENV)/compiled --replace >/dev/null
+	@$(BIN)/sortie fly track_target --set duration_s=2 --out $(VENV)/compiled --replace >/dev/null
 	@touch $@
 
 # what tests, lint and research need besides

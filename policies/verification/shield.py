@@ -104,9 +104,8 @@ def check_shieldable(invariants: Iterable[Invariant]) -> tuple[Invariant, ...]:
         for node in rule.nodes:
             name = node.function if isinstance(node, LinksTerm) else node.change if isinstance(node, Recent) else ""
             if name in _NOT_SHIELDED:
-                raise InvariantError(
-                    f"{rule.text!r}: a shield cannot keep {name}(…); `sortie verify` can only prove it"
-                )
+                what = f"a shield cannot keep {name}(…); `sortie verify` can only prove it"
+                raise InvariantError(f"{rule.text!r}: {what}")
     return rules
 
 
@@ -230,12 +229,14 @@ class _Enforcing:
         if len(kept) == len(self._together):
             return begin, []
         held = [(r, k) for r in self._alone for k in range(len(begin.links)) if not self._breaks(r, k, begin)]
-        state = self._settle([*held, *self._places(self._together)], begin)
+        # from where no link has moved: the nearest way to keep a line alone may bar another line
+        unmoved = _State(tuple(self._base), tuple(self._ceilings), ((0, 0.0),) * len(self._base))
+        state = self._settle([*held, *self._places(self._together)], unmoved)
         if state is not None:
             return state, []
         state = begin
         for rule in self._together:
-            found = None if rule in kept else self._settle([*held, *self._places([*kept, rule])], begin)
+            found = None if rule in kept else self._settle([*held, *self._places([*kept, rule])], unmoved)
             if found is not None:
                 kept.append(rule)
                 state = found
@@ -261,9 +262,8 @@ class _Enforcing:
                 best = state
                 continue
             further = [after for after in self._ways_out(state, *broken) if after is not None]
-            waiting += sorted(further, key=lambda after: after.cost)[
-                ::-1
-            ]  # the nearest, and of equals the first, is next
+            # the nearest, and of equals the first, is next
+            waiting += sorted(further, key=lambda after: after.cost)[::-1]
         return best
 
     def _ways_out(self, state: _State, rule: Invariant, k: int) -> Iterator[_State | None]:

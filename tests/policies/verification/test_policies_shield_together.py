@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from random import Random
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from policies_examples import changed, fleet_of
 
@@ -97,6 +97,7 @@ def test_after_the_shield_every_line_holds_or_is_named(seed: int, some_lines) ->
 
 @settings(max_examples=80)
 @given(st.integers(0, 2**32))
+@example(3082)  # the nearest way to keep the last line alone bars the second one
 def test_lines_that_some_directives_keep_are_all_kept(seed: int) -> None:
     """Compared with every combination of the values that the lines name, for two links."""
     draw = Random(seed)
