@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sortie.policies.contract import Descriptor, Directive, Disc, Representation, goodput_to_members
 from sortie.scenarios.link_state import PROBED_MBPS
@@ -22,6 +22,9 @@ SAME_DISC_M = 1.6
 """A disc that moved by less than this (half a feature cell) is the same disc: it selects almost the same cells."""
 EPSILON_S = 1e-9
 """Tolerance of times: a dwell of 1 s is over at the tenth frame, whatever the rounding."""
+
+_CHARGE_TO_LINKS = slice(Descriptor._fields.index("battery_soc"), Descriptor._fields.index("peer_goodput_mbps") + 1)
+"""The fields of a descriptor with a hysteresis band: charge, both headrooms, goodput."""
 
 
 def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float) -> Descriptor:
@@ -43,27 +46,8 @@ def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float
     if not hysteresis:
         return measured
     part = 1.0 / (1.0 + hysteresis)
-    optional: list[Any]
-    # unpacked and built again for speed: every drone does this in every frame
-    (
-        stamp,
-        agent,
-        at,
-        turn,
-        velocity,
-        footprint,
-        own_soc,
-        own_cpu,
-        own_gpu,
-        own_links,
-        grid,
-        flags,
-        phase,
-        region,
-        targets,
-        *optional,
-    ) = measured
-    soc, cpu, gpu, links, last = own_soc, own_cpu, own_gpu, own_links, before.peer_goodput_mbps
+    own = measured.battery_soc, measured.cpu_headroom, measured.gpu_headroom, measured.peer_goodput_mbps
+    (soc, cpu, gpu, links), last = own, before.peer_goodput_mbps
     if measured.roster is not None and measured.roster != before.roster:
         last = goodput_to_members(before, measured.roster)
     if links != last and len(links) == len(last):  # else the fleet is another
@@ -79,26 +63,11 @@ def apply_hysteresis(before: Descriptor, measured: Descriptor, hysteresis: float
         cpu = max(before.cpu_headroom, cpu * part)
     if gpu > before.gpu_headroom:
         gpu = max(before.gpu_headroom, gpu * part)
-    if soc == own_soc and cpu == own_cpu and gpu == own_gpu and links == own_links:
+    if (soc, cpu, gpu, links) == own:
         return measured
-    return Descriptor(
-        stamp,
-        agent,
-        at,
-        turn,
-        velocity,
-        footprint,
-        soc,
-        cpu,
-        gpu,
-        links,
-        grid,
-        flags,
-        phase,
-        region,
-        targets,
-        *optional,
-    )
+    # built from its parts for speed: every drone does this in every frame
+    before_these, after_them = measured[: _CHARGE_TO_LINKS.start], measured[_CHARGE_TO_LINKS.stop :]
+    return Descriptor._make((*before_these, soc, cpu, gpu, links, *after_them))
 
 
 class DampedLink(NamedTuple):

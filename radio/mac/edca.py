@@ -46,58 +46,13 @@ OVERLAPS = 12
 NOTHING, GROUP, DATA, BLOCK_REQUEST, RTS, CTS, ANSWER = range(7)
 
 # columns of a station; first come all those that a frame changes at those who only hear it
-(
-    TX_END,
-    RESPONSE_AT,
-    TIMEOUT_AT,
-    GRANT,
-    GRANT_LOW,
-    ARRIVE_AT,
-    LOCK,
-    DEAF,
-    LOOKED_AT,
-    IS_BUSY,
-    CANDIDATE,
-    CANDIDATE_AT,
-    CANDIDATE_LINK,
-    TOUCHED,
-    EIFS_UNTIL,
-    SEGMENTS,
-    LOCK_AT,
-    LOCK_LINK,
-    NAV,
-    IDLE_AT,
-    BEGIN,
-    BEGIN_LOW,
-    SLOTS,
-    SLOTS_LOW,
-    TX_KIND,
-    TX_TO,
-    TX_ACCESS,
-    TX_COUNT,
-    TX_MCS,
-    TX_NAV,
-    TX_BEGIN,
-    TX_JOB,
-    RESPONSE_KIND,
-    RESPONSE_TO,
-    RESPONSE_NS,
-    AWAITS,
-    ACCESS,
-    WINDOW,
-    WINDOW_LOW,
-    FAILS,
-    FAILS_LOW,
-    HEAD,
-    HEAD_LOW,
-    TAIL,
-    TAIL_LOW,
-    REQUEST,
-    SENT,
-    DRAWN,
-    COMING,
-    TRANSMITTED_NS,
-) = range(50)
+TX_END, RESPONSE_AT, TIMEOUT_AT, GRANT, GRANT_LOW, ARRIVE_AT, LOCK, DEAF = range(8)
+LOOKED_AT, IS_BUSY, CANDIDATE, CANDIDATE_AT, CANDIDATE_LINK, TOUCHED, EIFS_UNTIL, SEGMENTS = range(8, 16)
+LOCK_AT, LOCK_LINK, NAV, IDLE_AT, BEGIN, BEGIN_LOW, SLOTS, SLOTS_LOW = range(16, 24)
+TX_KIND, TX_TO, TX_ACCESS, TX_COUNT, TX_MCS, TX_NAV, TX_BEGIN, TX_JOB = range(24, 32)
+RESPONSE_KIND, RESPONSE_TO, RESPONSE_NS, AWAITS, ACCESS, WINDOW, WINDOW_LOW, FAILS = range(32, 40)
+FAILS_LOW, HEAD, HEAD_LOW, TAIL, TAIL_LOW, REQUEST, SENT, DRAWN = range(40, 48)
+COMING, TRANSMITTED_NS = range(48, 50)
 HEARING_COLUMNS, STATION_COLUMNS = 24, 56
 """Whole lines of a processor's cache; the last columns are empty."""
 HEARS, ACTS, SENDS = 1, 2, 3
@@ -106,27 +61,9 @@ NEXT_AT, INCIDENT = range(2)
 """Rows of what all stations are asked at once: when the next thing happens, and how many frames are on the air there."""
 
 # columns of a job
-(
-    KIND,
-    STATION,
-    FLOW,
-    FOLLOWING,
-    COUNT,
-    FULL_BYTES,
-    LAST_BYTES,
-    DROPPED,
-    IS_LIVE,
-    JOB_ACCESS,
-    READY_AT,
-    IS_TOLD,
-    VAIN_TRIES,
-    ANSWERS,
-    LOW,
-    HIGH,
-    ARRIVED,
-    AIR_NS,
-    HEAD_AT,
-) = range(19)
+KIND, STATION, FLOW, FOLLOWING, COUNT, FULL_BYTES, LAST_BYTES, DROPPED = range(8)
+IS_LIVE, JOB_ACCESS, READY_AT, IS_TOLD, VAIN_TRIES, ANSWERS, LOW, HIGH = range(8, 16)
+ARRIVED, AIR_NS, HEAD_AT = range(16, 19)
 JOB_COLUMNS = 19
 
 # columns of a flow
@@ -135,24 +72,8 @@ FLOW_COLUMNS = 4
 FLOW_RATE, FLOW_LOSS, FLOW_BURST = range(3)
 
 # the settings, as integers and as floats
-(
-    C_STATIONS,
-    C_AIFSN,
-    C_AIFSN_LOW,
-    C_WINDOW,
-    C_WINDOW_LOW,
-    C_LARGEST,
-    C_LARGEST_LOW,
-    C_RETRIES,
-    C_BLOCK,
-    C_RTS,
-    C_FRAME,
-    C_BY_FRAME,
-    C_PREAMBLE_NS,
-    C_SYMBOL_NS,
-    C_LEARNS,
-    C_EXTRA,
-) = range(16)
+C_STATIONS, C_AIFSN, C_AIFSN_LOW, C_WINDOW, C_WINDOW_LOW, C_LARGEST, C_LARGEST_LOW, C_RETRIES = range(8)
+C_BLOCK, C_RTS, C_FRAME, C_BY_FRAME, C_PREAMBLE_NS, C_SYMBOL_NS, C_LEARNS, C_EXTRA = range(8, 16)
 # totals, and then who is on the air, by ascending id
 G_SINCE, G_GROUPS, G_OTHERS, G_GROUP_NS, G_OTHER_NS, G_SENDERS, G_FIRST = range(7)
 
