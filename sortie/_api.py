@@ -7,8 +7,8 @@ import math
 import operator
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -82,7 +82,7 @@ def fly(
     policy: PolicyLike | None = None,
     seed: int | None = None,
     replication: int = 0,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | Literal[True] | None = None,
     observer: Observer | None = None,
 ) -> Run:
     """Fly one sortie.
@@ -93,7 +93,8 @@ def fly(
             the end: the scenario's changes of policy and its commands are ignored.
         seed: determines every random draw; None uses the scenario's own.
         replication: the number of the repetition. Each has other random draws under the same seed.
-        progress: called with the simulated time (s) once a simulated second.
+        progress: called with the simulated time (s) once a simulated second; True shows a bar, or a line a minute
+            where there is no terminal.
         observer: gets the new rows of the record once a simulated second.
 
     Returns:
@@ -116,10 +117,10 @@ def fly(
 
     chosen, function = _with_policy(load(scenario, overrides), policy)
     seed, replication = whole("seed", seed), whole("replication", replication, 32) or 0
-    _ensure_callable("progress", progress)
     if observer is not None and not all(callable(getattr(observer, name, None)) for name in ("begin", "second")):
         raise ScenarioError(f"observer: {observer!r}, must have the methods begin and second")
-    record = run_sortie(chosen, function, seed, replication=replication, progress=progress, observer=observer)
+    with _shown(progress, chosen.name, chosen.duration_s) as watch:
+        record = run_sortie(chosen, function, seed, replication=replication, progress=watch, observer=observer)
     return Run(record)
 
 
@@ -224,7 +225,7 @@ def compare(
     *,
     seeds: int | Iterable[int] | None = None,
     own_fusion: bool = False,
-    progress: Callable[[str, int, float], None] | None = None,
+    progress: Callable[[str, int, float], None] | Literal[True] | None = None,
     half_width: float | None = None,
     metric: str | None = None,
     pilot: int | None = None,
@@ -246,7 +247,7 @@ def compare(
             the scenario's own town, and intervals cover that flight alone: they resample its blocks of 5 s.
         own_fusion: fly published methods with the fusion that they were published with, not `perception.fusion`.
         progress: called with the policy's label, the seed and the simulated time (s). With `half_width`: called with the
-            stage, the number of seeds flown in it, and the number of all its seeds.
+            stage, the number of seeds flown in it, and the number of all its seeds. True shows a bar.
         half_width: fly until the 95 % interval of every gain in `metric` reaches at most this far to each side, in AP: 0.01
             is one AP point. Scored by the scenario's detector, or by torch if that is the surrogate. Not with `seeds`.
         metric: `ap50.full_scene` (None) or `ap50.mission`.
@@ -284,9 +285,9 @@ def compare(
         raise PolicyError(f"policies: {', '.join(labels) or 'none'}, must be one or more, each named once{how}")
     if half_width is not None:
         settings = _precision_settings(half_width, seeds, metric, pilot, most_seeds)
-        _ensure_callable("progress", progress)
         path = default_path(flown, settings.pilot) if kept is True else as_path("kept", kept) if kept else None
-        return Comparison(*compare_to(flown, settings, path, progress))
+        with _stages_shown(progress) as watch:
+            return Comparison(*compare_to(flown, settings, path, watch))
     for name, value in (("metric", metric), ("pilot", pilot), ("most_seeds", most_seeds), ("kept", kept or None)):
         if value is not None:
             raise RunError(f"{name}: goes with half_width, which is missing")
@@ -297,10 +298,10 @@ def compare(
     else:
         raise ScenarioError(f"seeds: {seeds!r}, must be a list of seeds or how many, 1 or more")
     chosen = [whole("seeds", seed) or 0 for seed in listed]
-    _ensure_callable("progress", progress)
     if not chosen or len(set(chosen)) < len(chosen):
         raise ScenarioError(f"seeds: {chosen}, must be one or more, each named once")
-    return Comparison(*compare_policies(flown, chosen, progress=progress))
+    with _shown(progress, base.name, len(flown) * len(chosen) * base.duration_s) as watch:
+        return Comparison(*compare_policies(flown, chosen, progress=_summed(watch) if progress is True else watch))
 
 
 def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = False) -> Replay:
@@ -393,7 +394,7 @@ def campaign(
     by_torch: int | None = None,
     resume: bool = False,
     retry_failed: bool = False,
-    progress: Callable[[Any], None] | None = None,
+    progress: Callable[[Any], None] | Literal[True] | None = None,
     notice: Callable[[str], None] | None = None,
 ) -> CampaignResult:
     """Fly a campaign: many sorties over the fields that its file varies.
@@ -413,7 +414,7 @@ def campaign(
             `by_torch` within the campaign's. The report then estimates what torch would find over all of them.
         resume: only continue; raise an error if the folder has no campaign.
         retry_failed: fly failed runs once more.
-        progress: called with a `sortie.sim.campaign.drive.Progress` after each batch.
+        progress: called with a `sortie.sim.campaign.drive.Progress` after each batch; True shows a bar.
         notice: called with a line when a cluster has no workers; None issues warnings.
 
     Raises:
@@ -439,7 +440,8 @@ def campaign(
         raise RunError(f"workers: {workers!r}, must be a whole number from 0 on, or None")
     if worker_memory_gb is not None and not (_is_number(worker_memory_gb) and 0 < worker_memory_gb < math.inf):
         raise RunError(f"worker_memory_gb: {worker_memory_gb!r}, must be a number above 0, or None")
-    _ensure_callable("progress", progress)
+    if progress is not True:
+        _ensure_callable("progress", progress)
     _ensure_callable("notice", notice)
     tell = _warn if notice is None else notice
     files = None if security is None else _certificates(security)
@@ -453,15 +455,18 @@ def campaign(
         if units is not None:
             by_torch_plan = plan_by_torch(study, units, plan)
             ensure_usable(folder / FOLDER, by_torch_plan)
-        with open_engine(
-            count,
-            scheduler,
-            security=files,
-            wait_s=wait_for_workers_s,
-            notice=tell,
-            memory_b=None if worker_memory_gb is None else round(worker_memory_gb * 1e9),
-        ) as engine:
-            watch = (lambda p: None) if progress is None else progress
+        with (
+            _stages_shown(progress) as shown,
+            open_engine(
+                count,
+                scheduler,
+                security=files,
+                wait_s=wait_for_workers_s,
+                notice=tell,
+                memory_b=None if worker_memory_gb is None else round(worker_memory_gb * 1e9),
+            ) as engine,
+        ):
+            watch = _of_campaign(shown) if progress is True else shown or (lambda p: None)
             how: dict[str, Any] = {"retry_failed": retry_failed, "progress": watch}
             done = [run_campaign(plan, folder, engine, resume_only=resume, **how)]
             if units is not None:  # of those that stop_when left
@@ -512,7 +517,7 @@ def check(
     overrides: Overrides = (),
     *,
     update: bool = False,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | Literal[True] | None = None,
 ) -> tuple[Checked, ...]:
     """Fly scenarios and test the expectations that they state.
 
@@ -521,7 +526,7 @@ def check(
             file below it that has expectations is flown.
         overrides: fields to change in every scenario, as for `sortie.load`.
         update: write golden (stored) outcomes instead of comparing with them.
-        progress: called with the simulated time of the scenario that flies, s.
+        progress: called with the simulated time of the scenario that flies, s; True shows a bar for each.
 
     Returns:
         One `Checked` for each scenario, with `.verdicts`, `.failed`, and `.replay(verdict)`: the command that shows
@@ -536,17 +541,20 @@ def check(
         >>> [checked.failed for checked in sortie.check(folder)]
         [[]]
     """
-    from sortie.sim.check.checking import check_scenario
+    from sortie.sim.check.checking import check_scenario, flights
     from sortie.sim.check.discovery import scenario_files
 
-    _ensure_callable("progress", progress)
+    if progress is not True:
+        _ensure_callable("progress", progress)
     chosen = scenarios if isinstance(scenarios, Sequence) and not isinstance(scenarios, str) else [scenarios]
     names = [name for one in chosen for name in scenario_files(as_path("scenarios", one))]
     _ensure_overrides(overrides)
-    for name in names:
-        reading.load(name, overrides)  # all of them, before the first one flies
-    texts = reading.as_texts(overrides)
-    return tuple(check_scenario(name, texts, update=update, progress=progress) for name in names)
+    loaded = [(name, reading.load(name, overrides)) for name in names]  # all of them, before the first one flies
+    texts, checked = reading.as_texts(overrides), []
+    for name, flown in loaded:
+        with _shown(progress, flown.name, flown.duration_s * flights(flown)) as watch:
+            checked.append(check_scenario(name, texts, update=update, progress=watch))
+    return tuple(checked)
 
 
 @overload
@@ -628,6 +636,48 @@ def _precision_settings(half_width: Any, seeds: object, metric: Any, pilot: Any,
 
 def _is_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _summed(update: Callable[[float], None]) -> Callable[[str, int, float], None]:
+    """A comparison's progress as the simulated time of all its flights together."""
+    times_s: dict[tuple[str, int], float] = {}
+
+    def watch(policy: str, seed: int, t_s: float) -> None:
+        times_s[policy, seed] = t_s
+        update(sum(times_s.values()))
+
+    return watch
+
+
+def _of_campaign(report: Callable[[str, int, int], None]) -> Callable[[Any], None]:
+    """A campaign's progress as a bar over its runs."""
+    return lambda p: report("runs by torch" if p.by_torch else "runs", p.finished, p.of)
+
+
+@contextmanager
+def _stages_shown(progress: Any) -> Iterator[Any]:
+    """As `_shown`, with a bar for each stage."""
+    if progress is not True:
+        _ensure_callable("progress", progress)
+        yield progress
+        return
+    from sortie.sim.cli.console import stages
+
+    with stages() as report:
+        yield lambda stage, done, of: report(stage, done, round(of))
+
+
+@contextmanager
+def _shown(progress: Any, label: str, total: float) -> Iterator[Any]:
+    """What a flight calls with its progress: the caller's own function, or with True the updater of a bar."""
+    if progress is not True:
+        _ensure_callable("progress", progress)
+        yield progress
+        return
+    from sortie.sim.cli.console import bars
+
+    with bars() as add:
+        yield add(label, total)
 
 
 def _ensure_callable(name: str, value: object) -> None:

@@ -5,6 +5,7 @@ What is wrong is told as for scenarios, in one line with the campaign file's own
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from sortie.scenarios.reading.load import (
 )
 from sortie.scenarios.reading.nodes import MAX_DEPTH, Node, ScenarioError, as_node, assign, child, dotted, plain
 from sortie.scenarios.reading.strict_yaml import read_scalar
+from sortie.scenarios.remarks import unread
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.campaign import (
     Campaign,
@@ -37,6 +39,8 @@ from sortie.scenarios.schema.campaign import (
     Uniform,
 )
 from sortie.scenarios.tables import TableError, read_table
+
+_LOG = logging.getLogger("sortie")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +99,7 @@ def load_campaign(path_or_name: str | Path) -> Study:
     sections = base.model_dump(mode="json", exclude_none=True)
     drones, phases = base.fleet.drones, len(base.mission.phases)
     for name, spread in campaign.vary.items():
-        at = varied[name]
+        at, flat = varied[name], set[str | None]()
         resolved = as_node(sections, at.source, at.line)
         for row, value in enumerate(extremes(spread, columns.get(name, ())), 1):
             try:
@@ -105,6 +109,9 @@ def load_campaign(path_or_name: str | Path) -> Study:
                     raise
                 raise ScenarioError(f"{error} ({spread.file}: {spread.column} in row {row})") from None
             drones, phases = max(drones, made.fleet.drones), max(phases, len(made.mission.phases))
+            flat.add(unread(made, name, set(campaign.vary)))
+        if None not in flat and flat:
+            _LOG.warning("%s: vary.%s: %s", at.where, name, flat.pop())
     return Study(campaign, base, columns, here, root, drones, phases)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -30,6 +31,8 @@ _BOUNDS = {
     "less_than_equal": ("le", "≤"),
 }
 _UNITS = frozenset(["m", "s", "hz", "mps", "db", "dbm", "ghz", "mhz", "mbps", "w", "wh", "mohm", "deg", "bytes", "km"])
+CLOSE = 0.8
+"""How alike (of difflib) a key of the same section must be to come before one that is spelt so elsewhere."""
 _WITH_UNIT = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?\s*[a-zµ°%/]", re.IGNORECASE)
 _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[-+]?[0-9]+)?", re.IGNORECASE)
 
@@ -162,6 +165,8 @@ def _known(path: Path, root: Node, top: type[BaseModel] = Scenario) -> str:
     section = section_at(path[:-1], root, top)
     names = list(section.model_fields) if section else []
     homes = [f"in {dotted(at)}" if at else "at the top level" for at, name in _all_fields(top) if name == key]
+    if close := difflib.get_close_matches(key[:80], names, n=1, cutoff=CLOSE):
+        return f"did you mean {close[0]}?"
     if homes:
         return f"it belongs {one_of(homes)}"
     if near := nearest(key, names):

@@ -31,6 +31,7 @@ from sortie.scenarios.reading.nodes import (
 )
 from sortie.scenarios.reading.strict_yaml import read_yaml, write_yaml
 from sortie.scenarios.regular import regular
+from sortie.scenarios.remarks import remarks
 from sortie.scenarios.schema import Airframe, DescriptorForm, Scenario
 from sortie.scenarios.schema.base import PresetSection
 from sortie.scenarios.schema.conditions import ConditionSet
@@ -93,7 +94,10 @@ def _scenario(root: Node, source: str, overrides: Overrides) -> Scenario:
     else:
         for override in overrides:
             root = _override(root, override)
-    return validated(shortened(root, written), Scenario)
+    made = validated(shortened(root, written), Scenario)
+    for line in remarks(made):
+        _LOG.warning("%s: %s", made.name, line)
+    return made
 
 
 def shortened(root: Node, written: Node) -> Node:

@@ -1,4 +1,4 @@
-"""What a scenario names and what is not there: files, models in files, and their parameters."""
+"""What a scenario names and what is not there: files, models in files and their parameters, and metrics that it expects."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from sortie.scenarios.plugins.reference import installed, is_file, resolve
 from sortie.scenarios.reading.files import models_with_params, named_files
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.shipped import located
+from sortie.sim.folders import RunError
+from sortie.sim.results.outcome_fields import kind_at, open_keys
 
 
 def not_there(scenario: Scenario) -> list[str]:
-    """A line for each file that a scenario names and that is missing, and for each model that cannot be made.
+    """A line for each file that a scenario names and that is missing, for each model that cannot be made, and for each
+    expected metric that no outcome has.
 
     Files of models are loaded, as for a flight; no model is called.
     """
@@ -22,7 +25,8 @@ def not_there(scenario: Scenario) -> list[str]:
     models = list(models_with_params(sections))
     own = {name.rpartition(":")[0] for _, name, _ in models if is_file(name)}
     missing = [name for name in named_files(sections) if name not in own and not located(Path(name)).exists()]
-    return [f"no file {name}" for name in dict.fromkeys(missing)] + list(dict.fromkeys(_refused(models)))
+    lines = [*(f"no file {name}" for name in missing), *_refused(models), *_misspelt(scenario)]
+    return list(dict.fromkeys(lines))
 
 
 def _refused(models: list[tuple[str, str, dict[str, object]]]) -> Iterator[str]:
@@ -34,3 +38,20 @@ def _refused(models: list[tuple[str, str, dict[str, object]]]) -> Iterator[str]:
                 resolve(kind, name, params)
         except SortieError as error:
             yield str(error)
+
+
+def _misspelt(scenario: Scenario) -> Iterator[str]:
+    keys = open_keys(
+        scenario.fleet.drones,
+        len(scenario.mission.phases),
+        (),
+        traced=scenario.fleet.trace is not None,
+        metrics=scenario.metrics,
+    )
+    for i, expectation in enumerate(scenario.expect):
+        if expectation.metric.startswith("policies.decisions."):
+            continue  # by the names of policies, which plug-ins choose
+        try:
+            kind_at(expectation.metric, keys)
+        except RunError as error:
+            yield f"expect.{i}.metric: {error}"

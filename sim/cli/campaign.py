@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,7 @@ from sortie.sim.campaign.signals import EndedError, ended_by_sigterm
 from sortie.sim.cli.console import err, out, print_written
 
 if TYPE_CHECKING:
+    from sortie.scenarios.reading.campaign import Study
     from sortie.scenarios.schema import Scenario
     from sortie.sim.campaign.drive import Progress
 
@@ -88,6 +90,9 @@ def run(
     ] = False,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Fly failed runs again.")] = False,
     report_: Annotated[bool, typer.Option("--report/--no-report", help="Write the report at the end.")] = True,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Fly nothing: print how many runs there are, and how long they will take.")
+    ] = False,
 ) -> None:
     """Fly a campaign. After an interruption, the same command continues it and gives the same table."""
     folder = out_dir
@@ -102,7 +107,10 @@ def run(
                 refuse(context, ("security", "wait_for_workers"), "--scheduler")
             elif workers is not None:
                 raise RunError("--workers and --scheduler: name one of them")
-            name = load_campaign(campaign).campaign.campaign
+            study = load_campaign(campaign)
+            if dry_run:
+                return _print_plan(study, workers)
+            name = study.campaign.campaign
             folder = out_dir or campaign_folder(name)
             with _bar(name) as show:
                 done = sortie.campaign(
@@ -167,6 +175,17 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
         err.print(f"in the campaign run {run} failed: {row['error']}", soft_wrap=True)
     scenario, seed, replication = unpack(plan.task(run))
     return scenario, seed, replication, (row or {}).get("fingerprint") or None
+
+
+def _print_plan(study: Study, workers: int | None) -> None:
+    from sortie.sim.campaign import estimate
+    from sortie.sim.campaign.plan import make_plan
+    from sortie.sim.user_errors import user_errors
+
+    with user_errors():
+        plan = make_plan(study)
+        seconds = estimate.run_s(plan)
+    out.print(estimate.in_words(plan, seconds, workers or len(os.sched_getaffinity(0))), soft_wrap=True)
 
 
 def _notice(line: str) -> None:

@@ -7,6 +7,8 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from time import perf_counter
 from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -14,6 +16,9 @@ from rich.text import Text
 
 from sortie.sim.folders import RunError
 from sortie.sim.terminal import Terminal
+
+EVERY_S = 60.0
+"""Between two lines about one thing, where there is no terminal."""
 
 out = Terminal()
 err = Terminal(stderr=True, highlight=False)
@@ -79,19 +84,59 @@ def line_printer(name: str) -> Callable[[str], None]:
     return lambda words: err.print(f"{name}: {words}", soft_wrap=True)
 
 
+def line_a_minute(
+    label: str, total: float, *, say: Callable[[str], None], clock: Callable[[], float] = perf_counter
+) -> Callable[[float], None]:
+    """An updater that says how far something is, once a minute of wall-clock time."""
+    said_s = clock()
+
+    def update(done: float) -> None:
+        nonlocal said_s
+        if clock() - said_s >= EVERY_S:
+            said_s = clock()
+            say(_how_far(label, done, total))
+
+    return update
+
+
+def in_notebook() -> bool:
+    """Whether this process is the kernel of a notebook."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return shell is not None and hasattr(shell, "kernel")
+
+
+def line_in_notebook(label: str, total: float) -> Callable[[float], None]:
+    """An updater that renews one line below the cell."""
+    from IPython.display import display
+
+    def text(done: float) -> dict[str, str]:
+        return {"text/plain": _how_far(label, done, total)}
+
+    line = display(text(0.0), raw=True, display_id=True)  # type: ignore[no-untyped-call]
+    return lambda done: line.update(text(done), raw=True)
+
+
+def _how_far(label: str, done: float, total: float) -> str:
+    return f"{label}: {done:,.0f} of {total:,.0f}"
+
+
 @contextmanager
 def bars() -> Iterator[Callable[[str, float], Callable[[float], None]]]:
-    """A progress display; gives a function that adds a bar and returns its updater. Silent without a terminal."""
+    """A progress display; gives a function that adds a bar and returns its updater.
+
+    Without a terminal, a line on the error output once a minute says how far each is; in a notebook, a line that is renewed.
+    """
+    if not err.is_terminal:
+        yield line_in_notebook if in_notebook() else partial(line_a_minute, say=partial(err.print, soft_wrap=True))
+        return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
+    with Progress(*columns, console=err, transient=True) as progress:
 
         def add(label: str, total: float) -> Callable[[float], None]:
             task = progress.add_task(label, total=round(total))
             return lambda done: progress.update(task, completed=round(done))
 
-        if not err.is_terminal:
-            yield add
-            return
         from sortie.scenarios.compiled import when_compiling  # numba takes a second to import
 
         note = "compiling loops, which later runs reuse: a minute or so"

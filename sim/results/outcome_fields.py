@@ -424,18 +424,30 @@ def check_number(name: str, keys: Mapping[str, Collection[str]]) -> None:
     Raises:
         RunError: it never has one: no such field, wall clock, or no number; with what could have been meant.
     """
+    if name.partition(".")[0] in WALL:
+        raise RunError(f"{name}: is wall clock, a metric must follow from the run alone")
+    if what := _no_number(kind_at(name, keys)):
+        raise RunError(f"{name}: is {what}, a metric must be a number")
+
+
+def kind_at(name: str, keys: Mapping[str, Collection[str]]) -> Any:
+    """The type of a field of an outcome, by its dotted name.
+
+    Args:
+        keys: as `open_keys` gives them; a list that is not among them may be of any length.
+
+    Raises:
+        RunError: no outcome has it; with what could have been meant.
+    """
     kind: Any = Outcome
     parts = name.split(".")
-    if parts[0] in WALL:
-        raise RunError(f"{name}: is wall clock, a metric must follow from the run alone")
     for depth, part in enumerate(parts):
         above = ".".join(parts[:depth])
         below = _below(kind, part, keys.get(above))
         if below is None:
             raise RunError(f"{name}: {above or 'the outcome'} has no {part!r}, {_instead(kind, part, keys.get(above))}")
         kind = below
-    if what := _no_number(kind):
-        raise RunError(f"{name}: is {what}, a metric must be a number")
+    return kind
 
 
 def possible(name: str) -> Range:

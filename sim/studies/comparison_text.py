@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from rich.table import Table
 from rich.text import Text
 
+from sortie.radio.transmission import Status
 from sortie.scenarios.report_text import number, percent, points, size, table
 from sortie.sim.results.sentences import turns_in_words
 from sortie.sim.results.summary import PLURAL, titled
@@ -92,6 +93,10 @@ def compare_command(
     return shlex.join(said + ["--own-fusion"] * own_fusion)
 
 
+JAMMED = 0.5
+"""Of a policy's payloads: where so many miss their deadline, what is compared is a full channel."""
+
+
 def heading(flown: Flown) -> str:
     """The scenario, and how many sorties the figures are means of."""
     first = flown.sorties[0].outcome
@@ -113,6 +118,12 @@ def explanations(flown: Flown) -> Iterator[Line]:
         age = mean_of_known(s.outcome["data_age_s"]["p50"] for s in sorties)
         fused = "nothing fused" if age is None else f"fused data {age:.2f} s old at the median"
         yield Line(policy, f": {total} payloads{in_all}, {parts}; {fused}")
+        late = sum(n for fate, n in fates.items() if fate.startswith(Status.EXPIRED))
+        if late >= JAMMED * total:
+            cure = f"compare it with a smaller budget as well, {policy}(received_budget=0.1) for one"
+            yield Line(
+                policy, f": the channel is full, {percent(late / total)} of its payloads miss their deadline; {cure}"
+            )
 
 
 def precision_lines(found: Precision) -> Iterator[Line]:
