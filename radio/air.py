@@ -224,6 +224,10 @@ class Air:
         snr_db = self.channel.snr_db
         return snr_db if self._overrides is None else self._overrides.snr_db(snr_db)
 
+    def in_earshot(self) -> NDArray[np.bool_]:
+        """[N, N]: links of which the receiver hears a frame's begin in this frame."""
+        return self.usable(self._service.least_snr_db)
+
     def usable(self, least_snr_db: float) -> NDArray[np.bool_]:
         """[N, N]: links of at least this mean SNR in this frame; of those with a traced loss or goodput, the ones that
         carry anything."""

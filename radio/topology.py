@@ -1,11 +1,14 @@
-"""How a fleet hangs together over its usable links: who is connected, who is cut off, where the bottleneck is."""
+"""How a fleet hangs together over its usable links: who is connected, who is cut off, where the bottleneck is (`networkx`)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+import networkx as nx
+
+Edge = tuple[int, int, float]
+"""Sender, receiver and goodput, Mb/s."""
 
 
 class Connectivity(NamedTuple):
@@ -15,65 +18,58 @@ class Connectivity(NamedTuple):
     """Whether every drone reaches every other, over several hops if need be."""
     cut: tuple[int, ...]
     """Drones outside the largest group whose members all reach one another (of equals, that with the lowest id), ascending."""
-    bottleneck: tuple[int, int, float] | None
-    """Sender, receiver and quality of the link that limits the worst-off pair that is connected; None without links."""
+    articulation: tuple[int, ...]
+    """Drones without which a group that talks both ways falls apart, ascending."""
+    hops: float | None
+    """Links on the shortest route, the mean over all pairs with one; None without links."""
+    bottleneck: Edge | None
+    """The link that limits the worst-off pair that is connected; None without links."""
 
 
-def linked_drones(quality: ArrayLike, threshold: float) -> list[int]:
-    """Drones with at least one usable link, in or out, ascending; arguments as for `connectivity`."""
-    usable = np.asarray(quality, dtype=float) >= threshold
-    usable |= usable.T
-    np.fill_diagonal(usable, False)
-    linked: list[int] = np.flatnonzero(usable.any(axis=0)).tolist()
-    return linked
+def usable_graph(drones: Iterable[int], edges: Iterable[Edge]) -> nx.DiGraph:
+    """The usable links as a graph, with `mbps` on the edges; links of other drones are left out."""
+    found = nx.DiGraph()
+    found.add_nodes_from(drones)
+    found.add_edges_from((a, b, {"mbps": mbps}) for a, b, mbps in edges if a in found and b in found)
+    return found
 
 
-def widths(quality: ArrayLike) -> NDArray[np.float64]:
-    """How good the weakest link of the widest route between each pair is (Floyd's recursion with min and max).
-
-    Args:
-        quality: [N, N], sender by receiver; NaN is no link.
-
-    Returns:
-        [N, N]; −inf where there is no route, and on the diagonal.
-    """
-    wide = np.array(quality, dtype=float)
-    wide[np.isnan(wide)] = -np.inf
-    np.fill_diagonal(wide, -np.inf)
-    for via in range(len(wide)):
-        np.maximum(wide, np.minimum(wide[:, via, None], wide[None, via, :]), out=wide)
-    np.fill_diagonal(wide, -np.inf)
-    return wide
-
-
-def connectivity(quality: ArrayLike, threshold: float) -> Connectivity:
+def connectivity(usable: nx.DiGraph) -> Connectivity:
     """How a fleet hangs together.
 
     Args:
-        quality: [N, N], sender by receiver: goodput in Mb/s or SNR in dB; the diagonal and NaN are no links.
-        threshold: the least quality of a usable link, in the unit of `quality`.
-
-    Raises:
-        ValueError: if `quality` is not square.
+        usable: its usable links, as `usable_graph` makes it.
 
     Example, three drones in a row, and a fourth that nobody hears:
 
-    >>> connectivity([[0, 9, 1, 0], [9, 0, 6, 0], [1, 6, 0, 0], [0, 0, 0, 0]], threshold=5.0)
-    Connectivity(connected=False, cut=(3,), bottleneck=(1, 2, 6.0))
+    >>> links = [(0, 1, 9.0), (1, 0, 9.0), (1, 2, 6.0), (2, 1, 6.0)]
+    >>> connectivity(usable_graph(range(4), links))
+    Connectivity(connected=False, cut=(3,), articulation=(1,), hops=1.3333333333333333, bottleneck=(1, 2, 6.0))
     """
-    usable = np.array(quality, dtype=float)
-    if usable.ndim != 2 or usable.shape[0] != usable.shape[1]:
-        raise ValueError(f"quality has shape {usable.shape}, must be square")
-    usable[~(usable >= threshold)] = np.nan
-    np.fill_diagonal(usable, np.nan)
-    width = widths(usable)
-    has_route = np.isfinite(width)
-    bottleneck = None
-    if has_route.any():
-        limit = width[has_route].min()
-        i, j = (int(at[0]) for at in np.nonzero(usable == limit))
-        bottleneck = (i, j, float(limit))
-    np.fill_diagonal(has_route, True)
-    group = has_route & has_route.T  # a drone's row: who reaches it and is reached by it
-    largest = group[np.argmax(group.sum(axis=1))] if len(group) else group.any(axis=1)
-    return Connectivity(bool(has_route.all()), tuple(np.flatnonzero(~largest).tolist()), bottleneck)
+    groups = sorted(nx.strongly_connected_components(usable), key=lambda group: (-len(group), min(group)))
+    lengths = [hops for _, to in nx.all_pairs_shortest_path_length(usable) for hops in to.values() if hops]
+    return Connectivity(
+        len(groups) <= 1,
+        tuple(sorted(drone for group in groups[1:] for drone in group)),
+        tuple(sorted(nx.articulation_points(usable.to_undirected(reciprocal=True)))),
+        sum(lengths) / len(lengths) if lengths else None,
+        bottleneck(usable),
+    )
+
+
+def bottleneck(usable: nx.DiGraph) -> Edge | None:
+    """The link that limits the worst-off pair: without it and the better ones alone, somebody is reached no more.
+
+    Only links of at least its goodput are needed for everybody to reach whom they reach over all links.
+    """
+    edges: list[Edge] = sorted(usable.edges(data="mbps"), key=lambda edge: (edge[2], edge[0], edge[1]))
+    if not edges:
+        return None
+    reached = {drone: nx.descendants(usable, drone) for drone in usable}
+    low, high = 0, len(edges) - 1  # the links from `low` on are enough, and the answer is the last such place
+    while low < high:
+        middle = (low + high + 1) // 2
+        part = usable_graph(usable, (edge for edge in edges if edge[2] >= edges[middle][2]))
+        is_enough = all(nx.descendants(part, drone) == reached[drone] for drone in part)
+        low, high = (middle, high) if is_enough else (low, middle - 1)
+    return next(edge for edge in edges if edge[2] == edges[low][2])

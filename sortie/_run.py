@@ -22,6 +22,7 @@ from sortie.sim.results.run_files import RECORDING
 from sortie.sim.user_errors import missing, user_errors
 
 if TYPE_CHECKING:
+    import networkx as nx
     import pyarrow as pa
 
     from sortie.scenarios.schema import Scenario
@@ -125,6 +126,28 @@ class Run:
             True
         """
         return Metrics(numbers(self.outcome))
+
+    def graph(self, t_s: float) -> nx.DiGraph:
+        """The fleet as a graph at a moment, for `networkx`: drones as nodes, links within earshot as edges.
+
+        Nodes have `position_m`, `soc`, `phase` and `role`; edges `snr_db`, `goodput_mbps`, `loss`, `usable`, `state`, and
+        what was `sent` in the last second with its `bytes`.
+
+        Args:
+            t_s: the moment, s, from 0 to the sortie's end.
+
+        Raises:
+            RunError: the moment is outside the sortie.
+
+        Example:
+            >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
+            >>> fleet = run.graph(1.0)
+            >>> len(fleet), fleet.nodes[0]["phase"], fleet.edges[0, 1]["usable"]
+            (5, 'search', True)
+        """
+        from sortie.sim.results.graph import graph
+
+        return graph(self.record, t_s)
 
     def summary(self) -> Summary:
         """Accuracy, bytes, energy and delays, as the table that `sortie fly` prints.

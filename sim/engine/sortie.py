@@ -57,6 +57,7 @@ from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, air_settings, cars_in_reach
 from sortie.sim.identity import code_version, name_of, own_files
 from sortie.sim.results import beliefs, disagreement, rosters
+from sortie.sim.results.links import LinkLog
 from sortie.sim.results.record import AgentNotes, Recorder, SortieRecord
 from sortie.sim.results.views import TABLES as VIEW_TABLES
 from sortie.sim.results.views import Journal, decisions
@@ -249,10 +250,17 @@ def build(
     own = [OwnState(status, each, gnss=gnss) for status, each in zip(statuses, drawn, strict=True)]
     people = People(scenario, scene, recorder, (seed, replication))
     errors = sensor_errors(scenario, motion.position_m, seed, replication)
-    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, own, people, errors)
+    link_log = LinkLog(len(drones), recorder.spool)
+    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, own, people, errors, link_log)
     key = group_key(seed) if scenario.context.authentication else None
     transport = Transport(
-        env, air, memories, recorder, keys=None if key is None else {KEY_ID: key}, rates_mbps=_rates_mbps(scenario)
+        env,
+        air,
+        memories,
+        recorder,
+        keys=None if key is None else {KEY_ID: key},
+        rates_mbps=_rates_mbps(scenario),
+        links=link_log,
     )
 
     audit, choreography = Audit(env, recorder), None

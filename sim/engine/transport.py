@@ -22,6 +22,7 @@ from sortie.policies.contract import Representation
 from sortie.radio import Air, Transmission
 from sortie.radio.transmission import Status
 from sortie.scenarios.representation import NAME_OF
+from sortie.sim.results.links import LinkLog
 from sortie.sim.results.record import HANDSHAKE, Recorder
 
 OTHER_SPACE = "other_feature_space"
@@ -40,6 +41,7 @@ class Transport:
         *,
         keys: dict[int, bytes] | None,
         rates_mbps: Sequence[float],
+        links: LinkLog | None = None,
     ) -> None:
         """Put the transport on the air.
 
@@ -50,9 +52,10 @@ class Transport:
             recorder: gets each payload's fate, and each descriptor that is refused.
             keys: by key id; None where descriptors are unauthenticated.
             rates_mbps: the channel's data rates by MCS; empty where links are traced, which have no known data rate.
+            links: counts the descriptors that came over each link.
         """
         self._env = env
-        self._rates_mbps = rates_mbps
+        self._rates_mbps, self._links = rates_mbps, links
         self._receivers = receivers
         self.air = air
         self.last_datagram: dict[int, bytes] = {}
@@ -70,7 +73,12 @@ class Transport:
         """Broadcast a descriptor; its bytes are opened once, and checked for replay by each that hears it."""
         self.last_datagram[drone] = datagram
         opened = open_datagram(datagram, self._keys)
-        self.air.broadcast(drone, len(datagram), partial(self.hand_over, opened))
+        self.air.broadcast(drone, len(datagram), partial(self._heard, drone, opened))
+
+    def _heard(self, drone: int, opened: Opened | Dropped, heard: Sequence[int]) -> None:
+        if self._links is not None:
+            self._links.heard(drone, heard)
+        self.hand_over(opened, heard)
 
     def inject(self, datagram: bytes, listeners: Sequence[int]) -> None:
         """Put foreign bytes before the listeners (an attacker in range of all; its airtime is not modelled)."""

@@ -30,13 +30,14 @@ from sortie.policies.contract import Disc, TaskPhase
 from sortie.radio import Air
 from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.radio.settings import AirSettings
-from sortie.radio.topology import connectivity, linked_drones
+from sortie.radio.topology import connectivity, usable_graph
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.own_models import of_radio
 from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.tracking import FleetTracking
+from sortie.sim.results.links import LinkLog
 from sortie.sim.results.record import Recorder
 
 NAN = float("nan")
@@ -121,6 +122,7 @@ class World:
         own: Sequence[OwnState],
         people: People,
         errors: Mapping[int, np.ndarray],
+        links: LinkLog,
     ) -> None:
         self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
             env,
@@ -152,7 +154,7 @@ class World:
         """By drone: share of a frame in which its computer runs perception, when it senses: its compute delay."""
         self._airtime_s = [0.0] * n
         self._stepped_to_s = 0.0
-        self._busy_at_s = (0.0, 0.0)
+        self._busy_at_s, self._links = (0.0, 0.0), links
         self._receptions = (0,) * (1 + len(LOSS_CAUSES))  # heard and lost to each cause, up to the frame's begin
         self._frame = 0
         self._work = deque([[Work()] * n], maxlen=1 + max(1, round(scenario.context.rate_hz * SECOND_S)))
@@ -315,18 +317,21 @@ class World:
         self._busy_at_s = (self.env.now, busy_s)
         flying = [drone for drone, status in enumerate(self.drones) if status.airborne]
         usable = self.air.usable(USABLE_SNR_DB)
-        linked = linked_drones(usable if len(flying) == len(usable) else usable[np.ix_(flying, flying)], threshold=1.0)
-        self._recorder.rows["medium"].append((self.env.now, busy, len(linked)))
+        linked = (usable | usable.T)[np.ix_(flying, flying)] & ~np.eye(len(flying), dtype=bool)
+        self._recorder.rows["medium"].append((self.env.now, busy, int(linked.any(axis=0).sum())))
+        if self._links.is_due(self.env.now):
+            in_earshot, snr_db, mbps = self.air.in_earshot(), self.air.snr_db, self.air.link_mbps()
+            self._links.write(self.env.now, flying, snr_db, mbps, usable, in_earshot)
         if self._scenario.radio.relay_max_hops > 1:
             self._write_topology(flying)
 
     def _write_topology(self, flying: Sequence[int]) -> None:
         """Record whether all drones reach each other, which are cut off, and the link that limits the worst pair."""
-        whole = connectivity(self.air.link_mbps()[np.ix_(flying, flying)], LEAST_MBPS)
-        i, j, mbps = whole.bottleneck or (None, None, NAN)
-        ends = (-1, -1) if i is None or j is None else (flying[i], flying[j])
-        cut = [flying[k] for k in whole.cut]
-        self._recorder.rows["topology"].append((self.env.now, whole.connected, cut, *ends, mbps))
+        mbps = self.air.link_mbps()
+        usable = ((a, b, float(mbps[a, b])) for a in flying for b in flying if a != b and mbps[a, b] >= LEAST_MBPS)
+        whole = connectivity(usable_graph(flying, usable))
+        row = (self.env.now, whole.connected, list(whole.cut), *(whole.bottleneck or (-1, -1, NAN)))
+        self._recorder.rows["topology"].append(row)
 
     def _write(self, frame: int) -> None:
         rows, now_s, batteries = self._recorder.rows, self.env.now, self.batteries

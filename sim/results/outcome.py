@@ -23,6 +23,7 @@ from sortie.scenarios.plugins.reference import is_file
 from sortie.scenarios.representation import CELL_NAMES
 from sortie.sim.results import disagreement
 from sortie.sim.results.accuracy import FULL_SCENE, MISSION, Scored, score
+from sortie.sim.results.connectivity import connectivity_outcome
 from sortie.sim.results.mission_outcome import mission_outcome
 from sortie.sim.results.people_outcome import people_outcome
 from sortie.sim.results.record import DECISIONS_OF, VIOLATIONS_OF, SortieRecord
@@ -83,6 +84,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             **{f"data_{status}": count for status, count in sent.bytes_by_status().items()},
         },
         "context": _context(tables["receptions"], 0.0, scenario.duration_s),
+        "connectivity": connectivity_outcome(record),
         "context_share": _ratio(context_bytes, context_bytes + data_sent),
         "data_rate_mbps": data_sent * 8e-6 / scenario.duration_s,
         "deadline_miss_rate": sent.miss_rate(),

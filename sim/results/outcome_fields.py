@@ -263,6 +263,34 @@ class ContextOutcome(TypedDict):
     lost_to: Annotated[LostTo, "The part of it that each cause has; together they are `lost`."]
 
 
+class Bottleneck(TypedDict):
+    sender: Annotated[int | None, "Whose link it is."]
+    receiver: Annotated[int | None, "To whom."]
+    mbps: Annotated[float | None, "What it would carry alone on the channel, Mb/s."]
+
+
+class ConnectivityOutcome(TypedDict):
+    connected_share: Annotated[
+        float | None,
+        "Share of the moments at which every drone in the air reaches every other, over hops if need be.",
+        SHARE,
+    ]
+    partitioned_s: Annotated[float | None, "The rest of them, as time: for how long the fleet was in parts."]
+    mean_hops: Annotated[
+        float | None,
+        "Links on the shortest route, the mean over all pairs with one; in fleets of more than 200 drones from some 200 of them.",
+    ]
+    bottleneck: Annotated[
+        Bottleneck,
+        "The link that limited the worst-off pair that was connected, at the worst moment. Null in fleets of more than 200 drones.",
+    ]
+    articulation: Annotated[
+        dict[str, float],
+        "Share of the moments at which the fleet, or its part, would have fallen apart without the drone; of drones with any.",
+        SHARE,
+    ]
+
+
 class PhaseOutcome(TypedDict):
     phase: Annotated[
         str, "A phase of `mission.phases`. Its figures are of the whole fleet, also of drones in `mission.groups`."
@@ -316,6 +344,9 @@ class Outcome(TypedDict):
     people: Annotated[PeopleOutcome, "People and thermal cameras; null without both, and where nobody was in a region."]
     bytes: Annotated[Bytes, "What was sent."]
     context: Annotated[ContextOutcome, "What the context plane lost."]
+    connectivity: Annotated[
+        ConnectivityOutcome, "The fleet's graph of usable links (table `links`), looked at every 10 s from take-off on."
+    ]
     context_share: Annotated[float | None, "Context bytes over all bytes.", SHARE]
     data_rate_mbps: Annotated[float, "Payload bytes handed to the radio over the whole sortie, as Mb/s."]
     deadline_miss_rate: Annotated[
@@ -406,6 +437,7 @@ def open_keys(
         "descriptor_drops": tuple(map(str, DropReason)),
         "battery": ids,
         "drones": ids,
+        "connectivity.articulation": ids,
         "distrusted_by": ids,
         "energy_j": (*CAUSES, *([RECORDED] if traced else []), "total"),
         "policies.decisions": tuple(name for name in policies if "." not in name),  # a dot would lead further

@@ -43,13 +43,15 @@ class Checks:
         bounds = {name: (0, bound.high) for name, bound in DIRECTIVE_BOUNDS.items()}
         self._drones = scenario.fleet.drones
         self._ranges: dict[str, tuple[float, float]] = {
-            **dict.fromkeys(("drone", "peer", "receiver", "peers", "cut_drones", "members", "other"), drones),
+            **dict.fromkeys(("drone", "peer", "sender", "receiver", "peers", "cut_drones", "members", "other"), drones),
             **dict.fromkeys(("agent_id", "source", "destination"), drones),
             **dict.fromkeys(
                 ("bottleneck_sender", "bottleneck_receiver", "events.drone", "violations.peer"), drones_or_none
             ),
             **dict.fromkeys(("mcs", "target", "car", "person"), number_or_none),
-            **dict.fromkeys(("soc", "battery_soc", "cpu_headroom", "gpu_headroom", "busy_fraction", "trust"), share),
+            **dict.fromkeys(
+                ("soc", "battery_soc", "cpu_headroom", "gpu_headroom", "busy_fraction", "trust", "delivered"), share
+            ),
             **dict.fromkeys(("t_s", "begin_s"), instant),
             **bounds,
             "representation": (0, max(map(int, Representation))),  # the highest number, not the highest fidelity
@@ -175,6 +177,7 @@ _MAY_BE_NAN = frozenset(
         "target_x_m",
         "target_y_m",
         "bottleneck_mbps",
+        "delivered",
         "t_start_s",
         "t_done_s",
         "snr_db",

@@ -21,7 +21,7 @@ from sortie.policies.verification.enforced import CAUSES
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import models_of_the_past
-from sortie.sim.results import beliefs, disagreement, rosters, views
+from sortie.sim.results import beliefs, disagreement, links, rosters, views
 from sortie.sim.results.record import CLASS_COLUMN, OF_CLASSES, TABLES, VIOLATIONS_OF, SortieRecord
 from sortie.sim.results.run_checks import LARGEST, MOST_CHARACTERS, Checks, ensure_boxes, ensure_each_once
 
@@ -29,7 +29,7 @@ OUTCOME, SCENARIO, RECORD, RECORDING = "outcome.json", "scenario.yaml", "record.
 RECORDING_MARK = "\n\x06sortie"
 """Near the begin of a Rerun recording that Sortie wrote: the name of the application."""
 PAGE, TLOG, PCAP, BAG = "report.html", "sortie.tlog", "sortie.pcap", "bag"
-_TABLES = (*TABLES, *views.TABLES, disagreement.TABLE, rosters.TABLE, beliefs.TABLE)
+_TABLES = (*TABLES, *views.TABLES, disagreement.TABLE, rosters.TABLE, beliefs.TABLE, links.TABLE)
 WRITTEN = {OUTCOME, SCENARIO, RECORD, RECORDING, PAGE, TLOG, PCAP, BAG, *(f"{name}.parquet" for name in _TABLES)}
 """All that commands write into a run's folder."""
 WRITTEN |= {".DS_Store"}  # a desktop that looked in
@@ -186,6 +186,7 @@ def _read_tables(folder: Path, scenario: Scenario) -> dict[str, pa.Table]:
         (disagreement.TABLE, disagreement.COLUMNS, scenario.record.disagreement),
         (rosters.TABLE, rosters.COLUMNS, scenario.publishes_rosters),
         (beliefs.TABLE, beliefs.COLUMNS, scenario.record.beliefs),
+        (links.TABLE, links.COLUMNS, (folder / f"{links.TABLE}.parquet").exists()),  # not in runs of 0.2.0
     ):
         if wanted:
             needed[name] = known[name] = columns
