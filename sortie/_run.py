@@ -15,6 +15,7 @@ from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.nodes import nearest
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
+from sortie.sim.results.accuracy_table import WithAccuracy
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.outcome_fields import is_zero_count
 from sortie.sim.results.record import SortieRecord
@@ -100,14 +101,14 @@ class Run:
         """The code that made the record: release, plus sign, digest."""
         return self.record.version
 
-    @property
+    @cached_property
     def tables(self) -> Mapping[str, pa.Table]:
-        """The record's tables by name, as `pyarrow.Table`.
+        """The record's tables by name, and `accuracy`, which is computed from them, as `pyarrow.Table`.
 
         `sim/results/outcome.md` lists every table and column with its unit. `.to_pandas()` and `polars.from_arrow`
         convert a table.
         """
-        return self.record.tables
+        return WithAccuracy(self.record)
 
     @cached_property
     def outcome(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from sortie.scenarios.report_text import table
 from sortie.sim.folders import write_text
-from sortie.sim.results import beliefs, disagreement, links, rosters, views
+from sortie.sim.results import accuracy_table, beliefs, disagreement, links, rosters, views
 from sortie.sim.results.outcome_fields import Outcome
 from sortie.sim.results.record import ABOUT, TABLES
 
@@ -63,9 +63,9 @@ def page() -> str:
         "Where a scenario has trucks or thermal cameras, `detections` and `truths` have the column `kind` too: 0 a car, 1 a "
         "truck, 2 a person. `car` is then a person's number where the box is of one.",
         "",
-        "Every run has the first of these too. With `record.views: true` it has the next three, with `record.disagreement: "
-        "true` the fifth, with `context.roster: true`, or more than 200 drones, the sixth, with `record.beliefs: true` the "
-        "last one. They are no part of the fingerprint.",
+        "Every run has the first two of these too; `accuracy` is computed from the others. With `record.views: true` it has "
+        "the next three, with `record.disagreement: true` the sixth, with `context.roster: true`, or more than 200 drones, "
+        "the seventh, with `record.beliefs: true` the last one. They are no part of the fingerprint.",
         "",
         *table(
             ("table", "a row is", "columns"),
@@ -73,6 +73,7 @@ def page() -> str:
                 (f"`{name}`", about, _columns(columns))
                 for name, about, columns in (
                     (links.TABLE, links.ABOUT, links.COLUMNS),
+                    (accuracy_table.TABLE, accuracy_table.ABOUT, accuracy_table.COLUMNS),
                     *((name, views.ABOUT[name], columns) for name, columns in views.TABLES.items()),
                     (disagreement.TABLE, disagreement.ABOUT, disagreement.COLUMNS),
                     (rosters.TABLE, rosters.ABOUT, rosters.COLUMNS),

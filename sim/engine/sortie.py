@@ -250,7 +250,7 @@ def build(
     own = [OwnState(status, each, gnss=gnss) for status, each in zip(statuses, drawn, strict=True)]
     people = People(scenario, scene, recorder, (seed, replication))
     errors = sensor_errors(scenario, motion.position_m, seed, replication)
-    link_log = LinkLog(len(drones), recorder.spool)
+    link_log = LinkLog(len(drones), recorder)
     world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, own, people, errors, link_log)
     key = group_key(seed) if scenario.context.authentication else None
     transport = Transport(

@@ -310,18 +310,16 @@ class World:
         self._receptions = now
 
     def _write_medium(self) -> None:
-        """How busy the channel has been since the last row, and how many drones have a usable link."""
+        """How busy the channel has been since the last row, and how many drones others heard; and once in a while the links."""
         busy_s = self.air.utilisation * self.env.now
         since_s = self.env.now - self._busy_at_s[0]
         busy = (busy_s - self._busy_at_s[1]) / since_s if since_s > 0 else 0.0
         self._busy_at_s = (self.env.now, busy_s)
         flying = [drone for drone, status in enumerate(self.drones) if status.airborne]
-        usable = self.air.usable(USABLE_SNR_DB)
-        linked = (usable | usable.T)[np.ix_(flying, flying)] & ~np.eye(len(flying), dtype=bool)
-        self._recorder.rows["medium"].append((self.env.now, busy, int(linked.any(axis=0).sum())))
+        self._recorder.rows["medium"].append((self.env.now, busy, self._links.heard_drones()))
         if self._links.is_due(self.env.now):
             in_earshot, snr_db, mbps = self.air.in_earshot(), self.air.snr_db, self.air.link_mbps()
-            self._links.write(self.env.now, flying, snr_db, mbps, usable, in_earshot)
+            self._links.write(self.env.now, flying, snr_db, mbps, self.air.usable(USABLE_SNR_DB), in_earshot)
         if self._scenario.radio.relay_max_hops > 1:
             self._write_topology(flying)
 

@@ -1,4 +1,4 @@
-"""The plots, lanes and logs of a playback: what was carried, what it cost, and who decided what, and why.
+"""The plots, lanes, logs and the matrix of links of a playback: what was carried, what it cost, and who decided what, and why.
 
 As in `sortie.sim.playback.scene`, tables come whole or by whole seconds; sums over a second (k−1 to k) stand at k.
 """
@@ -19,7 +19,10 @@ from sortie.perception.metrics.ap import Matched, average_precision
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback.canvas import Canvas, line
-from sortie.sim.results import palette
+from sortie.sim.playback.event_lane import NOTHING, Span, lane_changes, spans_of
+from sortie.sim.playback.links import LinkMatrix
+from sortie.sim.results import links, palette
+from sortie.sim.results.accuracy_table import WINDOW_S
 from sortie.sim.results.link_traffic import mean_goodput
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.palette import Floats
@@ -28,12 +31,9 @@ from sortie.sim.results.sentences import decision_in_words, event_in_words
 from sortie.sim.results.sightings import Sighting
 from sortie.sim.results.traffic import settled
 
-AP_WINDOW_S = 5.0
 MARKED = ("ap", "battery", "goodput", "traffic", "age", "lost", "medium")
 """Plots in which phase changes and events are marked."""
 EVENT_LANE: palette.Rgba = (150, 108, 20, 255)
-OVER = "·"
-"""What every lane shows after the end: lanes go on to the right of it."""
 OVER_COLOUR: palette.Rgba = (0, 0, 0, 255)
 RUNGS = ("nothing", *list(REPRESENTATION_OF)[1:])
 FATES: dict[str, palette.Rgba] = {"expired": (225, 222, 240, 255), "lost": (255, 50, 70, 255)}
@@ -52,6 +52,7 @@ class Charts:
 
     def __init__(self, canvas: Canvas, scenario: Scenario) -> None:
         self._canvas, self._scenario, self._n = canvas, scenario, scenario.fleet.drones
+        self._links = LinkMatrix(canvas, self._n)
         self._known_s = 0.0
         self._settled: Floats = np.zeros((0, 2))
         self._kinds: list[str] = []
@@ -65,20 +66,24 @@ class Charts:
         self._lanes: dict[int, str] = {}
         self._lane_colours: dict[int, dict[str, palette.Rgba]] = defaultdict(dict)
         self._phase: dict[int, str] = {}
-        self._event_texts: list[str] = []
+        self._events_seen: list[Span] = []
+        self._event_shown, self._events_until_s = NOTHING, 0.0
         self._over = False
 
     def begin(self) -> None:
         """Name and colour every plot line that is known beforehand."""
         canvas, drones = self._canvas, range(self._n)
+        self._links.begin()
         for i in drones:
             colour = palette.drone_colour(i)
             canvas.static(f"plots/battery/{i}", line(f"drone {i}", colour))
             canvas.static(f"plots/goodput/{i}", line(f"drone {i}", colour))
+            canvas.static(f"plots/energy/{i}", line(f"drone {i}", colour))
+            canvas.static(f"plots/ap_of/{i}", line(f"drone {i}", colour))
         phases = list(palette.PHASES)
         for group in range(len(self._scenario.mission.phases_of)):
             colours = [*(palette.PHASES[p] for p in phases), OVER_COLOUR]
-            states = rr.StateConfiguration(values=[*phases, OVER], colors=colours)
+            states = rr.StateConfiguration(values=[*phases, NOTHING], colors=colours)
             canvas.static(phase_lane(group), states)
         canvas.static("plots/ap/full_scene", line("full scene", (120, 200, 255, 255), width=2.5))
         canvas.static("plots/ap/mission", line("mission disc", palette.MISSION, width=2.5))
@@ -95,9 +100,10 @@ class Charts:
         """Plot new rows; everything before `known_s` is in by now."""
         seconds = self._seconds(known_s)
         states = new["states"]
-        drone, t_s, soc = (states[k].to_numpy() for k in ("drone", "t_s", "soc"))
+        drone, t_s, soc, spent_j = (states[k].to_numpy() for k in ("drone", "t_s", "soc", "spent_j"))
         for i in range(self._n):
             self._canvas.scalars(f"plots/battery/{i}", t_s[drone == i], 100.0 * soc[drone == i])
+            self._canvas.scalars(f"plots/energy/{i}", t_s[drone == i], 1e-3 * spent_j[drone == i])
         self._goodput(new["descriptors"])
         self._traffic(seconds, new["transmissions"])
         self._plane(seconds, new["ages"], new["medium"])
@@ -105,7 +111,9 @@ class Charts:
         self._accuracy(seconds, seen)
         self._phases(new["mission"])
         self._decisions(new["directives"], states)
-        self._events(new["events"])
+        self._events(known_s, new["events"])
+        if links.TABLE in new:
+            self._links.add(new[links.TABLE])
         if known_s >= self._scenario.duration_s and not self._over:
             self._end_lanes()
 
@@ -189,23 +197,24 @@ class Charts:
             self._received = self._received[self._received[:, 0] >= seconds[-1][1] - _INSTANT_S]
 
     def _accuracy(self, seconds: Sequence[tuple[float, float]], seen: Iterable[Sighting]) -> None:
-        """AP@0.5 over the last seconds, all egos pooled."""
+        """AP@0.5 over the last seconds, all egos pooled, and of each ego in the full scene."""
         self._window.extend(seen)
-        points: dict[str, list[tuple[float, float]]] = {"full_scene": [], "mission": []}
+        points: dict[str, list[tuple[float, float]]] = defaultdict(list)
         for _, end_s in seconds:
-            while self._window and self._window[0].t_s < end_s - AP_WINDOW_S:
+            while self._window and self._window[0].t_s < end_s - WINDOW_S:
                 self._window.popleft()
             within = [s for s in self._window if s.t_s < end_s]
-            frames: dict[str, list[Matched]] = {
-                "full_scene": [s.full for s in within],
-                "mission": [s.mission for s in within if s.mission is not None],
-            }
+            frames: dict[str, list[Matched]] = defaultdict(list)
+            for seen_by in within:
+                frames["ap/full_scene"].append(seen_by.full)
+                frames[f"ap_of/{seen_by.drone}"].append(seen_by.full)
+                if seen_by.mission is not None:
+                    frames["ap/mission"].append(seen_by.mission)
             for name, matches in frames.items():
-                if matches:
-                    points[name].append((end_s, average_precision(matches)))
+                points[name].append((end_s, average_precision(matches)))
         for name, several in points.items():
             rows = np.array(several).reshape(-1, 2)
-            self._canvas.scalars(f"plots/ap/{name}", rows[:, 0], rows[:, 1])
+            self._canvas.scalars(f"plots/{name}", rows[:, 0], rows[:, 1])
 
     # --- lanes and logs --------------------------------------------------------------------------
 
@@ -267,23 +276,20 @@ class Charts:
         """Let every lane end with the sortie."""
         self._over, end_s = True, self._scenario.duration_s
         for drone in self._lanes:
-            colours = {**self._lane_colours[drone], OVER: OVER_COLOUR}
+            colours = {**self._lane_colours[drone], NOTHING: OVER_COLOUR}
             lane = rr.StateConfiguration(values=list(colours), colors=list(colours.values()))
             self._canvas.static(f"lanes/drone_{drone}", lane)
-            self._state(f"lanes/drone_{drone}", end_s, OVER)
+            self._state(f"lanes/drone_{drone}", end_s, NOTHING)
         for group in self._phase:
-            self._state(phase_lane(group), end_s, OVER)
-        if self._event_texts:
-            self._event_lane([*self._event_texts, OVER], [EVENT_LANE] * len(self._event_texts) + [OVER_COLOUR])
-            self._state("lanes/events", end_s, OVER)
-
-    def _event_lane(self, texts: list[str], colours: list[palette.Rgba]) -> None:
-        self._canvas.static("lanes/events", rr.StateConfiguration(values=texts, colors=colours))
+            self._state(phase_lane(group), end_s, NOTHING)
+        if self._events_seen:
+            self._state("lanes/events", end_s, NOTHING)
 
     def _state(self, path: str, t_s: float, state: str) -> None:
         self._canvas.columns(path, np.array([t_s]), rr.StateChange.columns(state=[state]))
 
-    def _events(self, events: pa.Table) -> None:
+    def _events(self, known_s: float, events: pa.Table) -> None:
+        """Log events, mark them, and let the lane show each while it lasts."""
         rows = events.to_pylist()
         if rows:
             texts = [event_in_words(r) for r in rows]
@@ -291,9 +297,14 @@ class Charts:
             t_s = [r["t_s"] for r in rows]
             self._canvas.columns("log/events", np.array(t_s), columns)
             self._marks("event", t_s)
-            self._event_texts += [text for text in dict.fromkeys(texts) if text not in self._event_texts]
-            self._event_lane(self._event_texts, [EVENT_LANE] * len(self._event_texts))
-            self._canvas.columns("lanes/events", np.array(t_s), rr.StateChange.columns(state=texts))
+            self._events_seen += spans_of(rows, self._scenario)
+            known = list(dict.fromkeys(span.text for span in self._events_seen))
+            colours = [*[EVENT_LANE] * len(known), OVER_COLOUR]
+            self._canvas.static("lanes/events", rr.StateConfiguration(values=[*known, NOTHING], colors=colours))
+        for at_s, text in lane_changes(self._events_seen, self._event_shown, self._events_until_s, known_s):
+            self._event_shown = text
+            self._state("lanes/events", at_s, text)
+        self._events_until_s = known_s
 
     def _marks(self, kind: str, t_s: list[float]) -> None:
         """Mark moments on the floor of the plots."""

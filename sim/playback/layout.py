@@ -10,8 +10,10 @@ import rerun.blueprint as rrb
 
 from sortie.fleet.coverage import cameras_of, footprint_radius_m
 from sortie.perception.scene.scene_model import MARGIN_M
+from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.events import Jam
 from sortie.sim.playback.canvas import SIM_TIME, SPAN_M
 from sortie.sim.playback.charts import phase_lane
 
@@ -43,14 +45,19 @@ LEGEND = """
 **{name}**: {description}
 
 Each drone has one colour, here and in the plots; its label is its number and charge, the **ring** on the ground
-what its camera sees straight below. Drones are drawn {span:.0f} m wide. The **pink ring** is the mission region, on the
-ground and once more above the roofs. An **orange ball** is a jammer that is on. The **map** has north up. A
-drone that is down is grey.
-
-**Arrows** are links: as wide as the traffic of the last second; green carries 100 Mb/s or more, yellow 10,
-red 1 or less; grey: nothing is sent; a **red cross**: all but gone. **Marks** on the plots' floors: yellow, something
-happened to the fleet; pink, the phase changed.
+what its camera sees straight below. Drones are drawn {span:.0f} m wide, and grey while they are down. The **map** has
+north up.{regions}{jammers}
+{links}
+**Marks** on the plots' floors: yellow, something happened to the fleet{phases}.
 {seen}
+"""
+OF_REGIONS = """ The **pink ring** is the mission region, on the ground and once more above the roofs."""
+OF_JAMMERS = """ An **orange ball** is a jammer that is on."""
+OF_PHASES = """; pink, the phase changed"""
+OF_LINKS = """
+**Arrows** are links: as wide as the traffic of the last second; green carries 100 Mb/s or more, yellow 10,
+red 1 or less; grey: nothing is sent; a **red cross**: all but gone. In the **matrix of links** green means that the drone
+across heard all descriptors of the one down the side, yellow half of them, red none; grey: out of earshot.
 """
 
 
@@ -79,7 +86,9 @@ def blueprint(
     plots: list[rrb.View | rrb.Container] = [
         lanes_view(scenario),
         rrb.Tabs(
-            plot("goodput, mean of a drone's links, Mb/s", "goodput"), plot("battery, %", "battery", (0.0, 104.0))
+            plot("goodput, mean of a drone's links, Mb/s", "goodput"),
+            plot("battery, %", "battery", (0.0, 104.0)),
+            plot("energy spent, kJ", "energy"),
         ),
         plot("traffic by what became of it, Mb/s", "traffic"),
         rrb.Tabs(
@@ -90,7 +99,8 @@ def blueprint(
     ]
     shares = [1.2, 1.2, 1.0]
     if scenario.perception.detector != "none":
-        plots.insert(1, plot("AP@0.5, last 5 s", "ap", (0.0, 1.0)))
+        seen = (plot("AP@0.5, last 5 s", "ap", (0.0, 1.0)), plot("AP@0.5 of each drone", "ap_of", (0.0, 1.0)))
+        plots.insert(1, rrb.Tabs(*seen))
         shares.insert(0, 1.2)
     lanes_height = 0.07 + 0.048 * (
         min(scenario.fleet.drones, MAX_LANES) + 2
@@ -106,11 +116,20 @@ def blueprint(
     )
     left = rrb.Vertical(
         scene_view(scenario, spread_m=spread_m),
-        rrb.Horizontal(log_view(), rrb.Tabs(above, about), column_shares=[5, 4]),
+        rrb.Horizontal(log_view(), rrb.Tabs(above, *_link_matrix(scenario.fleet.drones), about), column_shares=[5, 4]),
         row_shares=[11, 8],
     )
     body = rrb.Horizontal(left, rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2])
     return sheet(body, live=live)
+
+
+def _link_matrix(drones: int) -> list[rrb.View]:
+    """The matrix of links, of a fleet that has one."""
+    if not 2 <= drones <= LISTED_IDS:
+        return []
+    bounds = rrb.VisualBounds2D(x_range=(-1.5, drones + 0.5), y_range=(-1.5, drones + 0.5))
+    name = "descriptors heard: sender down, receiver across"
+    return [rrb.Spatial2DView(name=name, origin="/links", contents="/links/**", visual_bounds=bounds)]
 
 
 def _middle(town_m: tuple[float, float]) -> rrb.VisualBounds2D:
@@ -212,4 +231,12 @@ def legend(scenario: Scenario) -> rr.TextDocument:
     if seen and scenario.takes_turns:
         seen += OF_TURNS.format(scored=scenario.scored_drones, drones=len(scenario.scorable_drones))
     told = {"name": scenario.name, "description": " ".join(scenario.description.split()) or "no description."}
-    return rr.TextDocument(LEGEND.format(span=SPAN_M, seen=seen, **told).strip(), media_type=rr.MediaType.MARKDOWN)
+    phases = [phase for several in scenario.mission.phases_of for phase in several]
+    occurs = {
+        "regions": OF_REGIONS if any(phase.region for phase in phases) else "",
+        "jammers": OF_JAMMERS if any(isinstance(event, Jam) for event in scenario.events) else "",
+        "phases": OF_PHASES if any(0 < phase.at_s < scenario.duration_s for phase in phases) else "",
+        "links": OF_LINKS if scenario.fleet.drones > 1 else "",
+    }
+    text = LEGEND.format(span=SPAN_M, seen=seen, **told, **occurs)
+    return rr.TextDocument(text.strip(), media_type=rr.MediaType.MARKDOWN)

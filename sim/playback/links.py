@@ -1,4 +1,4 @@
-"""Links in the scene of a playback: arrows as wide as their traffic and as green as their goodput, broken ones crossed.
+"""Links in a playback: arrows as wide as their traffic and as green as their goodput, broken ones crossed; and a matrix.
 
 As in `sortie.sim.playback.scene`: tables come whole or by whole seconds, and a row at time t shows what was known before t.
 """
@@ -84,3 +84,41 @@ class LinkArrows:
                 columns = rr.LineStrips3D.columns(strips=strips).partition([len(strips)])
                 self._canvas.columns("world/broken", t_s[k : k + 1], columns)
             self._crossed = now
+
+
+class LinkMatrix:
+    """Which share of each drone's descriptors each other heard lately, as a picture: senders down, receivers across."""
+
+    def __init__(self, canvas: Canvas, n: int) -> None:
+        self._canvas, self._n = canvas, n
+        self._shown = 2 <= n <= LISTED_IDS
+
+    def begin(self) -> None:
+        """Number the rows and columns."""
+        if not self._shown:
+            return
+        size = rr.encodings.ImageFormat(self._n, self._n, color_model="RGBA", channel_datatype="U8")
+        self._canvas.static("links/heard", rr.Image.from_fields(format=size))
+        middle, edge = np.arange(self._n) + 0.5, np.full(self._n, -0.6)
+        drones = range(self._n)
+        numbers = rr.Points2D(
+            np.concatenate([np.column_stack([edge, middle]), np.column_stack([middle, edge])]),
+            labels=[str(i) for i in drones] * 2,
+            colors=[palette.drone_colour(i) for i in drones] * 2,
+            radii=-3.0,
+            show_labels=True,
+        )
+        self._canvas.static("links/numbers", numbers)
+
+    def add(self, links: pa.Table) -> None:
+        """Draw the moments of new rows of the table `links`."""
+        if not self._shown or not links.num_rows:
+            return
+        t_s, sender, receiver, delivered = (
+            links[name].to_numpy() for name in ("t_s", "sender", "receiver", "delivered")
+        )
+        moments, which = np.unique(t_s, return_inverse=True)
+        share = np.full((len(moments), self._n, self._n), np.nan)
+        share[which, sender, receiver] = delivered
+        pictures = [picture.tobytes() for picture in palette.share_colours(share)]
+        self._canvas.columns("links/heard", moments, rr.Image.columns(buffer=pictures))

@@ -23,6 +23,7 @@ from sortie.sim.playback.charts import Charts
 from sortie.sim.playback.comparison import comparison, roots
 from sortie.sim.playback.layout import blueprint, legend
 from sortie.sim.playback.scene import Drawing
+from sortie.sim.results import links
 from sortie.sim.results.flown_scene import scene_of, vehicles
 from sortie.sim.results.record import Recorder, SortieRecord
 from sortie.sim.results.regions import Regions
@@ -119,7 +120,8 @@ def _in_blocks(record: SortieRecord) -> Iterator[tuple[float, dict[str, pa.Table
     """The rows that a playback draws, in blocks of whole seconds, and what is known by then."""
     end_s = record.scenario.duration_s
     block_s = max(1.0, BLOCK_DRONE_S // record.scenario.fleet.drones)
-    rows = {name: InTime(record.tables, name, "t_done_s" if name == "transmissions" else "t_s") for name in DRAWN}
+    drawn = [*DRAWN, *([links.TABLE] if links.TABLE in record.tables else [])]  # not in runs of 0.2.0
+    rows = {name: InTime(record.tables, name, "t_done_s" if name == "transmissions" else "t_s") for name in drawn}
     known_s = 0.0
     while known_s < end_s:
         known_s = min(known_s + block_s, end_s)

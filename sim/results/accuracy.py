@@ -59,8 +59,19 @@ class Pool:
     def by_fusion(self) -> dict[Key, Matched]:
         """Each fusion by itself."""
         keys = zip(self.t_s.tolist(), self.drone.tolist(), strict=True)
-        spans = zip(self.first[:-1].tolist(), self.first[1:].tolist(), self.truths.tolist(), strict=True)
-        return {key: Matched(self.score[a:b], self.hit[a:b], n) for key, (a, b, n) in zip(keys, spans, strict=True)}
+        return dict(zip(keys, self.fusions(np.arange(len(self.t_s))), strict=True))
+
+    def fusions(self, which: NDArray[np.intp]) -> list[Matched]:
+        """Some fusions, by their places."""
+        spans = zip(
+            self.first[which].tolist(), self.first[which + 1].tolist(), self.truths[which].tolist(), strict=True
+        )
+        return [Matched(self.score[a:b], self.hit[a:b], n) for a, b, n in spans]
+
+    def ap_of(self, drone: int) -> float | None:
+        """AP of one ego's fusions; None without a truth."""
+        ap = average_precision(self.fusions(np.flatnonzero(self.drone == drone)))
+        return None if np.isnan(ap) else ap
 
     def ap(self, begin_s: float = 0.0, end_s: float = float("inf")) -> float | None:
         """AP of the fusions from `begin_s` to before `end_s`; None without a truth."""

@@ -9,7 +9,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from sortie.scenarios.disc import LISTED_IDS
-from sortie.sim.results.spool import Spool
+from sortie.sim.results.record import Recorder
 
 TABLE = "links"
 COLUMNS: dict[str, pa.DataType] = dict(
@@ -35,21 +35,29 @@ LARGE_FLEET_S = 10.0
 class LinkLog:
     """Counts the descriptors that came over each link, and writes the table's rows."""
 
-    def __init__(self, drones: int, spool: Spool) -> None:
+    def __init__(self, drones: int, recorder: Recorder) -> None:
         """Args:
         drones: how many there are.
-        spool: gets the rows.
+        recorder: gets the rows.
         """
         self._published = np.zeros(drones, np.int64)
+        self._reached = np.zeros(drones, bool)
         self._heard = np.zeros((drones, drones), np.int32)
         self._every_s = 1.0 if drones <= LISTED_IDS else LARGE_FLEET_S
-        self._due_s, self._spool = 0.0, spool
-        spool.define(TABLE, COLUMNS)
+        self._due_s, self._recorder = 0.0, recorder
+        recorder.define(TABLE, COLUMNS)
 
     def heard(self, sender: int, receivers: Sequence[int]) -> None:
         """A descriptor has ended on the air, and these drones heard it."""
         self._published[sender] += 1
         self._heard[sender, receivers] += 1
+        self._reached[sender] |= len(receivers) > 0
+
+    def heard_drones(self) -> int:
+        """How many drones were heard by another since the last call."""
+        count = int(self._reached.sum())
+        self._reached[:] = False
+        return count
 
     def is_due(self, t_s: float) -> bool:
         """Whether rows are wanted now."""
@@ -88,6 +96,6 @@ class LinkLog:
             (usable & in_the_air)[sender, receiver],
         )
         arrays = [pa.array(column, kind) for column, kind in zip(columns, COLUMNS.values(), strict=True)]
-        self._spool.add(TABLE, pa.RecordBatch.from_arrays(arrays, names=list(COLUMNS)))
+        self._recorder.add_batch(TABLE, pa.RecordBatch.from_arrays(arrays, names=list(COLUMNS)))
         self._published[:], self._heard[:] = 0, 0
         self._due_s = t_s + self._every_s

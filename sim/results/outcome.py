@@ -47,9 +47,9 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
     minutes = scenario.duration_s / 60.0
     links = scenario.fleet.drones * (scenario.fleet.drones - 1)
     changes = list(transitions(tables["directives"], {}))
-    drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones)
     looked_for = _looked_for(scenario.perception.classes)
     scored = score(record, [CAR, *(kind for kind in looked_for if kind != CAR)])
+    drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones, scored)
     return {
         "scenario": scenario.name,
         "policy": record.policy,
@@ -206,8 +206,8 @@ def _context(receptions: pa.Table, begin_s: float, end_s: float) -> dict[str, An
     }
 
 
-def _drones(states: pa.Table, energy: pa.Table, drones: int) -> dict[str, dict[str, Any]]:
-    """Each drone at the end, and the energy it spent."""
+def _drones(states: pa.Table, energy: pa.Table, drones: int, scored: Scored) -> dict[str, dict[str, Any]]:
+    """Each drone at the end, the energy it spent, and how well it saw."""
     last = states.slice(max(0, states.num_rows - drones))
     spent = np.zeros(drones)
     np.add.at(spent, energy["drone"].to_numpy(), energy["energy_j"].to_numpy())
@@ -215,6 +215,7 @@ def _drones(states: pa.Table, energy: pa.Table, drones: int) -> dict[str, dict[s
         str(row["drone"]): {
             **{name: row[name] for name in ("soc", "voltage_v", "airborne")},
             "energy_j": float(spent[row["drone"]]),
+            "ap50": {scope: scored.pools[CAR, scope].ap_of(row["drone"]) for scope in (FULL_SCENE, MISSION)},
         }
         for row in last.to_pylist()
     }

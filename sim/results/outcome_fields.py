@@ -174,6 +174,9 @@ class Drone(TypedDict):
     voltage_v: Annotated[float, "At the pack's terminals."]
     airborne: Annotated[bool, "Whether it still flew; of a ground station, whether it was on.", FLAG]
     energy_j: Annotated[float, "Spent to the very end, all causes."]
+    ap50: Annotated[
+        Accuracy, "AP@0.5 of cars over its own scored fusions; null where it had none, or no car was there."
+    ]
 
 
 class Violations(TypedDict):

@@ -62,7 +62,18 @@ def drone_colour(drone: int) -> Rgba:
 def goodput_colours(mbps: Floats) -> NDArray[np.uint8]:
     """Colours [..., 4] of goodputs: red at 1 Mb/s and below, yellow at 10, green at 100 and above; grey if not measured lately."""
     level = np.clip(np.log10(np.maximum(mbps, 1e-3)) / 2.0, 0.0, 1.0)
-    red, green = np.clip(2.0 - 2.0 * level, 0.0, 1.0), np.clip(2.0 * level, 0.0, 1.0)
+    return _from_red_to_green(np.where(is_tried(mbps), level, np.nan))
+
+
+def share_colours(share: Floats) -> NDArray[np.uint8]:
+    """Colours [..., 4] of shares: red at none, yellow at half, green at all; grey where there is none to tell of (NaN)."""
+    return _from_red_to_green(share)
+
+
+def _from_red_to_green(level: Floats) -> NDArray[np.uint8]:
+    """Colours [..., 4] of 0 … 1; grey of NaN."""
+    there = ~np.isnan(level)
+    known = np.where(there, level, 0.0)
+    red, green = np.clip(2.0 - 2.0 * known, 0.0, 1.0), np.clip(2.0 * known, 0.0, 1.0)
     colour = np.stack([50 + 205 * red, 45 + 185 * green, np.full_like(red, 60), np.full_like(red, 255)], axis=-1)
-    unmeasured = np.expand_dims(~is_tried(mbps), -1)
-    return np.where(unmeasured, UNMEASURED, colour).astype(np.uint8)
+    return np.where(there[..., None], colour, UNMEASURED).astype(np.uint8)

@@ -189,8 +189,8 @@ ABOUT = {
     "sightings": "What a drone's thermal camera took for a person, where the drone places it, ENU; `score` is the probability "
     "of finding a person at that distance, `person` −1 a false alarm.",
     "alerts": "A drone begins or ceases to know of a person in its region, from its own thermal camera or its peers.",
-    "medium": "Once a second: how busy the channel was since the row before (0 in the first, at take-off), and how many "
-    "drones have a usable link. What follows the last row is in `medium_busy_fraction` alone.",
+    "medium": "Once a second: how busy the channel was since the row before, and how many drones others heard since then "
+    "(0 in the first row, at take-off). What follows the last row is in `medium_busy_fraction` alone.",
     "topology": "Once a second where payloads are relayed: whether all drones reach all, who is outside the largest such "
     "group, and the link that limits the worst-off pair (−1 and NaN where there is none).",
     "energy": "What a drone spent on a cause.",
@@ -283,6 +283,21 @@ class Recorder:
             self.spool.define(name, columns | CLASS_COLUMN if classes and name in OF_CLASSES else columns)
         self._taken = dict.fromkeys(TABLES, 0)
         self._due = dict.fromkeys(TABLES, FIRST_ROWS)
+        self._fresh: dict[str, list[pa.RecordBatch]] = {}
+
+    def define(self, name: str, columns: Mapping[str, pa.DataType]) -> None:
+        """A table beside `TABLES`, which gets its rows by `add_batch`."""
+        self.spool.define(name, columns)
+        self._fresh[name] = []
+
+    def add_batch(self, name: str, batch: pa.RecordBatch) -> None:
+        """Many rows at once of a table that `define` named.
+
+        Raises:
+            ScratchError: the disk refuses.
+        """
+        self.spool.add(name, batch)
+        self._fresh[name].append(batch)
 
     def take_new(self) -> dict[str, pa.Table]:
         """The rows since the last call, for a viewer that follows the flight. Each call comes before the next `spill`."""
@@ -290,6 +305,9 @@ class Recorder:
         for name, rows in self.rows.items():
             new[name] = pa.Table.from_batches([self._batch(name, rows[self._taken[name] :])])
             self._taken[name] = len(rows)
+        for name, added in self._fresh.items():
+            new[name] = pa.Table.from_batches(added, self.spool.schema(name))
+            added.clear()
         return new
 
     def spill(self) -> None:
@@ -301,6 +319,8 @@ class Recorder:
         for name, rows in self.rows.items():
             if len(rows) >= self._due[name]:
                 self._due[name] = max(1, len(rows) * BATCH_BYTES // max(1, self._spill(name, rows)))
+        for added in self._fresh.values():
+            added.clear()
         scratch.release()
 
     def finish(self) -> SpooledTables:

@@ -170,14 +170,15 @@ def _numbers(result: dict[str, Any], fleet: Fleet) -> Html:
     ]
     drones = [_drone_row(i, d, fleet.station(int(i))) for i, d in result["drones"].items()]
     head = table_row("th", "phase", "AP full scene", "AP mission", "data", "deadlines missed", "descriptors lost")
-    other = table_row("th", "drone", "charge left", "energy", "voltage", "at the end")
+    other = table_row("th", "drone", "charge left", "energy", "voltage", "AP full scene", "AP mission", "at the end")
     return html("{}<br>{}", table(head, *phases), table(other, *drones))
 
 
-def _drone_row(number: str, drone: dict[str, Any], station: GroundStation | None) -> Html:
+def _drone_row(drone_id: str, drone: dict[str, Any], station: GroundStation | None) -> Html:
     """A drone or a ground station at the end."""
     energy = [percent(drone["soc"]), f"{drone['energy_j'] / 1e3:.1f} kJ", f"{drone['voltage_v']:.2f} V"]
     if station is not None and station.mains:
         energy = ["mains", "", ""]
     name, up, down = ("drone", "flying", "down") if station is None else ("station", "on", "off")
-    return table_row("td", f"{name} {number}", *energy, up if drone["airborne"] else down)
+    accuracy = [number(drone["ap50"][area]) for area in ("full_scene", "mission")]
+    return table_row("td", f"{name} {drone_id}", *energy, *accuracy, up if drone["airborne"] else down)

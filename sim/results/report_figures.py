@@ -18,7 +18,9 @@ from sortie.perception.scene.traffic import TargetPath
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema.events import Jam
 from sortie.sim.folders import RunError
+from sortie.sim.results import links
 from sortie.sim.results.accuracy import matched
+from sortie.sim.results.accuracy_table import WINDOW_S, accuracy_table
 from sortie.sim.results.link_traffic import mean_goodput
 from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
@@ -50,8 +52,8 @@ MOST_NAMED = 40
 """A legend has room for so many names."""
 DISCS = 6
 """A mission region that moves is drawn on the map at so many times."""
-WINDOW_S = 5.0
-"""Accuracy is drawn over this long before each second, as in the playback."""
+MOST_LINKS = 42
+"""The matrix of links has a row for each of so many; of larger fleets a row for each sender."""
 
 
 def colour(drone: int) -> str:
@@ -72,14 +74,23 @@ def figures(record: SortieRecord) -> dict[str, str]:
             _lanes,
         ),
         ("Accuracy of all drones over the last five seconds, AP@0.5", 2.6, _accuracy),
+        ("Accuracy of each drone over its last five seconds, full scene, AP@0.5", 2.6, _accuracy_of_each),
         ("Traffic by representation and fate, Mb/s", 2.6, _traffic),
         ("Goodput, mean of each drone's links measured lately and of each second, Mb/s", 2.6, _goodput),
+        (
+            "Links over time: share of the sender's descriptors that the receiver heard; white where it was out of earshot",
+            max(2.2, 0.9 + 0.16 * len(_matrix_rows(_drones(record)))),
+            _links,
+        ),
         ("Battery, %", 2.4, _battery),
+        ("Energy spent, kJ", 2.4, _energy),
         ("Age of descriptors when a policy read them, 99th percentile, ms", 2.2, _age),
         ("The way over the ground, m: drones, targets, mission regions and jammers", 5.2, _map),
     ]
-    if record.detector == "none":
-        del plots[1]
+    left_out = [_accuracy, _accuracy_of_each] if record.detector == "none" else []
+    if _drones(record) < 2 or links.TABLE not in record.tables:  # runs of 0.2.0 have no links
+        left_out.append(_links)
+    plots = [plot for plot in plots if plot[2] not in left_out]
 
     def over_time(draw: Drawer) -> Callable[[Axes], None]:
         def both(axes: Axes) -> None:
@@ -202,14 +213,17 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
     since = dict.fromkeys(range(n), (0.0, "nothing"))
     carried: list[dict[int, str]] = [{} for _ in range(n)]  # representation by drone and peer
     down: set[int] = set()
+    occurs: set[str] = set()
 
     def close(drone: int, t_s: float) -> None:
         begin_s, kind = since[drone]
+        occurs.add(kind)
         axes.broken_barh(
             [(begin_s, t_s - begin_s)], (drone - 0.42, 0.5), facecolor=SENT[kind], edgecolor="white", linewidth=0.5
         )
 
     for drone, begin_s, until_s, kind in arrived(record):
+        occurs.add(kind)
         axes.broken_barh([(begin_s, until_s - begin_s)], (drone + 0.11, 0.26), facecolor=SENT[kind])
     changes = [*landings(record), *transitions(record.tables["directives"], {})]
     for change in sorted(changes, key=lambda change: change["t_s"]):
@@ -229,7 +243,8 @@ def _lanes(axes: Axes, record: SortieRecord) -> None:
     axes.set_ylim(n - 0.5, -0.5)
     axes.grid(visible=False)
     for kind, ink in SENT.items():
-        axes.plot([], [], color=ink, linewidth=6, label=kind)
+        if kind in occurs:
+            axes.plot([], [], color=ink, linewidth=6, label=kind)
     legend_beside(axes)
 
 
@@ -298,6 +313,43 @@ def _accuracy(axes: Axes, record: SortieRecord) -> None:
     legend_beside(axes)
 
 
+def _accuracy_of_each(axes: Axes, record: SortieRecord) -> None:
+    table = accuracy_table(record)
+    drone, t_s, ap50 = table["drone"].to_numpy(), _column(table, "t_s"), _column(table, "ap50")
+    for i in np.unique(drone).tolist():
+        axes.plot(t_s[drone == i], ap50[drone == i], color=colour(i), linewidth=1.4, label=f"drone {i}")
+    axes.set_ylim(0.0, 1.0)
+    legend_beside(axes)
+
+
+def _matrix_rows(drones: int) -> list[tuple[int, int | None]]:
+    """The rows of the matrix of links: sender and receiver, or a sender alone."""
+    pairs = [(i, j) for i in range(drones) for j in range(drones) if i != j]
+    return [*pairs] if len(pairs) <= MOST_LINKS else [(i, None) for i in range(drones)]
+
+
+def _links(axes: Axes, record: SortieRecord) -> None:
+    table = record.tables[links.TABLE]
+    t_s, sender, receiver, delivered = (_column(table, name) for name in ("t_s", "sender", "receiver", "delivered"))
+    edges_s, rows = np.unique(np.append(t_s, record.scenario.duration_s)), _matrix_rows(_drones(record))
+    share = np.full((len(rows), len(edges_s) - 1), np.nan)
+    for k, (i, j) in enumerate(rows):
+        own = (sender == i) & (True if j is None else receiver == j) & ~np.isnan(delivered)
+        second = np.searchsorted(edges_s, t_s[own]) - 1  # a row tells of the time before it
+        count = np.bincount(second[second >= 0], minlength=share.shape[1])
+        total = np.bincount(second[second >= 0], delivered[own][second >= 0], share.shape[1])
+        share[k] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    drawn_in = axes.pcolormesh(
+        edges_s, np.arange(len(rows) + 1), share, cmap="RdYlGn", vmin=0.0, vmax=1.0, rasterized=True
+    )
+    axes.figure.colorbar(drawn_in, ax=axes, pad=0.01)
+    each = max(1, len(rows) // 20)
+    names = [f"{i}" if j is None else f"{i} → {j}" for i, j in rows]
+    axes.set_yticks(np.arange(len(rows))[::each] + 0.5, names[::each], fontsize=9)
+    axes.set_ylim(len(rows), 0)
+    axes.grid(visible=False)
+
+
 def delivered_mbps(record: SortieRecord) -> Floats:
     """Second and payload that arrived in it, Mb/s, [K, 2]; of payloads that came in part, that part."""
     sent, edges = record.tables["transmissions"], _edges(record)
@@ -353,6 +405,17 @@ def _battery(axes: Axes, record: SortieRecord) -> None:
         )
     lowest = float(soc.min()) if len(soc) else 0.0
     axes.set_ylim(max(0.0, 100.0 * np.floor(20.0 * lowest - 0.5) / 20.0), 100.0)
+    legend_beside(axes)
+
+
+def _energy(axes: Axes, record: SortieRecord) -> None:
+    table = record.tables["states"]
+    drone, t_s, spent_j = table["drone"].to_numpy(), _column(table, "t_s"), _column(table, "spent_j")
+    each = max(1, round(record.scenario.context.rate_hz))
+    for i in range(_drones(record)):
+        own = drone == i
+        axes.plot(t_s[own][::each], 1e-3 * spent_j[own][::each], color=colour(i), linewidth=1.6, label=f"drone {i}")
+    axes.set_ylim(bottom=0.0)
     legend_beside(axes)
 
 

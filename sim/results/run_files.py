@@ -21,7 +21,7 @@ from sortie.policies.verification.enforced import CAUSES
 from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import models_of_the_past
-from sortie.sim.results import beliefs, disagreement, links, rosters, views
+from sortie.sim.results import accuracy_table, beliefs, disagreement, links, rosters, views
 from sortie.sim.results.record import CLASS_COLUMN, OF_CLASSES, TABLES, VIOLATIONS_OF, SortieRecord
 from sortie.sim.results.run_checks import LARGEST, MOST_CHARACTERS, Checks, ensure_boxes, ensure_each_once
 
@@ -30,7 +30,17 @@ RECORDING_MARK = "\n\x06sortie"
 """Near the begin of a Rerun recording that Sortie wrote: the name of the application."""
 PAGE, TLOG, PCAP, BAG = "report.html", "sortie.tlog", "sortie.pcap", "bag"
 _TABLES = (*TABLES, *views.TABLES, disagreement.TABLE, rosters.TABLE, beliefs.TABLE, links.TABLE)
-WRITTEN = {OUTCOME, SCENARIO, RECORD, RECORDING, PAGE, TLOG, PCAP, BAG, *(f"{name}.parquet" for name in _TABLES)}
+WRITTEN = {
+    OUTCOME,
+    SCENARIO,
+    RECORD,
+    RECORDING,
+    PAGE,
+    TLOG,
+    PCAP,
+    BAG,
+    *(f"{name}.parquet" for name in (*_TABLES, accuracy_table.TABLE)),
+}
 """All that commands write into a run's folder."""
 WRITTEN |= {".DS_Store"}  # a desktop that looked in
 MOST_BYTES = 64 << 20

@@ -7,9 +7,12 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow.parquet as pq
+
 from sortie.scenarios.reading.load import dump
 from sortie.scenarios.schema import Scenario
 from sortie.sim.folders import RunError, ensure_folder, writing
+from sortie.sim.results.accuracy_table import TABLE, accuracy_table
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.run_files import OUTCOME, RECORD, RECORDING, SCENARIO, WRITTEN, About, read_json, read_run
@@ -79,6 +82,7 @@ def save(
             (folder / RECORD).write_text(json.dumps(about, indent=2, default=dict) + "\n", "utf-8")
             for name in record.tables:
                 write_parquet(record.tables, name, folder / f"{name}.parquet")
+            pq.write_table(accuracy_table(record), folder / f"{TABLE}.parquet", compression="zstd")
             if also is not None:
                 also(folder)
     except RunError:

@@ -42,9 +42,13 @@ class Spool:
         self._schemas[name] = pa.schema(list(columns.items()))
         self._places[name] = []
 
+    def schema(self, name: str) -> pa.Schema:
+        """A table's columns."""
+        return self._schemas[name]
+
     def batch(self, name: str, values: Sequence[Any] | None) -> pa.RecordBatch:
         """Rows of a table from the values of its columns; None makes none."""
-        schema = self._schemas[name]
+        schema = self.schema(name)
         each = [()] * len(schema) if values is None else values
         arrays = [pa.array(v, field.type) for v, field in zip(each, schema, strict=True)]
         return pa.RecordBatch.from_arrays(arrays, schema=schema)

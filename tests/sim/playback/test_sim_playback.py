@@ -15,7 +15,7 @@ from played_flight import Rows, drawn, flown, series, with_tables
 from rerun.chunk import RrdReader
 from sim_examples import example
 
-from sortie.sim.playback.charts import OVER
+from sortie.sim.playback.event_lane import NOTHING
 from sortie.sim.playback.recording import save_rrd, scene_of
 from sortie.sim.results.accuracy import matched
 from sortie.sim.results.outcome import outcome
@@ -44,13 +44,13 @@ def test_there_is_one_recording_with_its_layout(record: SortieRecord, tmp_path: 
     def column(name: str) -> list[Any]:
         return sorted(v for b in batches if name in b.schema.names for (v,) in b[name].to_pylist())
 
-    views = ["2D", "3D", "StateTimeline", "TextDocument", "TextLog", *["TimeSeries"] * 7]
+    views = ["2D", "2D", "3D", "StateTimeline", "TextDocument", "TextLog", *["TimeSeries"] * 9]
     assert column("ViewBlueprint:class_identifier") == views
     assert column("TimePanelBlueprint:timeline") == ["sim_time"]
 
 
 SHOWN = """
-/about /lanes/events /lanes/phase /log/decisions /log/events /plots/age/p99_ms /plots/ap/full_scene /plots/ap/mission
+/about /links/heard /links/numbers /lanes/events /lanes/phase /log/decisions /log/events /plots/age/p99_ms /plots/ap/full_scene /plots/ap/mission
 /plots/lost/percent /plots/medium/busy_percent /plots/traffic/features_delivered /world/cars/moving /world/cars/parked
 /world/fleet /world/links /world/mission /world/mission/disc /world/target /world/broken /world/town/buildings
 /world/town/ground /world/town/trees
@@ -58,7 +58,15 @@ SHOWN = """
 
 
 def test_every_entity_that_the_layout_shows_is_there(rows: Rows) -> None:
-    each = ["world/drones", "world/footprints", "world/trails", "plots/battery", "plots/goodput"]
+    each = [
+        "world/drones",
+        "world/footprints",
+        "world/trails",
+        "plots/battery",
+        "plots/energy",
+        "plots/goodput",
+        "plots/ap_of",
+    ]
     expected = {f"/{folder}/{i}" for folder in each for i in range(5)}
     expected |= {f"/world/seen/{i}/{kind}" for i in range(5) for kind in ("found", "missed", "false")}
     expected |= {f"/lanes/drone_{i}" for i in range(5)}
@@ -105,7 +113,7 @@ def test_events_and_phase_changes_are_marked_on_the_plots_and_in_the_log(rows: R
         assert series(rows, f"/plots/{plot}/marks/event") == [(4.0, 0.0), (6.0, 0.0)]
         assert series(rows, f"/plots/{plot}/marks/phase") == [(3.0, 0.0)]
     happened = [(4.0, ["drone 2: links of 2 lose 60 dB"]), (6.0, ["drone 3: fell silent"])]
-    assert [(t_s, v) for t_s, _, v in rows["/lanes/events"]["StateChange:state"]] == [*happened, (8.0, [OVER])]
+    assert [(t_s, v) for t_s, _, v in rows["/lanes/events"]["StateChange:state"]] == [*happened, (8.0, [NOTHING])]
     assert [(t_s, v) for t_s, _, v in rows["/log/events"]["TextLog:text"]] == happened
     assert [v for _, _, v in rows["/log/events"]["TextLog:level"]] == [["WARN"]] * 2
 
@@ -125,7 +133,7 @@ def test_the_disc_and_the_target_follow_the_mission(rows: Rows, record: SortieRe
     assert [(t_s, v) for t_s, _, v in rows["/lanes/phase"]["StateChange:state"]] == [
         (0.0, ["search"]),
         (3.0, ["track"]),
-        (8.0, [OVER]),
+        (8.0, [NOTHING]),
     ]
 
 

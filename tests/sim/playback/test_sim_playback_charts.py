@@ -10,9 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from record_by_hand import record, rows, tables_of
+from sim_examples import example
 
 from sortie.scenarios.schema import Scenario
-from sortie.sim.playback.charts import OVER, Charts
+from sortie.sim.playback.charts import Charts
+from sortie.sim.playback.event_lane import NOTHING, lane_changes, spans_of
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.sightings import sightings
 
@@ -174,9 +176,9 @@ def test_a_drone_s_lane_shows_nothing_each_time_that_it_is_down(seconds: tuple[f
         (2.1, "raw at 2 Hz"),
         (2.6, "tracks at 2 Hz"),
         (3.0, "nothing"),
-        (4.0, OVER),
+        (4.0, NOTHING),
     ]
-    assert lanes["lanes/drone_0"] == [(1.6, "detections at 2 Hz"), (3.6, "tracks at 2 Hz"), (4.0, OVER)]
+    assert lanes["lanes/drone_0"] == [(1.6, "detections at 2 Hz"), (3.6, "tracks at 2 Hz"), (4.0, NOTHING)]
 
 
 def test_of_links_on_one_rung_a_lane_shows_the_one_that_sends_most() -> None:
@@ -188,4 +190,30 @@ def test_of_links_on_one_rung_a_lane_shows_the_one_that_sends_most() -> None:
     first, second, third = (
         (t_s, f"features ρ={of}") for t_s, of in ((0.5, "0.25 at 2 Hz"), (1.5, "0.1 at 10 Hz"), (2.5, "0.25 at 2 Hz"))
     )
-    assert lanes["lanes/drone_0"] == [first, second, third, (4.0, OVER)]
+    assert lanes["lanes/drone_0"] == [first, second, third, (4.0, NOTHING)]
+
+
+def test_an_event_s_bar_ends_with_the_event() -> None:
+    """A jam lasts as the scenario says, a lost link to the end, a landing for two seconds; the last to begin is shown."""
+    scenario = example(
+        "duration_s=20",
+        "events=[{kind: jam, at_s: 2, until_s: 9, position_m: [0, 0, 60], power_dbm: 0}, {kind: link_drop, at_s: 12, drone: 1, loss_db: 9}]",
+    )
+    times = [(2.0, "jam", "on"), (4.0, "landed", "down"), (9.0, "jam_over", "off"), (12.0, "link_drop", "weak")]
+    spans = spans_of([{"t_s": t_s, "drone": -1, "kind": kind, "text": text} for t_s, kind, text in times], scenario)
+    bars = [(2, "on"), (4, "down"), (6, "on"), (9, "off"), (11, NOTHING), (12, "weak")]
+    whole = [(t_s, text if text == NOTHING else f"fleet: {text}") for t_s, text in bars]
+    assert lane_changes(spans, NOTHING, 0.0, 20.0) == whole
+    by_parts, shown = [], NOTHING
+    for from_s in range(20):
+        for change in lane_changes(spans, shown, float(from_s), from_s + 1.0):
+            by_parts.append(change)
+            shown = change[1]
+    assert by_parts == whole
+
+
+def test_each_drone_has_its_accuracy_and_its_energy(seconds: tuple[float, ...]) -> None:
+    """Together the drones' fusions are those of the plot of the whole fleet."""
+    made = drawn({}, seconds=seconds)
+    assert made["plots/ap_of/0"][0] == (1, 0.5)
+    assert {path for path in made if path.startswith("plots/energy/")} == {"plots/energy/0", "plots/energy/1"}

@@ -220,3 +220,16 @@ def test_a_hatch_covers_exactly_the_cells_of_the_region() -> None:
     ahead = math.cos(0.7) * (runs[:, 0] - pose[0]) + math.sin(0.7) * (runs[:, 1] - pose[1])
     strip = (1.5 / 4 - 0.5) * CELL_M  # the second of four strips, from the cell's centre
     assert ahead.tolist() == pytest.approx((centres[inside.any(axis=1)] + strip).tolist(), abs=1e-9)
+
+
+def test_the_matrix_has_what_the_table_of_links_has(rows: Rows, record: SortieRecord) -> None:
+    links = record.tables["links"].to_pandas()
+    pictures = {
+        t_s: np.frombuffer(bytes(v[0]), np.uint8).reshape(5, 5, 4) for t_s, _, v in rows["/links/heard"]["Image:buffer"]
+    }
+    assert sorted(pictures) == sorted(links.t_s.unique())
+    for t_s, now in links.groupby("t_s"):
+        share = np.full((5, 5), np.nan)
+        share[now.sender, now.receiver] = now.delivered
+        assert (pictures[t_s] == palette.share_colours(share)).all()
+    assert links[(links.t_s > 5) & (links.sender == 2)].empty  # out of earshot: grey
