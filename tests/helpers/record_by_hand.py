@@ -186,9 +186,9 @@ def told_outcome(off: float = 0.0) -> dict[str, Any]:
         "energy_j": {"rotor": 8100.0, "radio": 1200.0 * k, "compute": 2300.0 * k, "fault": 0.0, "total": 11_600.0 * k},
         "battery": {"0": 0.91, "1": 0.62 + share, "2": 0.73},
         "drones": {
-            "0": {"soc": 0.91, "voltage_v": 15.25, "airborne": True, "energy_j": 4400.0},
-            "1": {"soc": 0.62, "voltage_v": 14.5, "airborne": False, "energy_j": 7200.0},
-            "2": {"soc": 0.73, "voltage_v": 13.75, "airborne": True, "energy_j": 0.0},
+            "0": {"soc": 0.91, "voltage_v": 15.25, "airborne": True, "energy_j": 4400.0, "ap50": {"full_scene": 0.41, "mission": 0.62}},
+            "1": {"soc": 0.62, "voltage_v": 14.5, "airborne": False, "energy_j": 7200.0, "ap50": {"full_scene": 0.43, "mission": None}},
+            "2": {"soc": 0.73, "voltage_v": 13.75, "airborne": True, "energy_j": 0.0, "ap50": {"full_scene": None, "mission": None}},
         },
         "switches": 3.25, "policy_eval_us": {"p50": 21.0, "p99": 83.0}, "wall_s": 1.6, "realtime_factor": 2.5,
         "own_files": {"own.py": "f00d"}, "fingerprint": "0123456789abcdef" * 4,

@@ -100,9 +100,7 @@ def test_links_that_a_trace_cuts_are_not_usable_and_others_stay_as_they_are(tmp_
     file.write_text("t_s,sender,receiver,loss\n0,0,1,0\n")
     for power_dbm in (8, -4):
         far = ("fleet.formation.spacing_m=150", f"radio.tx_power_dbm={power_dbm}", "duration_s=6")
-        before, after = (
-            usable(run_sortie(example(*few, *far, *t), "silence")) for t in ((), (f"radio.trace={file}",))
-        )
+        before, after = (usable(run_sortie(example(*few, *far, *t), "silence")) for t in ((), (f"radio.trace={file}",)))
         assert after == before | {(t_s, 0, 1) for t_s in range(6)}
 
 

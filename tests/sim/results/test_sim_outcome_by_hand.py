@@ -15,6 +15,8 @@ import pytest
 from record_by_hand import CAR, SCENARIO, record, rows, tables_of
 
 from sortie.scenarios.reading.load import loads
+from sortie.sim.results.accuracy import Pool
+from sortie.sim.results.accuracy_table import accuracy_table, windowed_ap
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
@@ -53,10 +55,39 @@ def test_percentiles_lie_between_the_values(result: dict[str, Any]) -> None:
     assert result["data_age_mean_s"] == pytest.approx(0.25)
 
 
+def test_each_drone_s_accuracy_is_of_its_own_fusions() -> None:
+    """At 2.5 s drone 0 has two of four cars, with a false alarm between them; the disc is there from 2 s on."""
+    made = accuracy_table(record()).to_pandas()
+    counts = made.drop(columns=["ap50", "mission_ap50"])
+    assert counts.to_numpy().tolist() == [
+        [0.5, 0, 2, 1, 1, 0, 0, 0],
+        [2.5, 0, 2, 1, 0, 1, 1, 0],
+        [2.5, 1, 1, 0, 0, 1, 0, 0],
+        [3.5, 0, 1, 1, 0, 1, 1, 0],
+    ]
+    assert made.ap50.tolist() == pytest.approx([0.5, 1 / 4 + 1 / 6, 0.0, 0.5])
+    assert made.mission_ap50.tolist() == pytest.approx([np.nan, 1.0, 0.0, 1.0], nan_ok=True)
+
+
+def test_accuracy_is_of_the_five_seconds_up_to_each_moment() -> None:
+    """At 0 s one of one is found, at 4 s none of one, at 5 s and 7 s one of one; 5 s after a fusion it is out of the window."""
+    hits = np.array([True, True, True])
+    found = Pool(
+        np.array([0.0, 4.0, 5.0, 7.0]),
+        np.zeros(4, np.int32),
+        np.array([0, 1, 1, 2, 3]),
+        np.ones(3),
+        hits,
+        np.ones(4, int),
+    )
+    assert windowed_ap(found).tolist() == pytest.approx([1.0, 1 / 2, 1 / 2, 2 / 3])
+
+
 def test_energy_is_added_up_by_cause_by_drone_and_in_all(result: dict[str, Any]) -> None:
     assert result["energy_j"] == {"rotor": 150.0, "radio": 5.0, "fault": 20.0, "total": 175.0}
     assert {d: v["energy_j"] for d, v in result["drones"].items()} == {"0": 105.0, "1": 70.0}
     first = {"soc": pytest.approx(0.87), "voltage_v": 13.0, "airborne": True, "energy_j": 105.0}
+    first |= {"ap50": {"full_scene": 0.5, "mission": 1.0}}
     assert result["drones"]["0"] == first
     assert result["drones"]["1"]["airborne"] is False
     assert result["battery"] == pytest.approx({"0": 0.87, "1": 0.77})

@@ -48,7 +48,8 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.count[tag] = self.count.get(tag, 0) + 1
-        self.fetched += [v for k, v in attrs if k in ("src", "href", "xlink:href") and v and not v.startswith("#")]
+        inside = ("#", "data:image/png;base64,")
+        self.fetched += [v for k, v in attrs if k in ("src", "href", "xlink:href") and v and not v.startswith(inside)]
         if tag == "tr":
             self.rows.append([])
         if tag in ("td", "th"):
@@ -96,7 +97,7 @@ def test_the_page_stands_alone_and_text_of_users_is_text() -> None:
     assert "script" not in read.count
     assert "@import" not in html()
     assert not re.search(r"url\((?!#)", html())
-    assert read.count["svg"] == 6  # no accuracy: there was no detector
+    assert read.count["svg"] == 8  # no accuracy: there was no detector
     assert len(html()) < 1_000_000
     assert "Cars & <houses>" in read.text
     assert "<houses>" not in html()
@@ -130,7 +131,9 @@ def test_a_table_without_rows_leaves_every_figure_whole() -> None:
         short = ("duration_s=0.6", "fleet.drones=2", "mission.phases=[{}]", "perception.detector=surrogate")
         record = run_sortie(example(*short, *sets), policy)
         assert {name for name in empty if record.tables[name].num_rows} == set()
-        assert Page(page(record)).count["svg"] == 7
+        assert Page(page(record)).count["svg"] == (
+            10 if record.scenario.fleet.drones > 1 else 9
+        )  # no links of one drone
     nothing = Page(page(run_sortie(example("duration_s=0.5", "mission.phases=[{}]", "fleet.drones=1"), "silence")))
     assert "Nobody ever sent anything, and nothing happened to the fleet." in nothing.text
 

@@ -97,7 +97,7 @@ def test_the_same_record_from_plain_tables_in_few_row_groups(tmp_path: Path) -> 
 
 def test_an_observer_gets_every_row_once(monkeypatch: pytest.MonkeyPatch) -> None:
     make_tiny(monkeypatch)
-    seen: dict[str, list[Any]] = {name: [] for name in TABLES}
+    seen: dict[str, list[Any]] = {name: [] for name in (*TABLES, "links")}
 
     class Watcher:
         def begin(self, scenario: object, scene: object) -> None: ...

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -172,17 +173,30 @@ def test_the_page_s_tables_of_phases_and_drones_are_the_outcome_s() -> None:
     assert read == [
         ["search, 0–2 s", "0.200", "0.600", "7.5 Mb/s", "33.3 %", "37.5 %"],
         ["track, 2–4 s", "0.300", "0.700", "8.5 Mb/s", "100.0 %", "66.7 %"],
-        ["drone 0", "91.0 %", "4.4 kJ", "15.25 V", "flying"],
-        ["drone 1", "62.0 %", "7.2 kJ", "14.50 V", "down"],
-        ["station 2", "mains", "", "", "on"],
+        ["drone 0", "91.0 %", "4.4 kJ", "15.25 V", "0.410", "0.620", "flying"],
+        ["drone 1", "62.0 %", "7.2 kJ", "14.50 V", "0.430", "–", "down"],
+        ["station 2", "mains", "", "", "–", "–", "on"],
     ]
     on_battery = Fleet.model_validate({"drones": 3, "ground": [{"drone": 1, "mains": False}]})
-    assert "<td>station 1</td><td>62.0 %</td><td>7.2 kJ</td><td>14.50 V</td><td>off</td>" in report._numbers(
-        made, on_battery
+    assert (
+        "<td>station 1</td><td>62.0 %</td><td>7.2 kJ</td><td>14.50 V</td><td>0.430</td><td>–</td><td>off</td>"
+        in report._numbers(made, on_battery)
     )
 
 
 # --- figures over time ----------------------------------------------------------------------------------------------
+
+
+def test_the_matrix_of_links_is_the_table_s_a_row_later() -> None:
+    """A row of the table tells of the time before it: what is heard in the first second stands at 1 s."""
+    told = [(0.0, 0, 1, math.nan), (1.0, 0, 1, 0.5), (2.0, 0, 1, 0.25), (2.0, 1, 0, 1.0)]
+    columns = dict(zip(("t_s", "sender", "receiver", "delivered"), map(list, zip(*told, strict=True)), strict=True))
+    axes = Figure().add_subplot()
+    flown = record()
+    report_figures._links(axes, replace(flown, tables={**flown.tables, "links": pa.table(columns)}))
+    (mesh,) = axes.collections
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["0 → 1", "1 → 0"]
+    assert mesh.get_array().filled(-1.0).tolist() == [[0.5, 0.25, -1.0], [-1.0, 1.0, -1.0]]
 
 
 def curves(draw: Any, flown: SortieRecord) -> dict[str, list[tuple[float, float]]]:
