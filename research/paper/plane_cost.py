@@ -1,6 +1,6 @@
 """The paper's claims about the context plane's cost and its replayed traces, measured on a flown sortie.
 
-The sortie is `paper_replay`: the paper's 120 s with five drones instead of four, its directives enforced by gates and
+The sortie is `paper_replay_contention`: the paper's 120 s with five drones instead of four, its directives enforced by gates and
 its payloads handed to a radio. Names are those that the claims ask for (`research.paper.measures.Elsewhere`).
 """
 
@@ -29,7 +29,7 @@ from sortie.sim.folders import RunError
 from sortie.sim.identity import machine
 from sortie.sim.results.record import SortieRecord
 
-SCENARIO = "paper_replay"
+SCENARIO = "paper_replay_contention"
 PAPER_AGENTS, PAPER_HZ, PAPER_DIRECTIVES_HZ, PAPER_DEADLINE_MS = 4, 10, 80, 100.0
 PHASE_CHANGE_S, LINK_DROP_S, TIRED, CUT_OFF = 45.0, 60.0, 1, 2
 LADDER = [("features", 10.0), ("features", 5.0), ("detections", 2.0)]

@@ -19,7 +19,7 @@ from sortie.sim.results.views import TABLES
 from sortie.sim.studies.replay import kept_decisions
 
 LIBRARY = {
-    "track_target": (), "paper_context": (), "paper_replay": (), "search_grid": ("duration_s=10",),
+    "track_target": (), "paper_context": (), "paper_replay_contention": (), "search_grid": ("duration_s=10",),
 }  # fmt: skip
 """Scenarios of the library as they stand; 25 drones make many pairs, so the grid flies for 10 s."""
 POLICIES = ("all-4", "best-2", "random-2", "adaptive", "learned", "deputies")

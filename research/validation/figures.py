@@ -660,14 +660,20 @@ def _hysteresis() -> Tables:
 
     rows = []
     for band in (0.0, 0.2, 1.0):
-        record = run_sortie(load("paper_replay", ["perception.detector=none", f"policy.hysteresis={band}"]))
+        record = run_sortie(load("paper_replay_contention", ["perception.detector=none", f"policy.hysteresis={band}"]))
         rows.append([band, record.tables["directives"].num_rows, outcome(record)["switches"]])
     columns = [
         Column("`policy.hysteresis`", "g"),
         Column("directives", ",.0f"),
         Column("switches a link and minute", ".2f"),
     ]
-    return {"hysteresis": Table(columns, rows, "`paper_replay`, one sortie each.")}
+    return {"hysteresis": Table(columns, rows, "`paper_replay_contention`, one sortie each.")}
+
+
+def _replay_contention() -> Tables:
+    from research.validation import replay_contention
+
+    return {"replay_contention": replay_contention.table()}
 
 
 def _overhead() -> Tables:
@@ -694,13 +700,16 @@ def _live() -> Tables:
 
     four = ["fleet.drones=4"]
     full = [*four, "policy.name=all-4", "policy.params={received_budget: 1}"]
-    one, other = fly_live(load("paper_replay", four)), fly_live(load("paper_replay", full), duration_s=30.0)
+    one, other = (
+        fly_live(load("paper_replay_contention", four)),
+        fly_live(load("paper_replay_contention", full), duration_s=30.0),
+    )
     both = zip(overhead_rows(one), overhead_rows(other), strict=True)
     columns = [Column(""), Column("worked"), Column("all-4(received_budget=1)")]
     overhead = Table(
-        columns, [[*row, there[1]] for row, there in both], "Four drones; 120 s and 30 s of `paper_replay`."
+        columns, [[*row, there[1]] for row, there in both], "Four drones; 120 s and 30 s of `paper_replay_contention`."
     )
-    lossy = fly_live(load("paper_replay"), begin_s=50.0, duration_s=30.0, loss=0.3, kill=(3, 70.0))
+    lossy = fly_live(load("paper_replay_contention"), begin_s=50.0, duration_s=30.0, loss=0.3, kill=(3, 70.0))
     dropped, heard = (sum(getattr(d, name) for d in lossy.each) for name in ("dropped_by_loss", "heard"))
     noticed = [n for n in lossy.noticed if n.drone == 3]
     rows: list[list[Any]] = [
@@ -793,6 +802,7 @@ FIGURES: dict[str, Figure] = {
     "viewpoints": Figure(2, _viewpoints, network=True),
     "join_rules": Figure(4, _join_rules, network=True),
     "where_boxes_average": Figure(3, _where_boxes_average, network=True),
+    "replay_contention": Figure(4, _replay_contention),
     "live": Figure(3.5, _live, timed=True),
     "track_prediction": Figure(4, _track_prediction, network=True),
     "radio_scale": Figure(3, _radio_scale, timed=True),
