@@ -1,6 +1,6 @@
 """The paper's 120 s context traces as files: what they hold, and how they are made.
 
-    python -m research.paper.context_traces [FOLDER]     writes drones.csv, links.csv and mission.csv
+    python -m research.paper.context_traces [FOLDER]     writes the four tables of `FILES`
 
 The paper replays traces that hold a mission's phase change, a battery's decay and a drop of link quality; its text
 gives when they happen and what policies do then, and its own files are not to be had. These are made from that text;
@@ -20,6 +20,8 @@ from sortie.scenarios.streams import stream
 
 PAPER_120S = TRACES / "paper_120s"
 DRONES, DURATION_S = 4, 120
+STEADY_DRONES = 5
+"""Of paper_replay, which flies a whole cross."""
 PHASE_CHANGE_S, LINK_DROP_S = 45, 60
 TIRED, CUT_OFF = 1, 2
 REGION_RADIUS_M = 32.0
@@ -62,6 +64,17 @@ def link_rows(seed: int = 1) -> Iterable[Row]:
                 yield t_s, i, j, round((DROPPED_MBPS if dropped else GOOD_MBPS) * swing, 1)
 
 
+def steady_link_rows() -> Iterable[Row]:
+    """The same of five drones, without swings: a row a link, and two more at the drop."""
+    for i in range(STEADY_DRONES):
+        for j in range(STEADY_DRONES):
+            if CUT_OFF in (i, j) and i != j:
+                yield LINK_DROP_S - 0.1, i, j, GOOD_MBPS
+                yield LINK_DROP_S, i, j, DROPPED_MBPS
+            elif i != j:
+                yield 0, i, j, GOOD_MBPS
+
+
 def mission_rows() -> Iterable[Row]:
     """t_s, phase and the region of responsibility: every second; no region while searching."""
     for t_s in range(DURATION_S + 1):
@@ -74,6 +87,7 @@ def mission_rows() -> Iterable[Row]:
 FILES = {
     "drones.csv": (("t_s", "drone", "soc"), drone_rows),
     "links.csv": (("t_s", "sender", "receiver", "goodput_mbps"), link_rows),
+    "steady_links.csv": (("t_s", "sender", "receiver", "goodput_mbps"), steady_link_rows),
     "mission.csv": (("t_s", "phase", "region_x_m", "region_y_m", "region_radius_m"), mission_rows),
 }
 

@@ -45,9 +45,9 @@ class Expectation(Section):
 
 
 class DecisionExpectation(Section):
-    """Some directive that a drone's gate takes up within a window."""
+    """Some directive that a drone's gate takes up within a window, or how many links change to it."""
 
-    drone: DroneId = Field(description="Whose gate.")
+    drone: DroneId | None = Field(None, description="Whose gate; left out, any drone's.")
     peer: DroneId | None = Field(None, description="The link's other end; left out, any.")
     from_s: float = Field(ge=0, description="Begin of the window, inclusive.")
     until_s: float = Field(ge=0, description="End of the window, inclusive.")
@@ -55,6 +55,11 @@ class DecisionExpectation(Section):
     rate_at_most_hz: float | None = Field(None, ge=0, le=30, description="Its highest rate.")
     roi: bool | None = Field(None, description="Whether it is confined to a region.")
     reason: str = Field("", description="Text that its reason contains.")
+    changes: int | None = Field(
+        None,
+        ge=0,
+        description="How often links change to it in the window, counted link by link; left out, any number.",
+    )
     because: str = Field("", description="Why it is expected; shown when it fails.")
 
     @model_validator(mode="after")

@@ -57,6 +57,9 @@ class Scenario(Section):
     expect_decisions: tuple[DecisionExpectation, ...] = Field(
         (), max_length=1000, description="What the gates must take up, and when; asserted by `sortie check`."
     )
+    expect_no_other_changes: bool = Field(
+        False, description="Whether each change of what a link carries must be one that `expect_decisions` lists."
+    )
 
     @property
     def publishes_rosters(self) -> bool:

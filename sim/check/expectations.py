@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.report_text import interval
 from sortie.scenarios.schema import DecisionExpectation, Expectation, Scenario
-from sortie.sim.results.outcome import describe
+from sortie.sim.results.outcome import changes, describe
 from sortie.sim.results.outcome_fields import is_zero_count, possible
 from sortie.sim.results.record import SortieRecord
 
@@ -74,6 +74,7 @@ def check(
             for e in scenario.expect
         ),
         *(_check_decision(e, record) for e in scenario.expect_decisions),
+        *([_check_no_others(scenario.expect_decisions, record)] if scenario.expect_no_other_changes else []),
     ]
 
 
@@ -145,8 +146,8 @@ def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
 
 
 def _check_decision(e: DecisionExpectation, record: SortieRecord) -> Verdict:
-    """Between from_s and until_s some link of the drone is given what is expected, for the reason expected."""
-    whom = f"drone {e.drone}" + ("" if e.peer is None else f" → {e.peer}")
+    """Between from_s and until_s some link is given what is expected, or as many links change to it as are expected."""
+    whom = ("any drone" if e.drone is None else f"drone {e.drone}") + ("" if e.peer is None else f" → {e.peer}")
     what = " ".join(
         [
             e.representation or "anything",
@@ -155,24 +156,55 @@ def _check_decision(e: DecisionExpectation, record: SortieRecord) -> Verdict:
             *([f"because of {e.reason!r}"] if e.reason else []),
         ]
     )
-    expected = f"{whom}: {what} decided in [{e.from_s:g}, {e.until_s:g}] s"
-    rows = [
-        r
-        for r in record.tables["directives"].to_pylist()
-        if e.from_s - TOLERANCE <= r["t_s"] <= e.until_s + TOLERANCE
-        and r["drone"] == e.drone
-        and (e.peer is None or r["peer"] == e.peer)
-    ]
-    for r in rows:
-        if (
-            (e.representation is None or r["representation"] == e.representation)
-            and (e.rate_at_most_hz is None or r["rate_hz"] <= e.rate_at_most_hz)
-            and (e.roi is None or (r["roi_radius_m"] == r["roi_radius_m"]) == e.roi)  # NaN is no ROI
-            and e.reason in r["reason"]
-        ):
-            return Verdict(expected, _row_in_words(r), True, e.because)
-    got = "; ".join(_row_in_words(r) for r in rows[:3]) or "no decision"
-    return Verdict(expected, got, False, e.because)
+    window = f"in [{e.from_s:g}, {e.until_s:g}] s"
+    if e.changes is not None:
+        found = [row for row in _changes(record) if _is_expected(e, row)]
+        holds = len(found) == e.changes
+        got = "; ".join([_counted(len(found), "change"), *map(_row_in_words, found[: 1 if holds else 3])])
+        return Verdict(f"{whom}: {_counted(e.changes, 'change')} to {what} {window}", got, holds, e.because)
+    rows = [row for row in record.tables["directives"].to_pylist() if _is_of_window(e, row)]
+    holding = next((row for row in rows if _is_expected(e, row)), None)
+    got = "; ".join(map(_row_in_words, rows[:3] if holding is None else [holding])) or "no decision"
+    return Verdict(f"{whom}: {what} decided {window}", got, holding is not None, e.because)
+
+
+def _check_no_others(expected: Sequence[DecisionExpectation], record: SortieRecord) -> Verdict:
+    """Every change of what a link carries is one of those that are expected."""
+    others = [row for row in _changes(record) if not any(_is_expected(e, row) for e in expected)]
+    got = "; ".join([_counted(len(others), "other"), *map(_row_in_words, others[:3])])
+    return Verdict("no changes of what links carry but those of expect_decisions", got, not others, "")
+
+
+def _changes(record: SortieRecord) -> Iterator[dict[str, Any]]:
+    """The directives that change what their link carries."""
+    carried: dict[tuple[int, int], str] = {}
+    for row, level in changes(record.tables["directives"], carried):
+        carried[row["drone"], row["peer"]] = level
+        yield row
+
+
+def _is_of_window(e: DecisionExpectation, row: dict[str, Any]) -> bool:
+    """Whether a directive is for a link and of a time that the expectation names."""
+    return (
+        e.from_s - TOLERANCE <= row["t_s"] <= e.until_s + TOLERANCE
+        and e.drone in (None, row["drone"])
+        and e.peer in (None, row["peer"])
+    )
+
+
+def _is_expected(e: DecisionExpectation, row: dict[str, Any]) -> bool:
+    """Whether a directive is all that the expectation names."""
+    return (
+        _is_of_window(e, row)
+        and e.representation in (None, row["representation"])
+        and (e.rate_at_most_hz is None or row["rate_hz"] <= e.rate_at_most_hz)
+        and (e.roi is None or (row["roi_radius_m"] == row["roi_radius_m"]) == e.roi)  # NaN is no ROI
+        and e.reason in row["reason"]
+    )
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _row_in_words(row: dict[str, Any]) -> str:

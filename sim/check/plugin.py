@@ -113,6 +113,7 @@ class ScenarioFile(pytest.File):
             raise self.CollectError(str(error)) from None
         names = [in_words(e) for e in scenario.expect]
         names += [f"decision {i}" for i in range(len(scenario.expect_decisions))]
+        names += ["no other changes"] * scenario.expect_no_other_changes
         if golden_path(self.path).is_file() or self.config.getoption("sortie_update"):
             names.append("golden outcome")
         for i, name in enumerate(names):

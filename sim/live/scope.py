@@ -56,6 +56,7 @@ UNUSED = (
     "metrics",
     "expect",
     "expect_decisions",
+    "expect_no_other_changes",
 )
 """Fields that change nothing in a live flight."""
 

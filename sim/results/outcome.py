@@ -46,7 +46,7 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
     scenario = record.scenario
     minutes = scenario.duration_s / 60.0
     links = scenario.fleet.drones * (scenario.fleet.drones - 1)
-    changes = list(transitions(tables["directives"], {}))
+    switched = list(transitions(tables["directives"], {}))
     looked_for = _looked_for(scenario.perception.classes)
     scored = score(record, [CAR, *(kind for kind in looked_for if kind != CAR)])
     drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones, scored)
@@ -107,8 +107,8 @@ def outcome(record: SortieRecord) -> dict[str, Any]:
             "violated_ticks": totals["violated_ticks"],
             "violations_by_cause": {c.replace(" ", "_"): totals[f"{VIOLATIONS_OF}{c}"] for c in CAUSES},
         },
-        "switches": sum(len(c["peers"]) for c in changes) / (links * minutes) if links else None,
-        "transitions": changes,
+        "switches": sum(len(c["peers"]) for c in switched) / (links * minutes) if links else None,
+        "transitions": switched,
         "phases": [
             _phase(record, scored, payloads, span, name)
             for payloads, (span, name) in zip(by_phase, phases, strict=True)
@@ -238,18 +238,26 @@ def describe(row: dict[str, Any]) -> str:
     return f"{row['representation']}{budget} at {row['rate_hz']:g} Hz{roi}"
 
 
+def changes(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[tuple[dict[str, Any], str]]:
+    """The directives that change what their link carries (a disc that moves is no change), and what it carries then.
+
+    `carried` is what each (drone, peer) carried before. Whoever reads this keeps it up to date, after each directive.
+    """
+    for row in chain.from_iterable(batch.to_pylist() for batch in directives.to_batches()):
+        if (level := describe(row)) != carried.get((row["drone"], row["peer"]), "nothing"):
+            yield row, level
+
+
 def transitions(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[dict[str, Any]]:
-    """Changes of what a link carries (a disc that moves is none); links of a drone that change alike in one entry.
+    """The `changes` of links; those of a drone that change alike in one entry.
 
     The same entries as `outcome.json` has, but in slices: `carried` is what each (drone, peer) carried before and is
     brought up to date. Each entry comes before the next one's changes are in `carried`.
     """
     entry: dict[str, Any] | None = None
-    for row in chain.from_iterable(batch.to_pylist() for batch in directives.to_batches()):
-        link, level = (row["drone"], row["peer"]), describe(row)
+    for row, level in changes(directives, carried):
+        link = (row["drone"], row["peer"])
         before = carried.get(link, "nothing")
-        if level == before:
-            continue
         change = {"t_s": row["t_s"], "drone": row["drone"], "from": before, "to": level, "reason": row["reason"]}
         if entry is not None and all(entry[k] == v for k, v in change.items()):
             entry["peers"].append(row["peer"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -13,12 +13,12 @@ from rich.table import Table
 from rich.text import Text
 
 from sortie.scenarios.report_text import number, percent, size
+from sortie.sim.results.decisions import decision_rows
 from sortie.sim.results.sentences import losses_in_words, turns_in_words
 from sortie.sim.terminal import Terminal, harmless
 
-MAX_TRANSITIONS = 24
 MAX_LINKS = 24
-"""Of one row of transitions."""
+"""Of one row of decisions."""
 MAX_CHARGES = 24
 """Drones of a fleet for which the charge left of each is printed."""
 PLURAL = {"car": "cars", "truck": "trucks", "person": "people"}
@@ -173,7 +173,7 @@ def _people_in_words(people: dict[str, Any]) -> str:
     return f"{percent(people['located_share'])} of those in a drone's region located, {alone} by the drone's own camera"
 
 
-def _links_in_words(links: list[tuple[int, int]]) -> str:
+def _links_in_words(links: Sequence[tuple[int, int]]) -> str:
     """Links by their drone; the first of many, and how many more there are."""
     by_drone: dict[int, list[str]] = {}
     for drone, peer in sorted(links)[:MAX_LINKS]:
@@ -184,23 +184,13 @@ def _links_in_words(links: list[tuple[int, int]]) -> str:
 
 
 def transitions_table(result: dict[str, Any]) -> Table:
-    """What the gates switched, when and why, drones that do alike in one row; events among them."""
-    frame_s = result["frame_s"]
-    alike: dict[tuple[int, str, str], tuple[float, list[tuple[int, int]]]] = {}
-    for t in result["transitions"]:
-        key = (int(t["t_s"] / frame_s + 1e-6), f"{t['from']} → {t['to']}", t["reason"])
-        alike.setdefault(key, (t["t_s"], []))[1].extend((t["drone"], peer) for peer in t["peers"])
-    rows: list[tuple[float, str, str | Text, str]]
-    rows = [(t_s, _links_in_words(links), what, why) for (_, what, why), (t_s, links) in alike.items()]
-    rows += [
-        (e["t_s"], "fleet" if e["drone"] < 0 else str(e["drone"]), Text(e["kind"], "yellow"), e["text"])
-        for e in result["events"]
-    ]
-    rows.sort(key=lambda row: row[0])
-    more = len(rows) - MAX_TRANSITIONS
-    table = Table(title="decisions and events", caption=f"and {more} more in outcome.json" if more > 0 else None)
+    """Phases, events and decisions in order of time, 25 rows at most (`sortie.sim.results.decisions`)."""
+    rows, more = decision_rows(result)
+    table = Table(title="decisions and events", caption=f"and {more} more in outcome.json" if more else None)
     for column in ("t (s)", "who", "what", "why"):
         table.add_column(column, justify="right" if column == "t (s)" else "left")
-    for t_s, who, what, why in rows[:MAX_TRANSITIONS]:
-        table.add_row(f"{t_s:.2f}", who, what, why)
+    for row in rows:
+        who = "fleet" if row.fleet else _links_in_words(row.links) if row.links else str(row.drone)
+        what: str | Text = row.what if row.links else Text(row.what, "yellow")
+        table.add_row(f"{row.t_s:.2f}", who, what, row.why)
     return table

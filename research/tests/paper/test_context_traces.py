@@ -28,12 +28,14 @@ def test_drone_1_falls_through_both_thresholds() -> None:
     assert min(float(r["soc"]) for r in others) > 0.6
 
 
-def test_drone_2_loses_its_links_within_one_period_and_no_other() -> None:
-    for r in rows("links.csv"):
+@pytest.mark.parametrize(("name", "drones"), [("links.csv", ct.DRONES), ("steady_links.csv", ct.STEADY_DRONES)])
+def test_drone_2_loses_its_links_within_one_period_and_no_other(name: str, drones: int) -> None:
+    for r in rows(name):
         cut = str(ct.CUT_OFF) in (r["sender"], r["receiver"]) and float(r["t_s"]) >= ct.LINK_DROP_S
         mbps = float(r["goodput_mbps"])
         assert 0 < mbps < 5 if cut else mbps > 200
-    assert {float(r["t_s"]) for r in rows("links.csv")} >= {59.9, 60.0}
+    assert {float(r["t_s"]) for r in rows(name)} >= {59.9, 60.0}
+    assert len({(r["sender"], r["receiver"]) for r in rows(name)}) == drones * (drones - 1)
 
 
 def test_the_mission_is_the_scenarios() -> None:

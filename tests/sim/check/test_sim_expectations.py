@@ -121,6 +121,50 @@ def test_one_row_in_the_window_must_have_all_that_is_expected() -> None:
     assert judged(DecisionExpectation(**window), {}, record=record).got.startswith("1.00 s: 2 → 0 features")
 
 
+def test_changes_of_links_are_counted_and_no_others_may_be_beside_them() -> None:
+    """By hand: a directive that is repeated and a disc that moves are no changes, and links count one by one."""
+    names = ("t_s", "drone", "peer", "representation", "rho", "rate_hz", "roi_radius_m", "reason")
+    rows = [
+        (1.0, 2, 0, "features", 0.1, 10.0, math.nan, "battery ≥ 60 %"),
+        (1.0, 2, 1, "features", 0.1, 10.0, math.nan, "battery ≥ 60 %"),
+        (1.5, 2, 1, "features", 0.1, 10.0, math.nan, "repeated"),
+        (2.0, 3, 1, "none", 0.0, 0.0, math.nan, "says nothing, as before"),
+        (2.0, 2, 1, "features", 0.1, 10.0, 32.0, "track"),
+        (2.1, 2, 1, "features", 0.1, 10.0, 32.0, "the disc has moved"),
+        (3.0, 3, 1, "detections", 0.0, 2.0, math.nan, "goodput 4 < 5 Mb/s"),
+    ]
+    made = [dict(zip(names, row, strict=True)) for row in rows]
+    record = by_hand.record(tables=by_hand.tables_of({"directives": made}))
+    window = {"from_s": 0.0, "until_s": 3.0}
+    counted: list[tuple[dict[str, Any], bool]] = [
+        ({"changes": 4}, True),
+        ({"changes": 3}, False),
+        ({"changes": 5}, False),
+        ({"drone": 2, "changes": 3}, True),
+        ({"drone": 2, "peer": 1, "changes": 2}, True),
+        ({"drone": 2, "roi": False, "changes": 2}, True),
+        ({"roi": True, "changes": 1}, True),
+        ({"representation": "none", "changes": 0}, True),
+        ({"from_s": 1.1, "changes": 2}, True),
+        ({"reason": "repeated", "changes": 0}, True),
+        ({"reason": "repeated"}, True),  # it was decided, and changed nothing
+    ]
+    got = [(asked, judged(DecisionExpectation(**(window | asked)), {}, record=record).holds) for asked, _ in counted]
+    assert got == counted
+
+    def others(*expected: dict[str, Any]) -> str:
+        held = tuple(DecisionExpectation(**(window | each)) for each in expected)
+        scenario = example().model_copy(update={"expect_decisions": held, "expect_no_other_changes": True})
+        *_, verdict = check(scenario.model_copy(update={"expect": ()}), record, {})
+        assert verdict.holds == verdict.got.startswith("0 others")
+        return verdict.got
+
+    assert others({}) == others({"drone": 2}, {"reason": "goodput"}) == "0 others"
+    assert others({"drone": 2}).startswith("1 other; 3.00 s: 3 → 1 detections")
+    assert others({"drone": 2, "until_s": 2.5}, {"drone": 3, "until_s": 2.5}).startswith("1 other; 3.00 s")
+    assert others().startswith("4 others; 1.00 s: 2 → 0 features")
+
+
 # Student's t of two degrees at 90 %, one-sided, is 1.8856: of 4, 5 and 6 the mean is surely above 5 − 1.0887
 MEANS: list[tuple[dict[str, float], list[float], bool, int]] = [
     ({"at_least": 3.90}, [4.0, 5.0, 6.0], True, 0),

@@ -25,7 +25,16 @@ from sortie.scenarios.schema.fleet import Make
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.record import SortieRecord
 
-NOT_KNOBS = ("name", "description", "expect", "expect_decisions", "record", "limits", "metrics")
+NOT_KNOBS = (
+    "name",
+    "description",
+    "expect",
+    "expect_decisions",
+    "expect_no_other_changes",
+    "record",
+    "limits",
+    "metrics",
+)
 """Words for people, what is asserted or computed from the record, what is kept beside it, and wall-clock time."""
 
 IN_MAKES = {"fleet.makes.name", "fleet.makes.weights", "fleet.makes.codebook"}
