@@ -36,8 +36,8 @@ $(STAMP): $(LIGHT)
 sortie: $(LIGHT) ## fly the main scenario and print its outcome (SCENARIO=... for another)
 	$(BIN)/sortie fly $(SCENARIO)
 
-screenshot: $(LIGHT) ## fly the paper's replay and take docs/sortie.png from the real viewer (needs mesa-vulkan-drivers)
-	$(BIN)/sortie fly paper_replay --set perception.detector=surrogate --out runs/screenshot --replace
+screenshot: $(LIGHT) ## fly the paper's replay with contention and take docs/sortie.png from the real viewer (needs mesa-vulkan-drivers)
+	$(BIN)/sortie fly paper_replay_contention --set perception.detector=surrogate --out runs/screenshot --replace
 	$(BIN)/sortie view runs/screenshot --picture docs/sortie.png --at 64.2
 
 test: $(STAMP) ## run the test suite but for its slow tests and those of pages, a worker a core

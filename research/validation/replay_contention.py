@@ -2,8 +2,8 @@
 
 The conditions were written down before the measurement: seeds 1 to 5, no detector, the scenario as it stands but for the
 dwell time and the number of missed periods after which a link is degraded. Counted is what happens between 25 s, when all
-links carry features even with the longest dwell time, and 60 s, when drone 2's links fade: there, the story asks for 12 changes (10 by the phase, 2 by
-charge), and every other change comes from contention or from drones that sway in the wind.
+links carry features even with the longest dwell time, and 60 s, when drone 2's links fade. There the story asks for 12
+changes (10 by the phase, 2 by charge). Every other change comes from contention or from drones that sway in the wind.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from sortie.scenarios.schema import PolicySection, Scenario
 
 BROKEN = sorted((Path(__file__).parent / "broken").glob("*.yaml"))
 PARSERS = {"python": yaml.SafeLoader, "libyaml": getattr(yaml, "CSafeLoader", None)}
-LIBRARY = "paper_context, paper_replay, person_crossing, search_grid, track_target, two_groups, two_makes"
+LIBRARY = "paper_context, paper_replay, paper_replay_contention, person_crossing, search_grid, track_target, two_groups, two_makes"
 
 
 def error_of(text: str) -> str:

@@ -57,6 +57,7 @@ NETWORK_TOLERANCE = 0.005
 CASES = {
     "track_target": ("track_target", ("perception.detector=none",)),
     "paper_replay": ("paper_replay", ("perception.detector=none",)),
+    "paper_replay_contention": ("paper_replay_contention", ("perception.detector=none",)),
     "track_target_surrogate": ("track_target", ("perception.detector=surrogate", *SHORT)),
     "track_target_torch": ("track_target", ("perception.detector=torch", *SHORT, *SEEN)),
 }

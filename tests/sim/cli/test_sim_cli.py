@@ -191,7 +191,7 @@ def test_a_note_is_printed_once_a_command_however_many_policies_fly(
 ) -> None:
     def read_twice(*_: object, **__: object) -> None:
         for _ in range(2):
-            load("paper_replay", {"duration_s": 5})
+            load("paper_replay_contention", {"duration_s": 5})
         raise sortie.RunError("enough")
 
     monkeypatch.setattr(sortie, "compare", read_twice)

@@ -118,15 +118,15 @@ def test_the_first_issue_alone_is_the_error_of_a_flight() -> None:
 def test_what_happens_after_the_end_is_left_out_with_a_line_or_is_an_error_where_it_was_meant(
     here: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    whole = load("paper_replay")
+    whole = load("paper_replay_contention")
     with caplog.at_level(logging.WARNING, "sortie"):
-        short = load("paper_replay", {"duration_s": 5})
+        short = load("paper_replay_contention", {"duration_s": 5})
     assert len(whole.events) > len(short.events) == sum(event.at_s < 5 for event in whole.events)
     left = f"{len(whole.events) - len(short.events)} of {len(whole.events)}"
     assert f"events: {left} begin at duration_s = 5 or later, and are left out" in caplog.messages
     late = "events=[{kind: jam, at_s: 9, position_m: [0, 0, 0]}]"
     (here / "a.yaml").write_text("name: a\nduration_s: 5\nevents: [{kind: drone_lost, at_s: 9, drone: 1}]\n")
-    for name, sets in (("paper_replay", ["duration_s=5", late]), ("a.yaml", [])):
+    for name, sets in (("paper_replay_contention", ["duration_s=5", late]), ("a.yaml", [])):
         with pytest.raises(ScenarioError, match=r"events.0.at_s: 9, must be below duration_s = 5"):
             load(name, sets)
 

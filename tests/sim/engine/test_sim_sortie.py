@@ -172,7 +172,7 @@ def test_the_papers_three_transitions() -> None:
     bare = ["perception.detector=none"]
     # Drone 1's battery falls through 60 % and 30 %. Quarters are sent: whole maps of all would fill the air, and a link
     # that is silent or degraded rises to what the battery allows only after its dwell time.
-    calm = run_sortie(load("paper_replay", [*bare, *PATIENT, "policy.params={rho: 0.25}"]))
+    calm = run_sortie(load("paper_replay_contention", [*bare, *PATIENT, "policy.params={rho: 0.25}"]))
     charge = {row["t_s"]: row["soc"] for row in calm.tables["descriptors"].to_pylist() if row["drone"] == 1}
     for threshold, rate_hz, rung, reason in (
         (0.6, 5.0, "features", "battery < 60 %"),
@@ -184,7 +184,7 @@ def test_the_papers_three_transitions() -> None:
         got = (first or [r for r in late if str(r["reason"]).startswith(reason)])[0]
         assert got["t_s"] == crossed_s, "decided on the very descriptor that crossed the threshold"
     # The phase changes at 45 s: the payload falls about tenfold.
-    result = outcome(run_sortie(load("paper_replay", bare)))
+    result = outcome(run_sortie(load("paper_replay_contention", bare)))
     search, track = result["phases"]
     assert 8 < search["feature_payload_bytes"] / track["feature_payload_bytes"] < 16
     confined = [t for t in result["transitions"] if "in 32 m" in t["to"] and "in 32 m" not in t["from"]]

@@ -85,48 +85,6 @@ def test_a_large_fleet_and_a_slow_flight_are_shown_as_such() -> None:
     assert shown["wall time"] == "73.00 s, 0.027 × real time"
 
 
-def change(t_s: float, drone: int, reason: str = "r", to: str = "features", peers: Any = None) -> dict[str, Any]:
-    peers = peers or [drone + 1, drone + 2]
-    return {"t_s": t_s, "drone": drone, "from": "nothing", "to": to, "reason": reason, "peers": peers}
-
-
-def transitions(changes: list[dict[str, Any]], events: list[dict[str, Any]] | None = None) -> Table:
-    return summary.transitions_table(told_outcome() | {"frame_s": 0.1, "transitions": changes, "events": events or []})
-
-
-def test_decisions_of_one_frame_are_one_row_and_events_stand_among_them() -> None:
-    changes = [change(0.51, 4), change(0.55, 2), change(0.58, 3, "other"), change(0.59, 1, to="raw"), change(0.6, 1)]
-    events = [
-        {"t_s": 0.57, "drone": 3, "kind": "drone_lost", "text": "fell silent"},
-        {"t_s": 0.2, "drone": -1, "kind": "jam", "text": "a jammer"},
-    ]
-    table = transitions(changes, events)
-    assert cells(table) == [
-        ["0.20", "fleet", "jam", "a jammer"],
-        ["0.51", "2→3,4  4→5,6", "nothing → features", "r"],
-        ["0.57", "3", "drone_lost", "fell silent"],
-        ["0.58", "3→4,5", "nothing → features", "other"],
-        ["0.59", "1→2,3", "nothing → raw", "r"],
-        ["0.60", "1→2,3", "nothing → features", "r"],
-    ]
-    assert table.caption is None
-
-
-def test_of_many_links_that_do_alike_the_first_are_shown_and_the_others_counted() -> None:
-    """In order of the drones' numbers, and each drone once."""
-    links = ((10, list(range(20, 40))), (9, [3]), (9, [1, 2]), (100, [0]))
-    changes = [change(0.5, drone, peers=peers) for drone, peers in links]
-    ((_, who, _, _),) = cells(transitions(changes))
-    twenty = ",".join(str(k) for k in range(20, 40))
-    assert who == f"9→1,2,3  10→{twenty}  100→0"
-    ((_, who, _, _),) = cells(transitions([*changes, changes[0] | {"drone": 0}]))
-    assert who == f"0→{twenty}  9→1,2,3  10→20  and 20 more"
-    for count in (24, 25, 30):
-        table = transitions([change(k / 2, 0) for k in range(count)])
-        assert [row[0] for row in cells(table)] == [f"{k / 2:.2f}" for k in range(24)]
-        assert table.caption == (None if count == 24 else f"and {count - 24} more in outcome.json")
-
-
 LOST_TO = (
     "5.0 % collisions with payloads, 3.0 % collisions with descriptors, 2.0 % own transmissions, 1.0 % hidden senders"
 )
