@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from statistics import median
 from typing import Any
 
+import numpy as np
 from agent_rig import descriptor, memory
 from hypothesis import given
 from hypothesis import strategies as st
@@ -235,6 +236,15 @@ def test_the_compiled_loop_finds_what_the_formula_finds(data: st.DataObject) -> 
             assert now.strikes == (min(was.strikes + 1, 6) if doubt and i else max(was.strikes - 1, 0))
             assert now.reason == (doubt if doubt and i else was.reason)
             assert now.least_soc == min(was.least_soc, socs[i])
+
+
+@given(st.lists(st.integers(-50, 50), min_size=1, max_size=7), st.data())
+def test_the_median_of_the_others_is_that_of_the_formula(falls: list[int], data: st.DataObject) -> None:
+    """Of an odd and of an even number of others, equal ones among them."""
+    me = data.draw(st.integers(0, len(falls) - 1))
+    others = [fall for k, fall in enumerate(falls) if k != me]
+    found = trust_loops._median_without.py_func(np.sort(np.array(falls, float)), float(falls[me]))
+    assert found == (median(others) if others else 0.0)
 
 
 def test_the_compiled_loop_has_the_constants_of_the_formula() -> None:
