@@ -33,8 +33,8 @@ $(STAMP): $(LIGHT)
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[dev]'
 	@touch $@
 
-sortie: $(LIGHT) ## fly the main scenario and print its outcome (SCENARIO=... for another)
-	$(BIN)/sortie fly $(SCENARIO)
+sortie: $(LIGHT) ## fly the main scenario, print its outcome and what sharing is worth (SCENARIO=... for another)
+	$(BIN)/sortie fly $(SCENARIO) --over silence
 
 screenshot: $(LIGHT) ## fly the paper's replay with contention and take docs/sortie.png from the real viewer (needs mesa-vulkan-drivers)
 	$(BIN)/sortie fly paper_replay_contention --set perception.detector=surrogate --out runs/screenshot --replace

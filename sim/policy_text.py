@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from sortie.policies.contract import PolicyError
+from sortie.policies.registry import resolve
 from sortie.scenarios.reading.call_text import read_call, split_at_commas
+from sortie.scenarios.reading.load import build
+from sortie.scenarios.schema import Scenario
 
 
 def policy_overrides(text: str, own: str) -> list[str]:
@@ -20,6 +23,18 @@ def policy_overrides(text: str, own: str) -> list[str]:
         overrides += ["policy.commands=[]", "policy.changes=[]"]  # it flies to the end
         overrides.append("policy.of_makes=false")  # and on every drone
     return overrides + [f"policy.params.{p}" for p in params or ()]
+
+
+def flown_by(scenario: Scenario, policy: str) -> Scenario:
+    """The same scenario and draws with another policy in it.
+
+    Raises:
+        PolicyError, ScenarioError: no such policy, or one of its parameters is wrong.
+    """
+    sections = scenario.model_dump(mode="json", exclude_none=True)
+    flown = build(sections, policy_overrides(policy, scenario.policy.name), scenario.name)
+    resolve(flown.policy.name, flown.policy.params)
+    return flown
 
 
 def name_and_params(text: str, kind: str = "policy") -> tuple[str, list[str] | None]:

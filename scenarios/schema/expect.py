@@ -10,6 +10,11 @@ from sortie.scenarios.schema.base import DroneId, Section, inconsistent
 
 class Expectation(Section):
     metric: str = Field(min_length=1, description="A dotted field of outcome.json, for example ap50.mission.")
+    over: str | None = Field(
+        None,
+        min_length=1,
+        description="A policy, as `silence`: the bounds are of the metric minus that of the same sortie flown by it.",
+    )
     at_least: float | None = Field(None, description="Lower bound, inclusive.")
     at_most: float | None = Field(None, description="Upper bound, inclusive.")
     equals: float | str | bool | None = Field(None, description="The exact value.")
@@ -34,6 +39,8 @@ class Expectation(Section):
             raise inconsistent((missing,), "missing", f"given where {given} is")
         if self.replications is not None and self.equals is not None:
             raise inconsistent(("equals",), f"{self.equals}", "at_least or at_most where replications is given")
+        if self.over is not None and isinstance(self.equals, str | bool):
+            raise inconsistent(("equals",), f"{self.equals!r}", "a number where over is given, it is a difference")
         if self.tolerance and isinstance(self.equals, str | bool):
             bound = f"left out where equals is {self.equals!r}, it goes with numbers"
             raise inconsistent(("tolerance",), f"{self.tolerance:g}", bound)

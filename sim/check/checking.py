@@ -15,6 +15,7 @@ from sortie.sim.check.expectations import Verdict, check
 from sortie.sim.check.golden import differences, golden_path, with_relative_files, write_golden
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
+from sortie.sim.policy_text import flown_by
 from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
@@ -63,10 +64,14 @@ def check_scenario(
     """
     ensure_own(overrides, update=update)
     scenario = load(path_or_name, overrides)
+    others = {policy: flown_by(scenario, policy) for policy in _counts(scenario)}  # unknown policies stop it here
     record = run_sortie(scenario, progress=progress)
     result = outcome(record)
-    results = [result, *_replicate(scenario, progress)]
-    verdicts = [_with_explanation(v, scenario, record, results) for v in check(scenario, record, result, results)]
+    rest = _Flights(scenario.duration_s, progress)
+    results = [result, *rest.fly(scenario, range(1, _own(scenario)))]
+    theirs = {policy: rest.fly(others[policy], range(count)) for policy, count in _counts(scenario).items()}
+    verdicts = check(scenario, record, result, results, theirs)
+    verdicts = [_with_explanation(v, scenario, record, results) for v in verdicts]
     golden = golden_path(library().get(path_or_name, Path(path_or_name)))
     portable = with_relative_files(golden.parent, result, named_files(scenario.model_dump(mode="json")))
     written = write_golden(golden, portable) if update else ""
@@ -87,17 +92,41 @@ def ensure_own(overrides: Sequence[str], *, update: bool) -> None:
 
 
 def flights(scenario: Scenario) -> int:
-    """How many sorties its expectations need."""
+    """How many sorties its expectations need, those by other policies included."""
+    return _own(scenario) + sum(_counts(scenario).values())
+
+
+def _own(scenario: Scenario) -> int:
     return max([1, *(e.replications for e in scenario.expect if e.replications is not None)])
 
 
-def _replicate(scenario: Scenario, progress: Callable[[float], None] | None) -> list[dict[str, Any]]:
-    outcomes = []
-    for replication in range(1, flights(scenario)):
-        begin_s = replication * scenario.duration_s
-        watch = None if progress is None else (lambda t_s, b=begin_s: progress(b + t_s))
-        outcomes.append(outcome(run_sortie(scenario, replication=replication, progress=watch)))
-    return outcomes
+def _counts(scenario: Scenario) -> dict[str, int]:
+    """How many sorties each policy flies that expectations are over: replications 0, 1, … as its expectations ask for."""
+    counts: dict[str, int] = {}
+    for e in scenario.expect:
+        if e.over is not None:
+            counts[e.over] = max(counts.get(e.over, 1), e.replications or 1)
+    return counts
+
+
+class _Flights:
+    """The sorties after the first one, with one progress over all."""
+
+    def __init__(self, duration_s: float, progress: Callable[[float], None] | None) -> None:
+        self._begin_s, self._duration_s, self._progress = 0.0, duration_s, progress
+
+    def fly(self, scenario: Scenario, replications: range) -> list[dict[str, Any]]:
+        outcomes = []
+        for replication in replications:
+            self._begin_s += self._duration_s
+            outcomes.append(
+                outcome(run_sortie(scenario, replication=replication, progress=self._progress and self._at))
+            )
+        return outcomes
+
+    def _at(self, t_s: float) -> None:
+        assert self._progress is not None  # noqa: S101
+        self._progress(self._begin_s + t_s)
 
 
 def _with_explanation(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.report_text import interval
@@ -60,19 +60,28 @@ def metric(result: dict[str, Any], dotted: str) -> Any:
 
 
 def check(
-    scenario: Scenario, record: SortieRecord, result: dict[str, Any], replications: Sequence[dict[str, Any]] = ()
+    scenario: Scenario,
+    record: SortieRecord,
+    result: dict[str, Any],
+    replications: Sequence[dict[str, Any]] = (),
+    others: Mapping[str, Sequence[dict[str, Any]]] | None = None,
 ) -> list[Verdict]:
     """Every expectation of the scenario, in its order.
 
     Args:
         record, result: of the sortie.
         replications: outcomes of replications 0, 1, …, as many as the expectations ask for.
+        others: the same of the policies that expectations are over.
     """
+
+    def checked(e: Expectation) -> Verdict:
+        results = [result] if e.replications is None else replications
+        compared = [None] * len(results) if e.over is None else (others or {}).get(e.over, ())
+        pairs = list(zip(results, compared, strict=False))
+        return _check_one(e, pairs) if e.replications is None else _check_mean(e, pairs)
+
     return [
-        *(
-            _check_metric(e, result) if e.replications is None else _check_mean(e, replications)
-            for e in scenario.expect
-        ),
+        *(checked(e) for e in scenario.expect),
         *(_check_decision(e, record) for e in scenario.expect_decisions),
         *([_check_no_others(scenario.expect_decisions, record)] if scenario.expect_no_other_changes else []),
     ]
@@ -89,14 +98,41 @@ def in_words(e: Expectation) -> str:
         bounds.append(f"≤ {e.at_most:g}")
     off = f" (± {e.tolerance:g})" if e.tolerance else ""
     sure = "" if e.confidence is None else f" with {100 * e.confidence:g} % over {e.replications}"
-    return f"{e.metric} {' and '.join(bounds)}{off}{sure}"
+    over = "" if e.over is None else f" over {e.over}"
+    return f"{e.metric}{over} {' and '.join(bounds)}{off}{sure}"
 
 
-def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
+_Pair: TypeAlias = tuple[dict[str, Any], dict[str, Any] | None]
+"""An outcome, and that of the same sortie by the policy that the expectation is over, where it is over one."""
+
+
+def _got(e: Expectation, pair: _Pair) -> Any:
+    """The metric, or how much more it is than under the other policy.
+
+    Raises:
+        KeyError: no such field, or no difference as one of the two is no number.
+    """
+    result, other = pair
+    own = metric(result, e.metric)
+    if other is None:
+        return own
+    its = metric(other, e.metric)
+    if not (_is_number(own) and _is_number(its)):
+        raise KeyError(f"{own} and {its} under {e.over}, no difference")
+    return own - its
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _check_one(expectation: Expectation, pairs: Sequence[_Pair]) -> Verdict:
     name, slack = expectation.metric, expectation.tolerance
     expected = in_words(expectation)
+    if not pairs:
+        return Verdict(expected, f"{expectation.over} not flown", False, expectation.because, name)
     try:
-        got = metric(result, name)
+        got = _got(expectation, pairs[0])
     except KeyError as error:
         return Verdict(expected, error.args[0], False, expectation.because, name)
     holds = True
@@ -106,35 +142,39 @@ def _check_metric(expectation: Expectation, result: dict[str, Any]) -> Verdict:
         if not any(truths) and isinstance(got, int | float) and isinstance(expectation.equals, int | float):
             holds = abs(got - expectation.equals) <= max(TOLERANCE, slack)
     if expectation.at_least is not None or expectation.at_most is not None:
-        number = isinstance(got, int | float) and not isinstance(got, bool)
         holds = (
             holds
-            and number
+            and _is_number(got)
             and (expectation.at_least is None or got >= expectation.at_least - slack)
             and (expectation.at_most is None or got <= expectation.at_most + slack)
         )
     shown = f"{got:.6g}" if isinstance(got, float) else str(got)
+    if pairs[0][1] is not None:
+        both = (f"{metric(result, name):.6g}" for result in pairs[0] if result is not None)
+        shown += f" ({', '.join(both)} under {expectation.over})"
     return Verdict(expected, shown, holds, expectation.because, name)
 
 
-def _check_mean(e: Expectation, results: Sequence[dict[str, Any]]) -> Verdict:
+def _check_mean(e: Expectation, pairs: Sequence[_Pair]) -> Verdict:
     """The mean over replications lies within each bound with the confidence asked for, by one end of an interval alone.
 
-    An expectation that the replications leave open fails; more replications may settle it.
+    Where it is over another policy, the differences within pairs of replications are what has a mean. An expectation that
+    the replications leave open fails; more replications may settle it.
     """
     assert e.replications is not None and e.confidence is not None  # noqa: S101, PT018
     expected, values = in_words(e), []
-    for i, result in enumerate(results[: e.replications]):
+    for i, pair in enumerate(pairs[: e.replications]):
         try:
-            value = metric(result, e.metric)
+            value = _got(e, pair)
         except KeyError as error:
             return Verdict(expected, f"replication {i}: {error.args[0]}", False, e.because, e.metric, replication=i)
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if not _is_number(value):
             return Verdict(expected, f"replication {i}: {value}, no number", False, e.because, e.metric, replication=i)
         values.append(float(value))
     if len(values) < e.replications:
         return Verdict(expected, f"{len(values)} replications flown", False, e.because, e.metric)
-    found = mean_interval(values, possible(e.metric), 2 * e.confidence - 1)
+    limits = possible(e.metric)
+    found = mean_interval(values, limits if e.over is None else limits.of_differences(), 2 * e.confidence - 1)
     low = e.at_least is not None and found.low < e.at_least - e.tolerance
     high = e.at_most is not None and found.high > e.at_most + e.tolerance
     got = f"{interval(found.mean, found.low, found.high, '{:.6g}'.format)} over {len(values)}"

@@ -12,6 +12,7 @@ from sortie.scenarios.reading.files import models_with_params, named_files
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.shipped import located
 from sortie.sim.folders import RunError
+from sortie.sim.policy_text import flown_by
 from sortie.sim.results.outcome_fields import kind_at, open_keys
 
 
@@ -25,7 +26,7 @@ def not_there(scenario: Scenario) -> list[str]:
     models = list(models_with_params(sections))
     own = {name.rpartition(":")[0] for _, name, _ in models if is_file(name)}
     missing = [name for name in named_files(sections) if name not in own and not located(Path(name)).exists()]
-    lines = [*(f"no file {name}" for name in missing), *_refused(models), *_misspelt(scenario)]
+    lines = [*(f"no file {name}" for name in missing), *_refused(models), *_misspelt(scenario), *_unknown(scenario)]
     return list(dict.fromkeys(lines))
 
 
@@ -38,6 +39,16 @@ def _refused(models: list[tuple[str, str, dict[str, object]]]) -> Iterator[str]:
                 resolve(kind, name, params)
         except SortieError as error:
             yield str(error)
+
+
+def _unknown(scenario: Scenario) -> Iterator[str]:
+    """Policies that expectations are over and that cannot be made."""
+    for i, expectation in enumerate(scenario.expect):
+        try:
+            if expectation.over is not None:
+                flown_by(scenario, expectation.over)
+        except SortieError as error:
+            yield f"expect.{i}.over: {error}"
 
 
 def _misspelt(scenario: Scenario) -> Iterator[str]:

@@ -11,16 +11,20 @@ from typing import Annotated, Any
 import typer
 
 import sortie
+from sortie.scenarios.errors import SortieError
+from sortie.scenarios.exit_codes import FAILED
 from sortie.sim.cli import tables
 from sortie.sim.cli.campaign import again
-from sortie.sim.cli.console import bars, line_printer, out, print_written
+from sortie.sim.cli.console import bars, line_printer, out, print_failure, print_written
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded, refuse
 from sortie.sim.cli.view import view
 from sortie.sim.engine.needs import Forecast, ensure_room, needs
 from sortie.sim.engine.watchers import Watcher, Watchers
 from sortie.sim.folders import RunError
+from sortie.sim.policy_text import flown_by
 from sortie.sim.results import run_folder
 from sortie.sim.results.run_files import RECORDING
+from sortie.sim.studies.beside import Beside, worth
 
 
 def fly(
@@ -30,6 +34,13 @@ def fly(
         typer.Argument(help="A scenario file or a library scenario's name; leave it out with --from-campaign."),
     ] = None,
     policy: PolicyOption = None,
+    over: Annotated[
+        str | None,
+        typer.Option(
+            help="Fly the same draws by this policy too, on another core, and print the difference: --over silence says "
+            "what sharing is worth."
+        ),
+    ] = None,
     seed: SeedOption = None,
     set_: SetOption = None,
     replication: Annotated[
@@ -89,6 +100,10 @@ def fly(
         flown, number, expected = loaded(_named(scenario), set_, policy), replication or 0, None
     if out_dir is not None:
         run_folder.ensure_usable(out_dir, flown, flown.seed if seed is None else seed, number, replace=replace)
+    other = None if over is None else flown_by(flown, over)
+    if other is not None and other.policy == flown.policy:
+        out.print(f"{flown.name} flies {over} itself: there is nothing to compare it with")
+        other = None
     need = needs(flown)
     if words := ensure_room(flown, need, out_dir or Path("runs/run"), force=force):
         line_printer(flown.name)(words)
@@ -96,6 +111,7 @@ def fly(
         import_module("sortie.sim.playback.recording")  # a missing Rerun is reported before the flight
     with _watching(live, mavlink, pace, mavlink_key) as watchers, _profiled(profile) as report, bars() as bar:
         ticker = Forecast(flown, line_printer(flown.name), bar(flown.name, flown.duration_s), memory=need.memory)
+        beside = None if other is None else Beside(other, seed, number, bar(f"{flown.name}, {over}", flown.duration_s))
         flight = sortie.fly(flown, seed=seed, replication=number, progress=ticker, observer=watchers or None)
     note = ""
     try:
@@ -110,6 +126,13 @@ def fly(
     print_written("kept in", path, f"{note}{see}")
     if not recorded and recording is None:
         out.print("without a recording, as Rerun is missing: pip install 'sortie-sim[view]'")
+    if beside is not None and over is not None:
+        try:
+            theirs = beside.record()
+        except SortieError as error:  # the first flight is kept and printed
+            print_failure(f"{over} did not fly to its end: {error}")
+            raise typer.Exit(FAILED) from None
+        out.print(worth(over, flight.record, theirs, str(scenario or flown.name)), soft_wrap=True, highlight=False)
     if expected is not None:
         same = flight.fingerprint[:16] == expected
         out.print(f"the record is{'' if same else ' not'} the campaign's", style=None if same else "red")

@@ -150,13 +150,10 @@ def compare(
             scenario = own_town if len(seeds) == 1 else in_town_of(own_town, seed)
             watch = None if progress is None else functools.partial(progress, label, seed)
             record = run_sortie(scenario, function, seed, progress=watch)
-            gains: dict[str, float | None] = dict.fromkeys(AREAS)
+            gains = dict.fromkeys(AREAS) if first is None else gains_over(first, record)
             for name, mission in AREAS.items():
-                if first is None:
-                    continue
-                pairs = pair_up([first], [record], mission=mission)
-                gains[name] = gain_between(pairs[0], pairs[1])
-                if gains[name] is not None and len(seeds) == 1:
+                if first is not None and gains[name] is not None and len(seeds) == 1:
+                    pairs = pair_up([first], [record], mission=mission)
                     d = bootstrap(*pairs)
                     count = len(set(pairs[2]))
                     within.append(Gain(label, f"ap50.{name}", d.delta, d.low, d.high, "blocks of one sortie", count))
@@ -185,6 +182,12 @@ def _blind(its: Compared, first: Compared, area: str) -> float | None:
     """AP minus the first policy's, with drones that left the air counted as blind under both."""
     ap, before = (f.outcome["ap50"]["grounded_blind"][area] for f in (its, first))
     return None if ap is None or before is None else ap - before
+
+
+def gains_over(first: SortieRecord, other: SortieRecord) -> dict[str, float | None]:
+    """AP@0.5 of one sortie minus that of the first, over the fusions that both made, by area."""
+    pairs = {name: pair_up([first], [other], mission=mission) for name, mission in AREAS.items()}
+    return {name: gain_between(ours, theirs) for name, (ours, theirs, _) in pairs.items()}
 
 
 def gain_between(first: Sequence[Matched], other: Sequence[Matched]) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,13 @@ import record_by_hand as by_hand
 from scipy import stats
 from sim_examples import example
 
+from sortie.policies.contract import PolicyError
 from sortie.scenarios.intervals import mean_interval
+from sortie.scenarios.reading.load import library, load
 from sortie.scenarios.schema import DecisionExpectation, Expectation
+from sortie.sim.check.checking import check_scenario, flights
 from sortie.sim.check.expectations import Verdict, check
+from sortie.sim.check.named import not_there
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 
@@ -234,3 +239,85 @@ def test_of_a_time_that_was_not_flown_nothing_is_held_to_be_so() -> None:
         (False, "phases.1.data_rate_mbps: phases has no '1', it has 0 … 0"),
         (False, "no decision"),
     ]
+
+
+OVER: list[tuple[dict[str, Any], list[float], list[float], bool, str]] = [
+    ({"at_least": 0.1}, [0.5], [0.3], True, "0.2 (0.5, 0.3 under silence)"),
+    ({"at_least": 0.1}, [0.5], [0.5], False, "0 (0.5, 0.5 under silence)"),
+    ({"at_most": -0.1}, [0.3], [0.5], True, "-0.2 (0.3, 0.5 under silence)"),
+    ({"at_least": 0.1}, [0.5], [], False, "silence not flown"),
+    # the differences are alike where the values are not: only pairs show it
+    (
+        {"at_least": 1.0, "replications": 3, "confidence": 0.9},
+        [9.0, 5.0, 1.0],
+        [8.0, 4.0, 0.0],
+        True,
+        "1 [1, 1] over 3",
+    ),
+    (
+        {"at_least": 1.1, "replications": 3, "confidence": 0.9},
+        [9.0, 5.0, 1.0],
+        [8.0, 4.0, 0.0],
+        False,
+        "1 [1, 1] over 3",
+    ),
+]
+
+
+def test_a_bound_over_another_policy_is_of_the_difference_within_pairs() -> None:
+    wrong = []
+    for bound, own, other, holds, got in OVER:
+        scenario = example().model_copy(update={"expect": (Expectation(metric="m", over="silence", **bound),)})
+        results, theirs = ([{"m": value} for value in values] for values in (own, other))
+        (verdict,) = check(scenario, by_hand.record(), results[0], results, {"silence": theirs})
+        if verdict.holds is not holds or not verdict.got.startswith(got):
+            wrong.append((bound, verdict))
+    assert wrong == []
+
+
+def test_silence_fails_each_paired_expectation_of_the_library() -> None:
+    """Silence minus silence is 0 of every metric."""
+    paired = {name: [e for e in load(name).expect if e.over is not None] for name in library()}
+    zero = [{"value": 0.0}]
+    held = [
+        (name, e.metric)
+        for name, expectations in paired.items()
+        for e in expectations
+        if judged_over(e.model_copy(update={"metric": "value", "replications": None}), zero).holds
+    ]
+    assert held == []
+    assert {name for name, each in paired.items() if each} == {
+        "person_crossing",
+        "track_target",
+        "two_groups",
+        "two_makes",
+    }
+
+
+def judged_over(expectation: Expectation, results: list[dict[str, Any]]) -> Verdict:
+    """The verdict of an expectation where both policies came to the same."""
+    scenario = example().model_copy(update={"expect": (expectation,)})
+    (verdict,) = check(scenario, by_hand.record(), results[0], results, {str(expectation.over): results})
+    return verdict
+
+
+def test_a_check_flies_the_other_policy_once_and_refuses_an_unknown_one(tmp_path: Path) -> None:
+    head = "name: mine\nduration_s: 2\nperception: {detector: none}\nexpect:\n"
+    sent = "  - {metric: bytes.data_sent, over: silence, at_least: 1}\n"
+    path = tmp_path / "mine.yaml"
+    for policy, lines, holds in (
+        ("worked", sent * 2, [True, True]),
+        ("silence", sent, [False]),
+        ("worked", sent.replace("1}", "1, replications: 2, confidence: 0.9}"), [True]),
+    ):
+        path.write_text(head + lines, "utf-8")
+        times: list[float] = []
+        checked = check_scenario(str(path), [f"policy.name={policy}"], progress=times.append)
+        assert [v.holds for v in checked.verdicts] == holds
+        assert flights(checked.scenario) == (4 if "replications" in lines else 2)
+        assert times == sorted(times)
+        assert flights(checked.scenario) * 2 - 2 <= times[-1] <= flights(checked.scenario) * 2
+    path.write_text(head + sent.replace("silence", "silnce"), "utf-8")
+    assert not_there(load(str(path)))[0].startswith("expect.0.over: unknown policy 'silnce', did you mean silence?")
+    with pytest.raises(PolicyError, match="did you mean silence"):
+        check_scenario(str(path))
