@@ -252,14 +252,14 @@ OVER: list[tuple[dict[str, Any], list[float], list[float], bool, str]] = [
         [9.0, 5.0, 1.0],
         [8.0, 4.0, 0.0],
         True,
-        "1 [1, 1] over 3",
+        "1 (all equal) over 3",
     ),
     (
         {"at_least": 1.1, "replications": 3, "confidence": 0.9},
         [9.0, 5.0, 1.0],
         [8.0, 4.0, 0.0],
         False,
-        "1 [1, 1] over 3",
+        "1 (all equal) over 3",
     ),
 ]
 
