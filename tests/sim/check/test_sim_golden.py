@@ -43,7 +43,7 @@ def same(name: str, a: float | str, b: float | str, *, network: bool) -> bool:
     """Equal, or numbers that differ in their last bits only; with a `network`, boxes differ at the threshold."""
     if isinstance(a, str) or isinstance(b, str):
         return a == b
-    of_boxes = network and name.startswith(("ap50.", "tracking.", "phases.", "mission.target_"))
+    of_boxes = network and (name.startswith(("ap50.", "tracking.", "phases.", "mission.target_")) or ".ap50." in name)
     return math.isclose(a, b, rel_tol=1e-6, abs_tol=NETWORK_TOLERANCE if of_boxes else 0.0)
 
 
