@@ -23,7 +23,7 @@ from sortie.scenarios.reading.nodes import ScenarioError
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.whole import whole
 from sortie.sim.folders import RunError
-from sortie.sim.policy_text import policy_overrides
+from sortie.sim.policy_text import flown_by
 from sortie.sim.user_errors import user_errors
 
 if TYPE_CHECKING:
@@ -603,7 +603,7 @@ def _with_policy(scenario: Scenario, policy: PolicyLike | None) -> tuple[Scenari
     if policy is None:
         return scenario, None
     if isinstance(policy, str):
-        return load(scenario, policy_overrides(policy, scenario.policy.name)), None
+        return flown_by(scenario, policy), None
     if not callable(policy):
         raise PolicyError(f"policy: {policy!r}, must be a name, file.py:function or a callable of one FleetView")
     try:

@@ -44,7 +44,7 @@ SCENARIO: Rows = [
     (lambda: sortie.fly("track_target", replication=1.5), "replication: 1.5, must be a whole number"),
     (lambda: sortie.compare("track_target", ["worked"], seeds=[1, 1]), "seeds: [1, 1], must"),
     (lambda: sortie.load("track_target", [("fleet.drones", 3)]), "overrides: [('fleet.drones', 3)], must"),
-    (lambda: sortie.fly("track_target", SHORT, progress=True), "progress: True, must be a function, or None"),
+    (lambda: sortie.fly("track_target", SHORT, progress=5), "progress: 5, must be a function, or None"),
     (lambda: sortie.fly("track_target", SHORT, observer=print), "must have the methods begin and second"),
     (lambda: sortie.fly("track_target", replication=2**32), "replication: 4294967296, must"),
     (lambda: sortie.check("track_target", "duration_s=1"), "overrides: 'duration_s=1', must be a map or a list"),

@@ -25,6 +25,7 @@ from sortie.perception.recordings.recording import open_recording
 from sortie.policies.registry import resolve
 from sortie.scenarios.exit_codes import DEFECT, FAILED, INTERRUPTED, USER
 from sortie.scenarios.reading.load import load
+from sortie.scenarios.report_text import size
 from sortie.scenarios.traces import read_columns
 from sortie.sim.check.expectations import check
 from sortie.sim.cli.app import app
@@ -32,10 +33,12 @@ from sortie.sim.cli.export import export
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.export.endpoint import read_key
 from sortie.sim.export.telemetry import MavlinkEndpoint
+from sortie.sim.folders import RunError
 from sortie.sim.identity import file_digest
 from sortie.sim.results import run_folder
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.run_files import WRITTEN
+from sortie.sim.studies.beside import Beside
 
 SHORT = "--no-recording --set duration_s=0.5"
 
@@ -132,6 +135,26 @@ def test_another_policy_flies_to_the_end_and_says_so(here: Path, capsys: pytest.
         assert run_line(f"fly example.yaml --replace --out run --policy {policy} {SHORT}") == 0
         assert (told in capsys.readouterr().err) == (policy == "boxes")
         assert run_folder.load(Path("run")).totals["policy_changes"] == changes
+
+
+def test_over_another_policy_says_what_sharing_is_worth(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both fly the same draws. A second flight that fails leaves the first, and a scenario is not compared with itself."""
+    assert run_line(f"fly example.yaml --out run --over silence {SHORT}") == 0
+    sent = sortie.open_run("run").outcome["bytes"]["data_sent"]
+    told = capsys.readouterr().out
+    assert f"over silence: data sent {size(sent)} (0 B under silence); one sortie each; `sortie compare" in told
+    assert "--seeds 8` gives an interval" in told
+    assert run_line(f"fly example.yaml --out alike --over worked {SHORT}") == 0
+    assert "example flies worked itself: there is nothing to compare it with" in capsys.readouterr().out
+    assert run_line(f"fly example.yaml --out none --over slience {SHORT}") == USER
+    assert "did you mean silence?" in capsys.readouterr().err
+    assert not Path("none").exists()
+    monkeypatch.setattr(Beside, "record", lambda _: (_ for _ in ()).throw(RunError("its process was killed")))
+    assert run_line(f"fly example.yaml --out kept --over silence {SHORT}") == FAILED
+    assert "silence did not fly to its end: its process was killed" in capsys.readouterr().err
+    assert sortie.open_run("kept").outcome["bytes"]["data_sent"] == sent
 
 
 # --- checks and comparisons ------------------------------------------------------------------------------
