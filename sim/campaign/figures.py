@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,22 @@ MAX_METRICS, MAX_FIELDS = 8, 6
 APART = 0.012
 """How far policies stand beside one another, of a field's range, so that whiskers do not hide whiskers."""
 COST = ("bytes.data_sent", "data_rate_mbps", "energy_j.total")
+
+
+def in_units(metric: str) -> tuple[str, float]:
+    """A metric's name on an axis, with its unit, and the factor to it: `bytes.data_sent, MB`, 1e-6.
+
+    Other metrics have their units in their names.
+    """
+    if metric.startswith("bytes."):
+        return f"{metric}, MB", 1e-6
+    if "energy_j" in metric:
+        return f"{metric.replace('energy_j', 'energy')}, kJ", 1e-3
+    return metric, 1.0
+
+
+def _scaled(estimate: Estimate, factor: float) -> Estimate:
+    return replace(estimate, mean=estimate.mean * factor, low=estimate.low * factor, high=estimate.high * factor)
 
 
 def with_values(rows: CampaignRows) -> list[str]:
@@ -58,6 +75,7 @@ def draw_varied(rows: CampaignRows, path: Path) -> bool:
         return False
     figure, axes = _axes(len(metrics), len(fields))
     for r, metric in enumerate(metrics):
+        name, factor = in_units(metric)
         for c, field in enumerate(fields):
             ax = axes[r][c]
             bins = rows.bins(field)
@@ -67,7 +85,10 @@ def draw_varied(rows: CampaignRows, path: Path) -> bool:
             for p, label in enumerate(rows.plan.policies):
                 aside = apart * (p - (len(rows.plan.policies) - 1) / 2)
                 points = [
-                    (x + aside, mean_interval(_column(rows.by_unit(metric, mask), p), possible(metric)))
+                    (
+                        x + aside,
+                        _scaled(mean_interval(_column(rows.by_unit(metric, mask), p), possible(metric)), factor),
+                    )
                     for _, x, mask in bins
                 ]
                 ax.errorbar(
@@ -82,7 +103,7 @@ def draw_varied(rows: CampaignRows, path: Path) -> bool:
             if words:
                 ax.set_xticks([x for _, x, _ in bins], [name for name, _, _ in bins])
             if c == 0:
-                ax.set_ylabel(metric)
+                ax.set_ylabel(name)
             if r == len(metrics) - 1:
                 ax.set_xlabel(field)
     axes[0][0].legend(fontsize="small")
@@ -100,8 +121,10 @@ def draw_pareto(rows: CampaignRows, path: Path) -> bool:
     for r, accuracy in enumerate(accuracies):
         for c, price in enumerate(prices):
             ax = axes[r][c]
+            price_name, factor = in_units(price)
             xs = [
-                mean_interval(_column(rows.by_unit(price), p), possible(price)) for p in range(len(rows.plan.policies))
+                _scaled(mean_interval(_column(rows.by_unit(price), p), possible(price)), factor)
+                for p in range(len(rows.plan.policies))
             ]
             ys = [
                 mean_interval(_column(rows.by_unit(accuracy), p), possible(accuracy))
@@ -113,7 +136,7 @@ def draw_pareto(rows: CampaignRows, path: Path) -> bool:
             front = on_front([x.mean for x in xs], [y.mean for y in ys])
             line = sorted((x.mean, y.mean) for x, y, f in zip(xs, ys, front, strict=True) if f)
             ax.plot([x for x, _ in line], [y for _, y in line], color="0.6", zorder=0)
-            ax.set_xlabel(price)
+            ax.set_xlabel(price_name)
             ax.set_ylabel(accuracy)
     axes[0][0].legend(fontsize="small")
     figure.savefig(path)

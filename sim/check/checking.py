@@ -12,16 +12,13 @@ from sortie.scenarios.reading.files import named_files
 from sortie.scenarios.reading.load import library, load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.check.expectations import Verdict, check
-from sortie.sim.check.golden import differences, golden_path, with_relative_files, write_golden
+from sortie.sim.check.golden import differences, golden_path, told, with_relative_files, write_golden
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError
 from sortie.sim.policy_text import flown_by
 from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-
-SHOWN = 4
-"""How many changed figures of a golden outcome a verdict names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,12 +140,6 @@ def _with_explanation(
 
 def _golden(path: Path, result: dict[str, Any]) -> Verdict:
     moved = differences(path, result)
-    listed = "; ".join(f"{n} {_short(was)} → {_short(now)}" for n, (was, now) in list(moved.items())[:SHOWN])
-    more = f"; and {len(moved) - SHOWN} more" if len(moved) > SHOWN else ""
-    got = f"{len(moved)} moved: {listed}{more}" if moved else "the same"
-    renew = "renew it with --update (pytest: --sortie-update) where it was meant to move"
-    return Verdict(f"the outcome in {path.name}", got, not moved, renew)
-
-
-def _short(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    got, whole = told(moved) if moved else ("the same", "")
+    renew = "-v lists all; renew it with --update (pytest: --sortie-update) where it was meant to move"
+    return Verdict(f"the outcome in {path.name}", got, not moved, renew, whole=whole)

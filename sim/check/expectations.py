@@ -30,6 +30,8 @@ class Verdict:
     """Facts from the record, where the expectation fails."""
     replication: int = 0
     """The replication that shows the result best."""
+    whole: str = ""
+    """Of a golden outcome that moved, a line for each figure."""
 
 
 def metric(result: dict[str, Any], dotted: str) -> Any:

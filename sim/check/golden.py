@@ -99,6 +99,42 @@ def differences(path: Path, result: dict[str, Any]) -> dict[str, tuple[Any, Any]
     }
 
 
+def told(moved: dict[str, tuple[Any, Any]]) -> tuple[str, str]:
+    """Differences in words: by sections of the outcome, the largest relative change first.
+
+    A figure that stands in two places, as a charge in `battery` and `drones`, is told once.
+
+    Returns:
+        A line that names how many figures of each section moved, and the one that moved most; and a line for each figure.
+    """
+    sections: dict[str, dict[str, tuple[Any, Any]]] = {}
+    known: set[tuple[Any, Any]] = set()
+    for name, change in sorted(moved.items(), key=lambda item: -_relative(*item[1])):
+        if change in known and all(isinstance(value, float) for value in change):
+            continue
+        known.add(change)
+        sections.setdefault(name.partition(".")[0], {})[name] = change
+    lines = [f"{name}: {_arrow(*change)}" for each in sections.values() for name, change in each.items()]
+    heads = []
+    for section, each in sections.items():
+        name, change = next(iter(each.items()))
+        heads.append(f"{section} ({len(each)}): {name.removeprefix(f'{section}.')} {_arrow(*change)}")
+    return f"{len(moved)} moved; of each section the most: {'; '.join(heads)}", "\n".join(lines)
+
+
+def _relative(was: Any, now: Any) -> float:
+    """By what part of the larger one two figures differ; 1 where they are no numbers."""
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in (was, now)):
+        return 1.0
+    largest = max(abs(was), abs(now))
+    return abs(now - was) / largest if largest else 0.0
+
+
+def _arrow(was: Any, now: Any) -> str:
+    before, after = (f"{value:.6g}" if isinstance(value, float) else str(value) for value in (was, now))
+    return f"{before} → {after}"
+
+
 def _read(path: Path) -> dict[str, Any]:
     try:
         golden: Any = json.loads(path.read_text("utf-8"))

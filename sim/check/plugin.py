@@ -167,7 +167,8 @@ class ScenarioItem(pytest.Item):
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """A failed expectation in words; an error of a flight as `user_errors.as_text` has it."""
         if isinstance(excinfo.value, ExpectationFailed):
-            return excinfo.value.in_words()
+            whole = excinfo.value.verdict.whole if self.config.get_verbosity() > 0 else ""
+            return "\n".join(filter(None, [excinfo.value.in_words(), whole]))
         if isinstance(excinfo.value, FlightFailed):
             return str(excinfo.value)
         return super().repr_failure(excinfo, style)

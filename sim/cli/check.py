@@ -34,6 +34,9 @@ def check(
     update: Annotated[
         bool, typer.Option("--update", help="Write NAME.golden.json beside each scenario instead of comparing with it.")
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="List every figure that differs from a golden outcome.")
+    ] = False,
     junit_file: Annotated[
         Path | None, typer.Option("--junit", help="Write the verdicts as JUnit XML too, for build servers.")
     ] = None,
@@ -65,6 +68,8 @@ def check(
         suites.append(Suite(name, checked))
         failed += len(checked.failed)
         out.print(tables.verdict_table(flown.name, checked.verdicts))
+        for verdict in checked.failed if verbose else ():
+            out.print(verdict.whole, soft_wrap=True, highlight=False)
         if checked.written:
             out.print(checked.written, soft_wrap=True)
         for command in dict.fromkeys(map(checked.replay, checked.failed)):

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from sortie.sim.check.checking import check_scenario
 from sortie.sim.check.discovery import is_scenario
 from sortie.sim.check.expectations import Verdict
-from sortie.sim.check.golden import differences, golden_path, write_golden
+from sortie.sim.check.golden import differences, golden_path, told, write_golden
 from sortie.sim.check.junit import Suite, junit
 from sortie.sim.check.once import Flown, flown_once
 from sortie.sim.cli.app import app
@@ -110,6 +110,30 @@ def test_golden_tolerances_are_the_files_own_and_stay(tmp_path: Path) -> None:
     assert differences(path, {**result, "a": 1.001}) == {}
     write_golden(path, {**result, "a": 2.0})
     assert json.loads(path.read_text())["tolerance"]["relative"] == 0.01
+
+
+def test_what_moved_is_told_by_sections_the_largest_change_first() -> None:
+    """A charge that stands in two places is told once; what is gone or no number counts as changed altogether."""
+    moved = {
+        "battery.0": (0.8, 0.75),
+        "bytes.data_sent": (1000, 1100),
+        "bytes.data_lost": (10, 5),
+        "drones.0.soc": (0.8, 0.75),
+        "drones.0.airborne": (True, False),
+        "phases.1.phase": ("track", "nothing"),
+    }
+    line, whole = told(moved)
+    assert line == (
+        "6 moved; of each section the most: drones (1): 0.airborne True → False; phases (1): 1.phase track → nothing; "
+        "bytes (2): data_lost 10 → 5; battery (1): 0 0.8 → 0.75"
+    )
+    assert whole.splitlines() == [
+        "drones.0.airborne: True → False",
+        "phases.1.phase: track → nothing",
+        "bytes.data_lost: 10 → 5",
+        "bytes.data_sent: 1000 → 1100",
+        "battery.0: 0.8 → 0.75",
+    ]
 
 
 NUMBER = "must be a number ≥ 0"
