@@ -20,7 +20,7 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     """A scenario's expectations, held or not."""
     table = Table(title=name, caption=None if verdicts else "this scenario expects nothing")
     for column in ("", "expected", "got", "because"):
-        table.add_column(column)
+        table.add_column(column, overflow="fold")
     for v in verdicts:
         because = Text(v.because).append(f"\nthe record: {v.explanation}" if v.explanation else "", "dim")
         verdict = Text("ok", "green") if v.holds else Text("FAILED", "red")

@@ -38,7 +38,7 @@ def comparison_table(flown: Flown) -> Table:
     table = titled(heading(flown), caption=_what_gains_are(flown) or None)
     table.add_column("", style="bold")
     for policy in _by_policy(flown):
-        table.add_column(policy, justify="right")
+        table.add_column(policy, justify="right", overflow="fold")
     for name, cells in side_by_side(flown).items():
         table.add_row(name, *cells)
     return table

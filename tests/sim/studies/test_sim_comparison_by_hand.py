@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
+from dataclasses import replace
+
 import pytest
 from matplotlib.figure import Figure
 from record_by_hand import told_outcome
+from rich.console import Console
 
 from sortie import Comparison
 from sortie._run import Metrics, UnknownMetricError
@@ -113,6 +117,18 @@ def test_the_table_and_the_markdown_have_the_same_cells() -> None:
     lines = ["| | a | b |", *(f"| {name.strip()} | {a} | {b} |" for name, (a, b) in rows.items())]
     assert [line for line in text if line.startswith("| ")] == lines
     assert "- **a**: 20 payloads in all sorties, 60.0 % delivered" in "\n".join(text)
+
+
+def test_parameters_of_policies_are_whole_in_80_columns() -> None:
+    """Long names go on in the next line; none is cut."""
+    long = {"a": "best-2(received_budget=0.125)", "b": "all-4(received_budget=0.0625)"}
+    told = flown()
+    many = tuple(replace(s, policy=long.get(s.policy, s.policy)) for s in told.sorties)
+    text = io.StringIO()
+    Console(file=text, width=80).print(comparison_table(Flown(many, ())))
+    head = [line.split("┃")[1:-1] for line in text.getvalue().splitlines() if line.startswith("┃")]
+    names = ["".join(cells[column].strip() for cells in head) for column in range(3)]
+    assert names == ["", *long.values()]
 
 
 def test_why_figures_differ_is_told_of_all_sorties_of_a_policy() -> None:
