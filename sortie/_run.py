@@ -145,6 +145,9 @@ class Run:
             >>> fleet = run.graph(1.0)
             >>> len(fleet), fleet.nodes[0]["phase"], fleet.edges[0, 1]["usable"]
             (5, 'search', True)
+            >>> import networkx
+            >>> sorted(networkx.articulation_points(fleet.to_undirected()))  # drones without which it falls apart
+            []
         """
         from sortie.sim.results.graph import graph
 
