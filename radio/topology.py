@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import networkx as nx
+if TYPE_CHECKING:
+    import networkx as nx
 
 Edge = tuple[int, int, float]
 """Sender, receiver and goodput, Mb/s."""
@@ -28,6 +29,8 @@ class Connectivity(NamedTuple):
 
 def usable_graph(drones: Iterable[int], edges: Iterable[Edge]) -> nx.DiGraph:
     """The usable links as a graph, with `mbps` on the edges; links of other drones are left out."""
+    import networkx as nx  # here: commands would wait a fifth of a second for it
+
     found = nx.DiGraph()
     found.add_nodes_from(drones)
     found.add_edges_from((a, b, {"mbps": mbps}) for a, b, mbps in edges if a in found and b in found)
@@ -46,6 +49,8 @@ def connectivity(usable: nx.DiGraph) -> Connectivity:
     >>> connectivity(usable_graph(range(4), links))
     Connectivity(connected=False, cut=(3,), articulation=(1,), hops=1.3333333333333333, bottleneck=(1, 2, 6.0))
     """
+    import networkx as nx
+
     groups = sorted(nx.strongly_connected_components(usable), key=lambda group: (-len(group), min(group)))
     lengths = [hops for _, to in nx.all_pairs_shortest_path_length(usable) for hops in to.values() if hops]
     return Connectivity(
@@ -62,6 +67,8 @@ def bottleneck(usable: nx.DiGraph) -> Edge | None:
 
     Only links of at least its goodput are needed for everybody to reach whom they reach over all links.
     """
+    import networkx as nx
+
     edges: list[Edge] = sorted(usable.edges(data="mbps"), key=lambda edge: (edge[2], edge[0], edge[1]))
     if not edges:
         return None

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import requires, version
 from importlib.resources import files
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 from sortie.scenarios.code_digest import contents, digest_of, installed
@@ -153,7 +154,7 @@ def own_files(
         try:
             file = Path(inspect.getsourcefile(function) or "")
             source = inspect.getsource(function)
-        except (OSError, TypeError):  # typed in, or written in C
+        except (OSError, TypeError, SyntaxError, TokenError):  # typed in, written in C, or its file holds other text
             file, source = Path(), ""
         if file.is_file():
             modules.update(imported_files(file))

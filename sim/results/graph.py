@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import networkx as nx
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -13,6 +12,9 @@ import pyarrow.compute as pc
 from sortie.sim.folders import RunError
 from sortie.sim.results import links
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 SENT_WITHIN_S = 1.0
 """An edge tells what was sent over it in this time before."""
@@ -36,6 +38,8 @@ def graph(record: SortieRecord, t_s: float) -> nx.DiGraph:
     Raises:
         RunError: the moment is outside the sortie, or the run is of a version without links.
     """
+    import networkx as nx  # here, as in `sortie.radio.topology`
+
     scenario, tables = record.scenario, record.tables
     if not 0.0 <= t_s <= scenario.duration_s:
         raise RunError(f"t_s: {t_s:g}, must be 0 to {scenario.duration_s:g}, the length of the sortie")

@@ -50,7 +50,12 @@ def test_a_run_is_kept_whole_and_reads_back(tmp_path: Path) -> None:
     assert run_folder.save(flown, path) == path
     assert set(result) >= set(FIELDS.split())
     assert json.loads((path / "outcome.json").read_text()) == result
-    files = {"outcome.json", "scenario.yaml", "record.json", *(f"{name}.parquet" for name in TABLES)}
+    files = {
+        "outcome.json",
+        "scenario.yaml",
+        "record.json",
+        *(f"{name}.parquet" for name in (*TABLES, "accuracy", "links")),
+    }
     assert {p.name for p in path.iterdir()} == files
     assert pq.read_table(path / "states.parquet").num_rows == 25
     back = run_folder.load(path)

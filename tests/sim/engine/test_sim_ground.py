@@ -101,7 +101,7 @@ def test_telemetry_and_report_call_a_station_one() -> None:
     }
     assert kinds == {**dict.fromkeys(range(4), mavlink2.MAV_TYPE_QUADROTOR), 4: mavlink2.MAV_TYPE_GCS}
     html = page(record)
-    assert "<tr><td>station 4</td><td>mains</td><td></td><td></td><td>on</td></tr>" in html
+    assert "<tr><td>station 4</td><td>mains</td><td></td><td></td><td>–</td><td>–</td><td>on</td></tr>" in html
     assert "<tr><td>drone 3</td>" in html
 
 

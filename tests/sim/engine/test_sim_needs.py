@@ -153,4 +153,6 @@ def test_fly_and_check_tell_how_long_they_take(monkeypatch: pytest.MonkeyPatch, 
     about = f"track_target: 5 drones for 3 s: about 0 minutes and {memory} of memory on this machine"
     assert f"{about}, estimated from the first 2 s" in flown.stderr
     checked = CliRunner().invoke(app, ["check", *short])
-    assert "track_target: 5 drones for 3 s: about 0 minutes on this machine, estimated from" in checked.stderr
+    assert (
+        "track_target: 5 drones for 2 × 3 s: about 0 minutes on this machine, estimated from" in checked.stderr
+    )  # and silence
