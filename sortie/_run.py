@@ -131,8 +131,9 @@ class Run:
     def graph(self, t_s: float) -> nx.DiGraph:
         """The fleet as a graph at a moment, for `networkx`: drones as nodes, links within earshot as edges.
 
-        Nodes have `position_m`, `soc`, `phase` and `role`; edges `snr_db`, `goodput_mbps`, `loss`, `usable`, `state`, and
-        what was `sent` in the last second with its `bytes`.
+        Nodes have `position_m`, `soc` (state of charge, 0 … 1), `phase` and `role`; edges `snr_db`, `goodput_mbps` (what
+        the link would carry alone on the channel), `loss` (of descriptors), `usable`, `state`, and what was `sent` in the
+        last second with its `bytes`.
 
         Args:
             t_s: the moment, s, from 0 to the sortie's end.
@@ -146,7 +147,8 @@ class Run:
             >>> len(fleet), fleet.nodes[0]["phase"], fleet.edges[0, 1]["usable"]
             (5, 'search', True)
             >>> import networkx
-            >>> sorted(networkx.articulation_points(fleet.to_undirected()))  # drones without which it falls apart
+            >>> usable = networkx.DiGraph((a, b) for a, b, is_usable in fleet.edges(data="usable") if is_usable)
+            >>> sorted(networkx.articulation_points(usable.to_undirected(reciprocal=True)))  # it falls apart without them
             []
         """
         from sortie.sim.results.graph import graph

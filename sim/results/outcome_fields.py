@@ -169,14 +169,17 @@ class Bytes(TypedDict):
     data_in_flight: Annotated[int, "On the way at the end."]
 
 
+class DroneAccuracy(TypedDict):
+    full_scene: Annotated[float | None, "AP@0.5 of cars over all of its own scored fusions.", SHARE]
+    mission: Annotated[float | None, "The same in the mission disc, while there is one.", SHARE]
+
+
 class Drone(TypedDict):
     soc: Annotated[float, "State of charge, 0 … 1.", SHARE]
     voltage_v: Annotated[float, "At the pack's terminals."]
     airborne: Annotated[bool, "Whether it still flew; of a ground station, whether it was on.", FLAG]
     energy_j: Annotated[float, "Spent to the very end, all causes."]
-    ap50: Annotated[
-        Accuracy, "AP@0.5 of cars over its own scored fusions; null where it had none, or no car was there."
-    ]
+    ap50: Annotated[DroneAccuracy, "How well this drone saw; null where it had no scored fusion, or no car was there."]
 
 
 class Violations(TypedDict):
