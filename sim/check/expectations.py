@@ -118,10 +118,10 @@ def _got(e: Expectation, pair: _Pair) -> Any:
     own = metric(result, e.metric)
     if other is None:
         return own
-    its = metric(other, e.metric)
-    if not (_is_number(own) and _is_number(its)):
-        raise KeyError(f"{own} and {its} under {e.over}, no difference")
-    return own - its
+    theirs = metric(other, e.metric)
+    if not (_is_number(own) and _is_number(theirs)):
+        raise KeyError(f"{own} and {theirs} under {e.over}, no difference")
+    return own - theirs
 
 
 def _is_number(value: Any) -> bool:
@@ -219,10 +219,7 @@ def _check_no_others(expected: Sequence[DecisionExpectation], record: SortieReco
 
 def _changes(record: SortieRecord) -> Iterator[dict[str, Any]]:
     """The directives that change what their link carries."""
-    carried: dict[tuple[int, int], str] = {}
-    for row, level in changes(record.tables["directives"], carried):
-        carried[row["drone"], row["peer"]] = level
-        yield row
+    return (row for row, _, _ in changes(record.tables["directives"], {}))
 
 
 def _is_of_window(e: DecisionExpectation, row: dict[str, Any]) -> bool:

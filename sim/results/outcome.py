@@ -238,14 +238,17 @@ def describe(row: dict[str, Any]) -> str:
     return f"{row['representation']}{budget} at {row['rate_hz']:g} Hz{roi}"
 
 
-def changes(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[tuple[dict[str, Any], str]]:
-    """The directives that change what their link carries (a disc that moves is no change), and what it carries then.
+def changes(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[tuple[dict[str, Any], str, str]]:
+    """The directives that change what their link carries (a disc that moves is no change), with what before and after.
 
-    `carried` is what each (drone, peer) carried before. Whoever reads this keeps it up to date, after each directive.
+    `carried` is what each (drone, peer) carried before. It is brought up to date when the next change is asked for.
     """
     for row in chain.from_iterable(batch.to_pylist() for batch in directives.to_batches()):
-        if (level := describe(row)) != carried.get((row["drone"], row["peer"]), "nothing"):
-            yield row, level
+        link, level = (row["drone"], row["peer"]), describe(row)
+        before = carried.get(link, "nothing")
+        if level != before:
+            yield row, before, level
+            carried[link] = level
 
 
 def transitions(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[dict[str, Any]]:
@@ -255,9 +258,7 @@ def transitions(directives: pa.Table, carried: dict[tuple[int, int], str]) -> It
     brought up to date. Each entry comes before the next one's changes are in `carried`.
     """
     entry: dict[str, Any] | None = None
-    for row, level in changes(directives, carried):
-        link = (row["drone"], row["peer"])
-        before = carried.get(link, "nothing")
+    for row, before, level in changes(directives, carried):
         change = {"t_s": row["t_s"], "drone": row["drone"], "from": before, "to": level, "reason": row["reason"]}
         if entry is not None and all(entry[k] == v for k, v in change.items()):
             entry["peers"].append(row["peer"])
@@ -265,7 +266,6 @@ def transitions(directives: pa.Table, carried: dict[tuple[int, int], str]) -> It
             if entry is not None:
                 yield entry
             entry = {**change, "peers": [row["peer"]]}
-        carried[link] = level
     if entry is not None:
         yield entry
 
