@@ -1,7 +1,7 @@
 """Intervals of means and of resampled figures: the one definition of each that all of Sortie uses.
 
 An interval covers what was drawn independently, its units: sorties, draws of a campaign, conditions, frames. Blocks of a
-single sortie (`sim/studies/compare.py`) are nearly independent only; an interval over them describes that sortie. Two cases:
+single sortie (`sim/experiment/compare.py`) are nearly independent only; an interval over them describes that sortie. Two cases:
 
 - **The mean of independent units** (`mean_interval`): Student's interval. Sortie's samples are small, eight sorties for
   one, where a percentile bootstrap covers well below 95 % (`research/pages/coverage.md`). A metric with a smallest or

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from sortie.sim.check.checking import Checked
     from sortie.sim.engine.sortie import Observer
     from sortie.sim.env import SortieEnv, TeamEnv
+    from sortie.sim.experiment.compare import Compared, Gain
+    from sortie.sim.experiment.half_width import Precision, Settings
     from sortie.sim.results.summary import Summary
-    from sortie.sim.studies.compare import Compared, Gain
-    from sortie.sim.studies.multifidelity import Precision, Settings
     from sortie.sim.studies.replayed import Replay
 
 ScenarioLike = str | Path | Mapping[str, object] | Scenario
@@ -179,9 +179,9 @@ class Comparison:
 
         A notebook and `rich` show it as a table; `str` returns plain text.
         """
+        from sortie.sim.experiment.compare import Flown
+        from sortie.sim.experiment.comparison_text import comparison_table, explanations, precision_lines
         from sortie.sim.results.summary import Summary
-        from sortie.sim.studies.compare import Flown
-        from sortie.sim.studies.comparison_text import comparison_table, explanations, precision_lines
 
         flown = Flown(self.sorties, self.gains)
         more = [] if self.precision is None else precision_lines(self.precision)
@@ -194,8 +194,8 @@ class Comparison:
         Raises:
             RunError: the file cannot be written, or matplotlib (extra `report`) is not installed.
         """
-        from sortie.sim.studies.compare import Flown
-        from sortie.sim.studies.comparison_page import save_comparison_page
+        from sortie.sim.experiment.compare import Flown
+        from sortie.sim.experiment.comparison_page import save_comparison_page
 
         place = as_path("path", path)
         save_comparison_page(Flown(self.sorties, self.gains), place, self.precision)
@@ -230,7 +230,8 @@ def compare(
     metric: str | None = None,
     pilot: int | None = None,
     most_seeds: int | None = None,
-    kept: str | Path | bool = False,
+    workers: int = 1,
+    kept: str | Path | bool | None = None,
 ) -> Comparison:
     """Fly a scenario under several policies, with the same seeds and draws.
 
@@ -254,10 +255,12 @@ def compare(
         pilot: the seeds that both detectors fly before the rest is planned; None is 12.
         most_seeds: the seeds that the torch detector flies at most; None is 200. `precision.reached` says whether that
             was enough.
-        kept: a file to which finished seeds are written. After an interruption the same call goes on from there. A later
-            call with a smaller half-width uses them too. True chooses a file in `runs`; False writes nothing. A policy
-            that is a callable must be a function at the top of a file, or a `functools.partial` of one with numbers and
-            texts, so that another one is not taken for it.
+        workers: the number of processes that fly policies given by name; with `half_width` one process flies.
+        kept: flights are kept, so that after an interruption the same call goes on, and what was flown once is not flown
+            again by this version of Sortie. None keeps the flights of policies given by name in the user's cache folder
+            (`docs/guide/README.md`), False keeps nothing, and a path names another file. With True or a path, flights of
+            callables are kept too; each must be a function at the top of a file, or a `functools.partial` of one with
+            numbers and texts, so that another one is not taken for it.
 
     Raises:
         ScenarioError, PolicyError: the scenario or a policy is wrong; raised before anything flies.
@@ -269,26 +272,28 @@ def compare(
         >>> compared.table.select(["policy", "seed", "town_seed"]).to_pylist()[2:]
         [{'policy': 'worked', 'seed': 2, 'town_seed': 8}, {'policy': 'silence', 'seed': 2, 'town_seed': 8}]
     """
-    from sortie.sim.studies.compare import Contender, chosen_seeds
-    from sortie.sim.studies.compare import compare as compare_policies
-    from sortie.sim.studies.kept_comparison import compare_to, default_path
+    from sortie.sim.experiment.compare import Contender, chosen_seeds
+    from sortie.sim.experiment.compare import compare as compare_policies
+    from sortie.sim.experiment.half_width import compare_to
 
     base = load(scenario, overrides)
     if isinstance(policies, str) or not isinstance(policies, Iterable):
         raise PolicyError(f"policies: {policies!r}, must be a list of policies: ['worked', 'silence']")
     flown = [Contender(label(policy), *_with_policy(base, policy)) for policy in policies]
+    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
+        raise RunError(f"workers: {workers!r}, must be a whole number from 1 on")
     if own_fusion:
         flown = [contender.with_own_fusion() for contender in flown]
     labels = [contender.label for contender in flown]
     if not flown or len(set(labels)) < len(labels):
         how = "; give functions of one name, such as lambdas, a __name__ of their own"
         raise PolicyError(f"policies: {', '.join(labels) or 'none'}, must be one or more, each named once{how}")
+    path, named = _kept(kept)
     if half_width is not None:
         settings = _precision_settings(half_width, seeds, metric, pilot, most_seeds)
-        path = default_path(flown, settings.pilot) if kept is True else as_path("kept", kept) if kept else None
         with _stages_shown(progress) as watch:
-            return Comparison(*compare_to(flown, settings, path, watch))
-    for name, value in (("metric", metric), ("pilot", pilot), ("most_seeds", most_seeds), ("kept", kept or None)):
+            return Comparison(*compare_to(flown, settings, path, watch, named=named))
+    for name, value in (("metric", metric), ("pilot", pilot), ("most_seeds", most_seeds)):
         if value is not None:
             raise RunError(f"{name}: goes with half_width, which is missing")
     if isinstance(seeds, Iterable):
@@ -301,7 +306,17 @@ def compare(
     if not chosen or len(set(chosen)) < len(chosen):
         raise ScenarioError(f"seeds: {chosen}, must be one or more, each named once")
     with _shown(progress, base.name, len(flown) * len(chosen) * base.duration_s) as watch:
-        return Comparison(*compare_policies(flown, chosen, progress=_summed(watch) if progress is True else watch))
+        shown = _summed(watch) if progress is True else watch
+        return Comparison(*compare_policies(flown, chosen, progress=shown, workers=workers, kept=path, named=named))
+
+
+def _kept(kept: str | Path | bool | None) -> tuple[Path | None, bool]:
+    """The file of flights, and whether those of callables are kept too."""
+    from sortie.sim.experiment.flight_file import users_file
+
+    if kept is None or isinstance(kept, bool):
+        return None if kept is False else users_file(), kept is True
+    return as_path("kept", kept), True
 
 
 def replay(run: Run, policy: PolicyLike | None = None, *, disagreement: bool = False) -> Replay:
@@ -366,7 +381,7 @@ class CampaignResult:
         Raises:
             RunError: nothing is finished, or the file of the rows is damaged.
         """
-        from sortie.sim.campaign.rows import read_rows
+        from sortie.sim.experiment.rows import read_rows
 
         return read_rows(self.path).all
 
@@ -376,7 +391,7 @@ class CampaignResult:
         Raises:
             RunError: nothing is finished, matplotlib is missing, or the files cannot be written.
         """
-        from sortie.sim.campaign.report import write_report
+        from sortie.sim.experiment.report import write_report
 
         with user_errors():
             return write_report(self.path)
@@ -414,7 +429,7 @@ def campaign(
             `by_torch` within the campaign's. The report then estimates what torch would find over all of them.
         resume: only continue; raise an error if the folder has no campaign.
         retry_failed: fly failed runs once more.
-        progress: called with a `sortie.sim.campaign.drive.Progress` after each batch; True shows a bar.
+        progress: called with a `sortie.sim.experiment.drive.Progress` after each batch; True shows a bar.
         notice: called with a line when a cluster has no workers; None issues warnings.
 
     Raises:
@@ -426,11 +441,10 @@ def campaign(
         >>> done.rows.group_by("policy").aggregate([("ap50.mission", "mean")])    # doctest: +SKIP
     """
     from sortie.scenarios.reading.campaign import load_campaign
-    from sortie.sim.campaign.by_torch import FOLDER, plan_by_torch
-    from sortie.sim.campaign.drive import run_campaign
-    from sortie.sim.campaign.engine import open_engine
-    from sortie.sim.campaign.plan import make_plan
-    from sortie.sim.campaign.store import ensure_usable
+    from sortie.sim.experiment.by_torch import FOLDER, plan_by_torch
+    from sortie.sim.experiment.drive import open_pool, run_campaign
+    from sortie.sim.experiment.plan import make_plan
+    from sortie.sim.experiment.store import ensure_usable
 
     if scheduler is not None and not isinstance(scheduler, str):
         raise RunError(f"scheduler: {scheduler!r}, must be an address: 'tcp://host:8786'")
@@ -457,24 +471,24 @@ def campaign(
             ensure_usable(folder / FOLDER, by_torch_plan)
         with (
             _stages_shown(progress) as shown,
-            open_engine(
+            open_pool(
                 count,
                 scheduler,
                 security=files,
                 wait_s=wait_for_workers_s,
                 notice=tell,
                 memory_b=None if worker_memory_gb is None else round(worker_memory_gb * 1e9),
-            ) as engine,
+            ) as pool,
         ):
             watch = _of_campaign(shown) if progress is True else shown or (lambda p: None)
-            how: dict[str, Any] = {"retry_failed": retry_failed, "progress": watch}
-            done = [run_campaign(plan, folder, engine, resume_only=resume, **how)]
+            how: dict[str, Any] = {"retry_failed": retry_failed, "progress": watch, "notice": tell}
+            done = [run_campaign(plan, folder, pool, resume_only=resume, **how)]
             if units is not None:  # of those that stop_when left
                 units = min(units, done[0].of // plan.unit_runs)
                 if units < 2:
                     tell(f"by_torch: stop_when left {units} {plan.unit}s, must be at least 2; torch flies none")
                 else:
-                    done.append(run_campaign(by_torch_plan, folder / FOLDER, engine, units=units, **how))
+                    done.append(run_campaign(by_torch_plan, folder / FOLDER, pool, units=units, **how))
     total = (sum(getattr(p, name) for p in done) for name in ("finished", "failed", "flown", "seconds"))
     return CampaignResult(folder, *total)
 
@@ -488,7 +502,7 @@ def open_campaign(folder: str | Path) -> CampaignResult:
     Example:
         >>> sortie.open_campaign("runs/campaign-link_battery").rows    # doctest: +SKIP
     """
-    from sortie.sim.campaign.store import CampaignTable
+    from sortie.sim.experiment.store import CampaignTable
 
     path = as_path("folder", folder)
     with user_errors(), closing(CampaignTable(path)) as store:
@@ -622,7 +636,7 @@ def label(policy: PolicyLike) -> str:
 
 def _precision_settings(half_width: Any, seeds: object, metric: Any, pilot: Any, most_seeds: Any) -> Settings:
     """The arguments of a comparison to a half-width, checked."""
-    from sortie.sim.studies.multifidelity import METRICS, MOST, PILOT, Settings
+    from sortie.sim.experiment.half_width import METRICS, MOST, PILOT, Settings
 
     if seeds is not None:
         raise RunError("seeds and half_width: name one of them; a half-width chooses its number of seeds")

@@ -18,7 +18,7 @@ from sortie.sim.user_errors import user_errors
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from sortie.sim.ranking.rank import Ranked
+    from sortie.sim.experiment.rank import Ranked
     from sortie.sim.results.summary import Summary
 
 
@@ -66,7 +66,7 @@ class Ranking:
 
     def summary(self) -> Summary:
         """The ranking as `sortie rank` prints it. A notebook and `rich` show it as tables; `str` returns plain text."""
-        from sortie.sim.ranking.board import summary
+        from sortie.sim.experiment.board import summary
 
         return summary(self.ranked)
 
@@ -76,7 +76,7 @@ class Ranking:
         Raises:
             RunError: matplotlib is missing (extra `report`), or the files cannot be written.
         """
-        from sortie.sim.ranking.board import draw, plain
+        from sortie.sim.experiment.board import draw, plain
 
         place = as_path("folder", folder)
         write_text(place / "ranking.json", json.dumps(plain(self.ranked), indent=1, allow_nan=False) + "\n")
@@ -94,7 +94,7 @@ def rank(
     by_torch: bool = False,
     further: int | None = None,
     workers: int = 1,
-    folder: str | Path = "runs/rank",
+    folder: str | Path | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Ranking:
     """Rank policies on a fixed, versioned suite of conditions, among all built-in policies.
@@ -113,7 +113,8 @@ def rank(
         further: with `by_torch`, the number of further draws of the suite, of thirty conditions each, that only the
             surrogate flies. None takes 3 for a suite of the library and 0 for a file; 0 takes torch alone.
         workers: number of processes that fly policies given by name. Callables fly in this process.
-        folder: flights of policies given by name are kept here, so that an interrupted ranking goes on.
+        folder: where flights of policies given by name are kept, so that an interrupted ranking goes on; None keeps them in
+            the user's cache folder.
         progress: called with a stage, the number of its steps that are done, and the number of all its steps.
 
     Raises:
@@ -121,12 +122,13 @@ def rank(
             policy that fails in flight raises nothing: it is last in that condition, and `Ranking.faults` says so.
 
     Example:
-        >>> ranking = sortie.rank("boxes", folder=folder)    # doctest: +SKIP
+        >>> ranking = sortie.rank("boxes")    # doctest: +SKIP
         >>> ranking.places["boxes"]                          # doctest: +SKIP
         (1, 4)
     """
-    from sortie.sim.ranking.rank import Entry
-    from sortie.sim.ranking.rank import rank as rank_entries
+    from sortie.sim.experiment.flight_file import users_file
+    from sortie.sim.experiment.rank import Entry
+    from sortie.sim.experiment.rank import rank as rank_entries
 
     asked = [policies] if isinstance(policies, str) or callable(policies) else policies
     if not isinstance(asked, Iterable):
@@ -145,7 +147,7 @@ def rank(
     with user_errors():
         ranked = rank_entries(
             entries,
-            as_path("folder", folder),
+            users_file() if folder is None else as_path("folder", folder) / "flights.sqlite",
             suite=str(suite),
             against=against,
             again=again,

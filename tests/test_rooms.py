@@ -32,9 +32,9 @@ HOMES = {
     "rerun": ("sim/playback/*",),
     "pymavlink": ("fleet/logs/ground_station.py", "fleet/logs/mavlink.py", "fleet/logs/tlog.py"),
     "yaml": ("scenarios/reading/strict_yaml.py", "scenarios/reading/top_keys.py"),
-    "distributed": ("sim/campaign/cluster.py",),
-    "dask": ("sim/campaign/cluster.py",),
-    "SALib": ("sim/campaign/*",),
+    "distributed": ("sim/experiment/cluster.py",),
+    "dask": ("sim/experiment/cluster.py",),
+    "SALib": ("sim/experiment/*",),
     "cyclonedds": ("sim/live/*",),
 }
 """Third-party libraries with one home each."""
@@ -200,7 +200,7 @@ FORBIDDEN = [
     ("sim/engine/sortie.py", "from torch import nn", "torch is at home in perception/*"),
     ("sim/engine/sortie.py", "import rerun as rr", "rerun is at home in sim/playback/*"),
     ("scenarios/reading/nodes.py", "import yaml", "yaml is at home in scenarios/reading/strict_yaml.py"),
-    ("sim/campaign.py", "import pickle", "pickle is not used: it runs what it reads"),
+    ("sim/experiment.py", "import pickle", "pickle is not used: it runs what it reads"),
     ("sim/cli/app.py", "def f():\n    from research.uav3d import convert", "sim must not import research"),
     ("sim/cli/app.py", "print('done')", "print() is not called in a room"),
     ("policies/registry.py", "f = eval(name)", "eval() is not called in a room"),

@@ -18,9 +18,9 @@ from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.experiment.conditions import scenario_of
+from sortie.sim.experiment.detectors import surrogate_of, torch_answers
 from sortie.sim.results.accuracy import both_matched
-from sortie.sim.studies.both_detectors import surrogate_of, torch_answers
-from sortie.sim.studies.conditions import scenario_of
 
 POLICIES = ("silence", "all-4", "boxes")
 TOWNS_APART = 1000

@@ -27,9 +27,9 @@ from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.sortie import DetectorMaker, run_sortie
+from sortie.sim.experiment.detectors import torch_answers
 from sortie.sim.folders import RunError, write_text
 from sortie.sim.results.accuracy import matched
-from sortie.sim.studies.both_detectors import torch_answers
 
 BUDGETS = (0.01, 0.04, 0.2, 0.6)
 SPACINGS_M = (15, 20, 30)

@@ -30,10 +30,10 @@ from scipy.optimize import nnls
 import sortie
 from research.validation.stored import Cell, Column, Table
 from sortie.scenarios.reading.campaign import load_campaign
-from sortie.sim.campaign.cluster import MAX_BATCH
-from sortie.sim.campaign.drive import run_campaign
-from sortie.sim.campaign.plan import make_plan
-from sortie.sim.campaign.work import RunResult, Task, task_key
+from sortie.sim.experiment.cluster import MAX_BATCH
+from sortie.sim.experiment.drive import run_campaign
+from sortie.sim.experiment.plan import make_plan
+from sortie.sim.experiment.work import RunResult, Task, task_key
 
 BASE = "name: small\nduration_s: 1\nfleet: {drones: 2}\nperception: {detector: none}\n"
 CAMPAIGN = """

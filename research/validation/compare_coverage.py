@@ -52,7 +52,7 @@ from numpy.typing import NDArray
 
 import sortie
 from research.validation.stored import Cell, Column, Table
-from sortie.sim.studies.compare import AREAS, SEEDS, over_sorties
+from sortie.sim.experiment.compare import AREAS, SEEDS, over_sorties
 
 TABLE = Path(__file__).parent / "compare_coverage.csv"
 SHORT = {"duration_s": 10, "mission.phases.1.at_s": 3, "perception.detector": "surrogate"}

@@ -10,9 +10,9 @@ The plan, written before anything of it was flown:
   them, but 10 s long (tracking from 3 s on) in place of 20 s (from 5 s on), as processor time is scarce. Policies: `worked`,
   `adaptive` and `all-4`. Two gains over `worked`, each in the full scene and in the mission disc.
 - **Expensive measurement**: a seed flown with `perception.detector: torch` under the three policies, from take-off on, traffic
-  included (`multifidelity.fly_torch`). The policies of a seed share what the network has encoded.
+  included (`half_width.fly_torch`). The policies of a seed share what the network has encoded.
 - **Cheap measurement**: the same seed flown with the surrogate, its gain averaged over eight draws of the surrogate's boxes on
-  one flight (`multifidelity.fly_surrogate`).
+  one flight (`half_width.fly_surrogate`).
 - **Seeds**: 5,000,001 to 5,000,032 by both, 6,000,001 to 6,000,096 by the surrogate alone. Each has a town and draws of its
   own. Torch seeds are flown in order; all seeds from the first one on without a gap count, however many these are.
 - **Costs** are processor seconds a seed (three policies), medians.
@@ -53,8 +53,8 @@ import sortie
 from research.validation.stored import Cell, Column, Table
 from sortie.scenarios.control_variates import Controlled, Plan, controlled_mean, plan_units
 from sortie.scenarios.intervals import mean_interval
-from sortie.sim.studies.compare import AREAS, Contender
-from sortie.sim.studies.multifidelity import METRICS, Row, fly_surrogate, fly_torch
+from sortie.sim.experiment.compare import AREAS, Contender
+from sortie.sim.experiment.half_width import METRICS, Row, fly_surrogate, fly_torch
 
 TABLE = Path(__file__).parent / "compare_price.csv"
 SHORT = {

@@ -63,7 +63,7 @@ def _liars() -> Tables:
 
 def _context_forms() -> Tables:
     from research.validation import minimal_context
-    from sortie.sim.studies.compare import BLOCK_S
+    from sortie.sim.experiment.compare import BLOCK_S
 
     rows = list(minimal_context.measure(range(1, 3), 40.0))
     return {
@@ -219,17 +219,14 @@ def _flight() -> Tables:
 
 def _over_conditions(name: str, policies: Sequence[str], *sets: str, by_torch: bool = False) -> Table:
     """As `sortie compare NAME --policies …`: every policy's AP, and its gain over the best fixed one, by phase and budget."""
-    from research.calibrate.in_flight import torch_answers
-    from sortie.perception.detectors import make_detector
-    from sortie.sim.studies.conditions import best_fixed, fly_all, summarise
+    from sortie.sim.experiment.conditions import best_fixed, fly_conditions, summarise
 
     conditions = load_conditions(name)
     assert conditions is not None, name
     conditions = conditions.model_copy(update={"set": (*conditions.set, *sets)})
-    detector_of = torch_answers() if by_torch else make_detector
     one_by_one = (conditions.model_copy(update={"conditions": (c,)}) for c in conditions.conditions)
     # the policies of a condition share what the network has encoded
-    cells = [cell for one in one_by_one for cell in fly_all(one, policies, detector_of=detector_of)]
+    cells = [cell for one in one_by_one for cell in fly_conditions(one, policies, by_torch=by_torch)]
     rows = summarise(cells)
     first = best_fixed(rows)
     ap = {(c.policy, c.condition): c.ap for c in cells}
@@ -285,8 +282,8 @@ def _worked_over_silence() -> Tables:
     when averaging became the default, to see what the worked policy's choice of maps costs.
     """
     from sortie.sim.engine.sortie import run_sortie
+    from sortie.sim.experiment.conditions import scenario_of
     from sortie.sim.results.outcome import outcome
-    from sortie.sim.studies.conditions import scenario_of
 
     conditions = load_conditions("conditions_fourth")
     assert conditions is not None
@@ -325,7 +322,7 @@ SLOWLY = "perception.sample_rate_hz=0.5"
 
 
 def _held_out() -> Tables:
-    from sortie.sim.studies.conditions import FIXED
+    from sortie.sim.experiment.conditions import FIXED
 
     return {"held_out": _over_conditions("conditions_fourth", [*FIXED, *ADAPTIVE], SLOWLY, by_torch=True)}
 

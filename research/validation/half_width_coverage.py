@@ -8,7 +8,7 @@ and the batches had been chosen before, by runs of a similar simulation with oth
 - **Made data**: a pair of measurements with a known mean of 0 and a correlation of 0, 0.6 or 0.9; normal, with a skewness of
   0.5 (gamma, shape 16), or with heavy tails (Student's with 6 degrees of freedom). The half-width is such that the expensive
   measurement alone needs 12, 30 or 80 units. An expensive unit costs 17 cheap ones. Every case has 400 repetitions of the
-  whole procedure (`multifidelity.next_batch`), pilot, plans and stop included.
+  whole procedure (`half_width.next_batch`), pilot, plans and stop included.
 - **Sorties**: the gains of 2,000 sorties of the surrogate (`compare_coverage.csv`, second run), drawn with replacement. The
   gain over `worked` in the mission disc stands as the expensive measurement: that of full sharing, with the gain of silence in
   the same sortie as the cheap measurement (correlation 0.83), and that of silence, with its gain in the full scene (0.52). Both
@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from research.validation.stored import Cell, Column, Table
 from sortie.scenarios.control_variates import controlled_mean, widened
-from sortie.sim.studies.multifidelity import FURTHER, Batch, Flown, Row, Settings, next_batch
+from sortie.sim.experiment.half_width import FURTHER, Batch, Flown, Row, Settings, next_batch
 
 Floats = NDArray[np.float64]
 Source = Callable[[int], Floats]

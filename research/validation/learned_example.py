@@ -23,9 +23,9 @@ from research.validation.stored import ROOT, Cell, Column, Table
 from sortie.scenarios.intervals import Estimate, mean_interval
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.env import COST_PER_KJ, COST_PER_MB
-from sortie.sim.ranking.flights import Flights
-from sortie.sim.ranking.rank import SUITE, Entry, Ranked, load_suite, rank
-from sortie.sim.studies.conditions import scenario_of
+from sortie.sim.experiment.conditions import scenario_of
+from sortie.sim.experiment.flights import Flights
+from sortie.sim.experiment.rank import SUITE, Entry, Ranked, load_suite, rank
 
 PAGE = ROOT / "docs/guide/learn.md"
 PLAN = Path(__file__).with_name("learned_example.toml")

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from research.validation.pairs_of_records import pair_up
 from research.validation.stored import Column, Table, points
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.policies.registry import resolve, within_budget
 from sortie.scenarios.reading.load import library, load
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.experiment.compare import BLOCK_S
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.studies.compare import BLOCK_S, pair_up
 
 SCENARIO, LIAR, SINCE_S = "track_target", 2, 5.0
 BUDGET = 0.1

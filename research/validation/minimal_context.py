@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from research.validation.pairs_of_records import pair_up
 from research.validation.stored import Column, Table, points
 from sortie.perception.metrics.bootstrap import Difference, compare
 from sortie.scenarios.reading.load import load
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.studies.compare import pair_up
 
 SCENARIO = "track_target"
 POLICIES = ("deputies", "who2com-style")

@@ -12,13 +12,13 @@ import numpy as np
 from research.validation.stored import ROOT, Cell, Column, Table
 from sortie.policies.registry import POLICIES, resolve
 from sortie.scenarios.intervals import Estimate
-from sortie.sim.ranking.board import draw, place_text
-from sortie.sim.ranking.flights import fly
-from sortie.sim.ranking.places import scores
-from sortie.sim.ranking.rank import SUITE, Entry, Ranked, load_suite, rank
-from sortie.sim.ranking.stored import made_now, read_results, save_results
-from sortie.sim.ranking.suite import digest_of
-from sortie.sim.ranking.verdict import verify
+from sortie.sim.experiment.board import draw, place_text
+from sortie.sim.experiment.flights import fly
+from sortie.sim.experiment.places import scores
+from sortie.sim.experiment.rank import SUITE, Entry, Ranked, load_suite, rank
+from sortie.sim.experiment.stored import made_now, read_results, save_results
+from sortie.sim.experiment.suite import digest_of
+from sortie.sim.experiment.verdict import verify
 
 PICTURE = ROOT / "docs/results/ranking.png"
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from research.validation.pairs_of_records import pair_up
 from research.validation.stored import Column, Table, points
 from sortie.fleet.coverage import footprint_radius_m
 from sortie.perception.metrics.ap import average_precision
@@ -24,7 +25,6 @@ from sortie.sim.engine.choreography import EVENT
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.studies.compare import pair_up
 
 SCENARIO, BUDGET, RADIUS_M = "track_target", 0.1, 32.0
 STAYS, MOVES = "all-4", "vantage"

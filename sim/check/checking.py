@@ -14,6 +14,8 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.check.expectations import Verdict, check
 from sortie.sim.check.golden import differences, golden_path, told, with_relative_files, write_golden
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.experiment.flight import OUTCOME, Task, task_of
+from sortie.sim.experiment.flight_file import fly_all, users_file
 from sortie.sim.folders import RunError
 from sortie.sim.policy_text import flown_by
 from sortie.sim.results.explain import explain_metric
@@ -107,23 +109,20 @@ def _counts(scenario: Scenario) -> dict[str, int]:
 
 
 class _Flights:
-    """The sorties after the first one, with one progress over all."""
+    """The outcomes of the sorties after the first one, with one progress over all."""
 
     def __init__(self, duration_s: float, progress: Callable[[float], None] | None) -> None:
         self._begin_s, self._duration_s, self._progress = 0.0, duration_s, progress
 
     def fly(self, scenario: Scenario, replications: range) -> list[dict[str, Any]]:
-        outcomes = []
-        for replication in replications:
-            self._begin_s += self._duration_s
-            outcomes.append(
-                outcome(run_sortie(scenario, replication=replication, progress=self._progress and self._at))
-            )
-        return outcomes
+        tasks = [task_of(scenario, (OUTCOME,), replication=k) for k in replications]
+        flights = fly_all(tasks, kept=users_file(), watch=self._at)
+        self._begin_s += len(tasks) * self._duration_s
+        return [flight.values[OUTCOME] for flight in flights]
 
-    def _at(self, t_s: float) -> None:
-        assert self._progress is not None  # noqa: S101
-        self._progress(self._begin_s + t_s)
+    def _at(self, task: Task, t_s: float) -> None:
+        if self._progress is not None:
+            self._progress(self._begin_s + (task.number + 1) * self._duration_s + min(t_s, self._duration_s))
 
 
 def _with_explanation(

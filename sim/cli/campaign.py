@@ -16,13 +16,13 @@ from typer.core import TyperGroup
 
 import sortie
 from sortie.scenarios.exit_codes import ENDED, FAILED, INTERRUPTED
-from sortie.sim.campaign.signals import EndedError, ended_by_sigterm
 from sortie.sim.cli.console import err, out, print_written
+from sortie.sim.experiment.signals import EndedError, ended_by_sigterm
 
 if TYPE_CHECKING:
     from sortie.scenarios.reading.campaign import Study
     from sortie.scenarios.schema import Scenario
-    from sortie.sim.campaign.drive import Progress
+    from sortie.sim.experiment.drive import Progress
 
 
 class _RunIsMeant(TyperGroup):
@@ -144,8 +144,8 @@ def run(
 @app.command("report")
 def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")]) -> None:
     """Write report.md and its figures from the finished runs."""
-    from sortie.sim.campaign.report import write_report
-    from sortie.sim.campaign.table import TABLE
+    from sortie.sim.experiment.report import write_report
+    from sortie.sim.experiment.store import TABLE
 
     path = write_report(folder)
     print_written("report written to", path, f", rows in {folder / TABLE}")
@@ -157,8 +157,8 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
     Raises:
         RunError: half of the two options, others beside them, no such run, or code that is not the campaign's.
     """
-    from sortie.sim.campaign.rows import find_row
-    from sortie.sim.campaign.work import unpack
+    from sortie.sim.experiment.flight import scenario_of_task
+    from sortie.sim.experiment.rows import find_row
     from sortie.sim.folders import RunError
     from sortie.sim.identity import codes_here
 
@@ -173,13 +173,13 @@ def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> t
         err.print(f"the campaign has not flown run {run} yet: there is no record to compare with")
     elif row["status"] == "failed":
         err.print(f"in the campaign run {run} failed: {row['error']}", soft_wrap=True)
-    scenario, seed, replication = unpack(plan.task(run))
-    return scenario, seed, replication, (row or {}).get("fingerprint") or None
+    task = plan.task(run)
+    return scenario_of_task(task), task.seed, task.replication, (row or {}).get("fingerprint") or None
 
 
 def _print_plan(study: Study, workers: int | None) -> None:
-    from sortie.sim.campaign import estimate
-    from sortie.sim.campaign.plan import make_plan
+    from sortie.sim.experiment import estimate
+    from sortie.sim.experiment.plan import make_plan
     from sortie.sim.user_errors import user_errors
 
     with user_errors():

@@ -23,14 +23,14 @@ from sortie.sim.cli.options import (
     refuse,
     split_policies,
 )
+from sortie.sim.experiment.compare import MOST_SEEDS, Flown, chosen_seeds, in_town_of
+from sortie.sim.experiment.comparison_text import BEGIN, END, compare_command, comparison_markdown
 from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.readme import with_section
 from sortie.sim.results.html_page import GENERATOR
 from sortie.sim.results.run_files import RECORDING_MARK
-from sortie.sim.studies.compare import MOST_SEEDS, Flown, chosen_seeds, in_town_of
-from sortie.sim.studies.comparison_text import BEGIN, END, compare_command, comparison_markdown
 
-PRECISE = ("metric", "pilot", "most_seeds", "kept")
+PRECISE = ("metric", "pilot", "most_seeds")
 """Options that go with --half-width."""
 
 
@@ -96,10 +96,11 @@ def compare(
             help="With --half-width: seeds flown by the torch detector at most. Default: 200.", min=4, max=MOST_SEEDS
         ),
     ] = None,
+    workers: Annotated[int, typer.Option(help="Number of processes that fly; with --half-width one.", min=1)] = 1,
     kept: Annotated[
         Path | None,
         typer.Option(
-            help="With --half-width: the file to which finished seeds are written. Default: runs/compare-NAME-….sqlite."
+            help="The file to which finished flights are written. Default: flights.sqlite in your cache folder."
         ),
     ] = None,
     by_torch: Annotated[
@@ -113,7 +114,7 @@ def compare(
     """
     conditions = load_conditions(scenario)
     if conditions is not None:
-        one = ("seeds", "own_fusion", "recording", "report", "readme", "half_width", *PRECISE)
+        one = ("seeds", "own_fusion", "recording", "report", "readme", "half_width", "workers", "kept", *PRECISE)
         refuse(context, ("seed",), "a scenario, not with a set of conditions: its file has its seeds")
         refuse(context, one, "a scenario, not with a set of conditions")
         named = list(POLICIES) if policies == "all" else split_policies(policies)
@@ -144,7 +145,7 @@ def compare(
                 metric=metric,
                 pilot=pilot,
                 most_seeds=most_seeds,
-                kept=kept or True,
+                kept=kept,
             )
     else:
         refuse(context, PRECISE, "--half-width")
@@ -157,6 +158,8 @@ def compare(
                 set_ or [],
                 seeds=chosen,
                 own_fusion=own_fusion,
+                workers=workers,
+                kept=kept,
                 progress=lambda label, at, t_s: each[label](chosen.index(at) * base.duration_s + t_s),
             )
     out.print(compared.summary())

@@ -12,13 +12,12 @@ from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
 
-from sortie.perception.detectors import make_detector
 from sortie.scenarios.report_text import number, percent, points, size
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import bars, out, print_written
+from sortie.sim.experiment.conditions import FIXED, Cell, best_fixed, fly_conditions, summarise
+from sortie.sim.experiment.flight_file import users_file
 from sortie.sim.folders import ensure_files, write_text
-from sortie.sim.studies.both_detectors import torch_answers
-from sortie.sim.studies.conditions import FIXED, Cell, best_fixed, fly_all, summarise
 
 
 def compare_conditions(
@@ -34,9 +33,10 @@ def compare_conditions(
     ensure_files(out_file, replace=replace, mark='{\n "summary": [')
     conditions = conditions.model_copy(update={"set": (*conditions.set, *sets)})
     with bars() as bar:
-        each = {p: bar(p, len(conditions.conditions)) for p in policies}
-        detector_of = torch_answers() if by_torch else make_detector
-        cells = fly_all(conditions, policies, progress=lambda p, k: each[p](k), detector_of=detector_of)
+        each = {p: bar(p, len(conditions.conditions) * max(1, len(conditions.seeds))) for p in policies}
+        cells = fly_conditions(
+            conditions, policies, progress=lambda p, k: each[p](k), by_torch=by_torch, kept=users_file()
+        )
     for table in _by_condition(conditions, policies, cells, out.width):
         out.print(table)
     if blind := list(dict.fromkeys(c.condition for c in cells if math.isnan(c.ap))):

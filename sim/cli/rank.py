@@ -11,7 +11,7 @@ import sortie
 from sortie.scenarios.exit_codes import FAILED
 from sortie.sim.cli.console import out, print_failure, print_written, stages
 from sortie.sim.cli.options import split_policies
-from sortie.sim.ranking.rank import SUITE
+from sortie.sim.experiment.rank import SUITE
 
 
 def rank(
@@ -48,7 +48,7 @@ def rank(
     workers: Annotated[int, typer.Option(help="Number of processes.", min=1)] = 1,
     out_dir: Annotated[
         Path,
-        typer.Option("--out", help="Folder for ranking.json, ranking.png and the finished flights."),
+        typer.Option("--out", help="Folder for ranking.json and ranking.png."),
     ] = Path("runs/rank"),
 ) -> None:
     """Fly a policy on a fixed, versioned suite of conditions, and print its place among all built-in policies.
@@ -56,7 +56,7 @@ def rank(
     The suite has thirty conditions with different budgets, links, batteries, missions, lies and faults. The policy gets the
     budget of each condition by its parameter `received_budget`, `sent_budget` or `rho`, if it has one of them.
 
-    A place is a range if the differences between policies are too small to tell. Flights are kept in the folder: after an
+    A place is a range if the differences between policies are too small to tell. Flights are kept in your cache folder: after an
     interruption the same command goes on. Exit code 1 if the policy failed in a condition or breaks a rule of the plane.
     """
     with stages() as report:
@@ -68,7 +68,6 @@ def rank(
             by_torch=by_torch,
             further=further,
             workers=workers,
-            folder=out_dir,
             progress=report,
         )
     out.print(ranking.summary())

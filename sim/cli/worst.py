@@ -27,7 +27,7 @@ def worst(
     ] = 0,
 ) -> None:
     """Show the worst runs by a metric, and the commands that fly them again."""
-    from sortie.sim.campaign.worst import worst as find
+    from sortie.sim.experiment.worst import worst as find
 
     found = find(folder, metric, max(count, fly), policy, more_is_worse=most)
     table = Table(

@@ -11,9 +11,10 @@ from sortie.scenarios.report_text import size
 from sortie.scenarios.schema import Scenario
 from sortie.sim.apart import Said, call_within
 from sortie.sim.engine.sortie import fly_here
+from sortie.sim.experiment.compare import AREAS, gains_over
+from sortie.sim.results.accuracy import both_matched
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.studies.compare import AREAS, gains_over
 
 
 class Beside:
@@ -59,7 +60,7 @@ def worth(policy: str, own: SortieRecord, other: SortieRecord, scenario: str) ->
     ours, theirs = (outcome(record) for record in (own, other))
     parts = [
         f"AP@0.5 {name.replace('_', ' ')} {100 * gain:+.1f} points ({ours['ap50'][name]:.3f}, {theirs['ap50'][name]:.3f})"
-        for name, gain in gains_over(other, own).items()
+        for name, gain in gains_over(both_matched(other), both_matched(own)).items()
         if name in AREAS and gain is not None
     ]
     parts.append(f"data sent {size(ours['bytes']['data_sent'])} ({size(theirs['bytes']['data_sent'])} under {policy})")

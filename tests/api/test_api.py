@@ -22,9 +22,9 @@ from typer.testing import CliRunner
 import sortie
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.experiment import half_width
+from sortie.sim.experiment.compare import Contender, chosen_seeds
 from sortie.sim.results.outcome import outcome
-from sortie.sim.studies import multifidelity
-from sortie.sim.studies.compare import Contender, chosen_seeds
 
 SHORT = {"duration_s": 1, "perception.detector": "none", "expect": [], "expect_decisions": []}
 SURROGATE = SHORT | {"duration_s": 2, "perception.detector": "surrogate"}
@@ -222,12 +222,12 @@ def test_a_comparison_of_several_has_a_row_a_sortie_and_intervals_over_sorties()
 @pytest.mark.slow
 def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The surrogate stands for torch; the command prints and writes the same."""
-    fly = multifidelity.fly_torch
+    fly = half_width.fly_torch
 
-    def stand_in(contenders: Sequence[Contender], seed: int) -> multifidelity.Row:
-        return fly([multifidelity.with_detector(c, "surrogate") for c in contenders], seed)._replace(processor_s=10.0)
+    def stand_in(contenders: Sequence[Contender], seed: int) -> half_width.Row:
+        return fly([half_width.with_detector(c, "surrogate") for c in contenders], seed)._replace(processor_s=10.0)
 
-    monkeypatch.setattr(multifidelity, "fly_torch", stand_in)
+    monkeypatch.setattr(half_width, "fly_torch", stand_in)
     monkeypatch.chdir(tmp_path)
     found = sortie.compare("track_target", ["worked", "silence"], SURROGATE, half_width=0.9, pilot=4)
     plain = compared()
@@ -261,10 +261,10 @@ def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.Monkey
         written = json.loads((tmp_path / "c.json").read_text())
         assert written["gains"] == [dataclasses.asdict(gain)]
         assert written["precision"]["paired"] == 4
-        monkeypatch.setattr(multifidelity, "fly_torch", None)
+        monkeypatch.setattr(half_width, "fly_torch", None)
     (kept,) = (tmp_path / "runs").iterdir()
     assert kept.match("compare-track_target-????????.sqlite")
-    monkeypatch.setattr(multifidelity, "fly_torch", stand_in)
+    monkeypatch.setattr(half_width, "fly_torch", stand_in)
     assert CliRunner().invoke(app, [*command, "--seed", "3", "--out", "d.json"]).exit_code == 0
     sorties = json.loads((tmp_path / "d.json").read_text())["sorties"]
     assert [(s["seed"], s["town_seed"]) for s in sorties[::2]] == [(seed, seed + 6) for seed in range(3, 7)]

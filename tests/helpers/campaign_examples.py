@@ -14,10 +14,11 @@ import pyarrow as pa
 import pytest
 
 from sortie.scenarios.reading.campaign import load_campaign
-from sortie.sim.campaign.plan import CampaignPlan, make_plan
-from sortie.sim.campaign.rows import CampaignRows
-from sortie.sim.campaign.store import FILE
-from sortie.sim.campaign.work import RunResult, Task, fly_batch, task_key
+from sortie.sim.experiment import flight
+from sortie.sim.experiment.flight import Flight, Task, fly_in_worker
+from sortie.sim.experiment.plan import CampaignPlan, make_plan
+from sortie.sim.experiment.rows import CampaignRows
+from sortie.sim.experiment.store import FILE
 
 CLUSTER = pytest.mark.filterwarnings(
     "default:::distributed", "default::ResourceWarning", "default::pytest.PytestUnraisableExceptionWarning"
@@ -66,47 +67,43 @@ def rows_on_disk(folder: Path) -> int:
     """How many runs of a campaign's folder have a row."""
     try:
         with closing(sqlite3.connect(f"file:{folder / FILE}?mode=ro", uri=True, timeout=60)) as db:
-            return int(db.execute("SELECT count(*) FROM rows").fetchone()[0])
+            return int(db.execute("SELECT count(*) FROM runs").fetchone()[0])
     except sqlite3.OperationalError:  # not there yet
         return 0
 
 
 class Pretended:
-    """An engine whose rows follow from the task alone, without flying; it can break off after some runs.
+    """A pool whose rows follow from the task alone, without flying; it can break off after some runs.
 
     Args:
         change: what becomes of each row.
     """
 
-    workers = 1
-
     def __init__(
         self,
         order: Sequence[int] | None = None,
         stop_after: int | None = None,
-        change: Callable[[RunResult], RunResult] = lambda row: row,
+        change: Callable[[Task, Flight], Flight] = lambda task, row: row,
     ) -> None:
         self.order, self.stop_after, self.change, self.flown = order, stop_after, change, list[int]()
 
-    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
+    def rows(self, tasks: Iterator[Task]) -> Iterator[list[tuple[Task, Flight]]]:
         todo = list(tasks)
         if self.order is not None:
             todo = [todo[i] for i in self.order if i < len(todo)]
-        for run, task in todo:
+        for task in todo:
             if self.stop_after is not None and len(self.flown) >= self.stop_after:
                 raise KeyboardInterrupt
-            self.flown.append(run)
-            yield [self.change(pretend(run, task, code))]
+            self.flown.append(task.number)
+            yield [(task, self.change(task, pretend(task)))]
 
 
 class InProcess:
-    """An engine that flies one run after the other in the test's own process."""
+    """A pool that flies one run after the other in the test's own process."""
 
-    workers = 1
-
-    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
+    def rows(self, tasks: Iterator[Task]) -> Iterator[list[tuple[Task, Flight]]]:
         for task in tasks:
-            yield fly_batch(code, [task])[0]
+            yield [(task, fly_in_worker(task))]
 
 
 def small_cluster(n_workers: int = 1, **options: Any) -> Any:
@@ -123,12 +120,12 @@ def small_cluster(n_workers: int = 1, **options: Any) -> Any:
     )
 
 
-def pretend(run: int, task: str, code: str) -> RunResult:
+def pretend(task: Task) -> Flight:
     """A row made of the task."""
-    asked, key = json.loads(task), task_key(task, code)
-    scenario = asked["scenario"]
+    scenario = json.loads(task.scenario)
     value = scenario["fleet"]["battery"]["initial_soc"] + 10 * (scenario["policy"]["name"] == "worked")
-    return RunResult(run, key, "done", "", key[:16], (value, float(asked["replication"])))
+    values = dict(zip(task.figures, (value, float(task.replication)), strict=True))
+    return Flight("", task.key[:16], values, task.key, task.files)
 
 
 def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_sent") -> CampaignRows:
@@ -148,11 +145,11 @@ def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_
 
 def report_lines(rows: CampaignRows, folder: Path) -> list[str]:
     """A campaign's report without its figures."""
-    from sortie.sim.campaign.report import _lines
+    from sortie.sim.experiment.report import _lines
 
     return list(_lines(rows, folder, {"varied.png": False, "pareto.png": False}))
 
 
-def failed(row: RunResult, error: str = "ValueError: planted") -> RunResult:
-    """The row of the same run, had it failed."""
-    return RunResult(row.run, row.key, "failed", error, "", (None, None))
+def failed(task: Task, error: str = "ValueError: planted") -> Flight:
+    """The row of a run that failed."""
+    return flight.failed(task, error)

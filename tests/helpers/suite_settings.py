@@ -13,6 +13,9 @@ from hypothesis import HealthCheck, settings
 # torch's threads wait in a busy loop by themselves, which takes the cores from other workers; read when torch is loaded
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+# a flight that one test flew must not be another test's
+os.environ["SORTIE_FLIGHTS"] = ""
+
 # typer reads all commands of the app anew at each call in this process, which takes longer than most of the calls
 typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
 

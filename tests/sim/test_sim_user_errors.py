@@ -15,10 +15,10 @@ import sortie
 from sortie.perception.errors import InputError
 from sortie.scenarios.plugins.reference import PluginError, from_file
 from sortie.scenarios.plugins.user_calls import guarded
-from sortie.sim.campaign.work import _result
 from sortie.sim.check import checking
 from sortie.sim.check.plugin import ScenarioFile
 from sortie.sim.engine import pilot
+from sortie.sim.experiment.work import _result
 from sortie.sim.folders import RunError
 from sortie.sim.user_errors import as_text, defect, missing, of_user, user_errors
 

@@ -14,7 +14,7 @@ from research.learn.learn import Lesson, draw_condition, fit, save
 from sortie.policies.catalogue.adaptive import ARMS, FEATURES, read_model
 from sortie.scenarios.reading.load import load_conditions
 from sortie.scenarios.schema.conditions import ConditionSet
-from sortie.sim.studies.conditions import scenario_of
+from sortie.sim.experiment.conditions import scenario_of
 
 SETS = ("conditions", "conditions_second", "conditions_third", "conditions_fourth")
 

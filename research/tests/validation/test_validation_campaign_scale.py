@@ -10,8 +10,8 @@ import pytest
 from research.validation import campaign_scale
 from research.validation.campaign_scale import QUANTITIES, Cost, MadeUp, fit, table
 from sortie.scenarios.reading.campaign import load_campaign
-from sortie.sim.campaign.drive import run_campaign
-from sortie.sim.campaign.plan import make_plan
+from sortie.sim.experiment.drive import run_campaign
+from sortie.sim.experiment.plan import make_plan
 
 RUNS = (100, 300, 1000)
 FLOWN = [Cost(n, True, 10 + 0.1 * n, 2 + 0.03 * n, 1 + 0.002 * n, 3e8 + 1000 * n, 2e4 + 350 * n) for n in RUNS]

@@ -17,8 +17,8 @@ from research.validation import figures
 from research.validation.figures import FIGURES, all_sections, pages, seeds_table, speed_table
 from research.validation.stored import FOLDER, MARKED, Column, Table, rendered, sections, store
 from sortie.scenarios.schema.conditions import ConditionSet
+from sortie.sim.experiment.conditions import Cell
 from sortie.sim.studies import conditions
-from sortie.sim.studies.conditions import Cell
 
 GENERATED = {"research/pages/paper/README.md", "research/pages/study/README.md", "sim/results/outcome.md"}
 """Pages that a command writes whole; their own tests hold them to their data."""

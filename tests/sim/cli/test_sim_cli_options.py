@@ -19,11 +19,11 @@ import sortie
 from sortie.fleet.logs.geodesy import Origin
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.reading.load import ScenarioError
-from sortie.sim.campaign.drive import run_campaign
-from sortie.sim.campaign.worst import Worst
 from sortie.sim.cli import console, fly
 from sortie.sim.cli import verify as verify_command
 from sortie.sim.cli.options import loaded, split_policies
+from sortie.sim.experiment.drive import run_campaign
+from sortie.sim.experiment.worst import Worst
 from sortie.sim.results import run_folder
 
 KEY = bytes(range(32))
@@ -208,7 +208,7 @@ def test_worst(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
         {"run": 3, "policy": "b", "x": "words", "m": 1234567.0},
     ]
     found, flown = Seen(Worst("m", True, ["x"], rows)), Seen(SimpleNamespace())
-    monkeypatch.setattr("sortie.sim.campaign.worst.worst", found)
+    monkeypatch.setattr("sortie.sim.experiment.worst.worst", found)
     monkeypatch.setattr("sortie.sim.cli.worst.fly_again", flown)
     assert run_line("campaign worst c m --count 4 --policy b --least --fly 1") == 0
     assert found.calls == [((Path("c"), "m", 4, "b"), {"more_is_worse": False})]

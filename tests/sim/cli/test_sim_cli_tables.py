@@ -23,9 +23,9 @@ from sortie.sim.check.expectations import Verdict
 from sortie.sim.cli import console
 from sortie.sim.cli.conditions import _by_condition
 from sortie.sim.cli.tables import verdict_table
+from sortie.sim.experiment.conditions import Cell
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.summary import transitions_table
-from sortie.sim.studies.conditions import Cell
 from sortie.sim.terminal import Terminal
 
 

@@ -10,12 +10,12 @@ from sortie.perception.errors import InputError
 from sortie.policies.catalogue.prior import METHODS
 from sortie.scenarios.representation import BOXES, NAME_OF, REPRESENTATION_OF, Representation
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.experiment.compare import Contender, compare
 from sortie.sim.export.messages import directives
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.palette import SENT
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report_figures import SENT as REPORT
-from sortie.sim.studies.compare import Contender, compare
 
 FEW = ("fleet.drones=3", "mission.phases=[{}]")
 

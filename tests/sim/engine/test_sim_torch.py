@@ -16,9 +16,9 @@ from sortie.scenarios.schema import Scenario
 from sortie.scenarios.shipped import NETWORKS
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.experiment.compare import Contender, compare
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.studies.compare import Contender, compare
 
 pytestmark = pytest.mark.slow
 TRACKED = ("duration_s=8", "mission.phases=[{at_s: 0, phase: track, region: {radius_m: 32}}]", "policy.dwell_s=0.2")

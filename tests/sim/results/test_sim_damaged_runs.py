@@ -18,10 +18,10 @@ from cli_examples import command, refusal
 from rich.console import Console
 
 import sortie
+from sortie.sim.experiment.compare import Compared, Flown
+from sortie.sim.experiment.comparison_page import comparison_page
 from sortie.sim.folders import RunError
 from sortie.sim.results.run_checks import MOST_CHARACTERS as MOST
-from sortie.sim.studies.compare import Compared, Flown
-from sortie.sim.studies.comparison_page import comparison_page
 from sortie.sim.terminal import Terminal
 
 SHORT = {

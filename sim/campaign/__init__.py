@@ -1,1 +1,0 @@
-"""Campaigns: many sorties over what is varied, resumable, the same rows on one core or a cluster."""

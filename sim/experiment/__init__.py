@@ -1,0 +1,1 @@
+"""Experiments: policies × conditions × draws are flown, and what their rows come to: comparisons, campaigns, ranks."""

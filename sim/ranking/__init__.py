@@ -1,1 +1,0 @@
-"""The ranking of policies on a fixed, versioned suite of conditions (`sortie rank`)."""

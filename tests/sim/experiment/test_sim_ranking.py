@@ -1,0 +1,293 @@
+"""The suite that policies are ranked on, their flights, and whole rankings of a small suite."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import sortie
+from sortie.policies.registry import POLICIES
+from sortie.scenarios.reading.load import condition_sets, load_conditions, read
+from sortie.scenarios.schema.conditions import ConditionSet
+from sortie.sim.cli import app
+from sortie.sim.experiment import flights, rank
+from sortie.sim.experiment.conditions import scenario_of
+from sortie.sim.experiment.flights import KEPT, Flight, fly
+from sortie.sim.experiment.stored import made_now, read_results, save_results
+from sortie.sim.experiment.suite import MISSIONS, NEWEST, TROUBLES, digest_of, further_conditions, name_of, suite_text
+from sortie.sim.experiment.verdict import Verified
+from sortie.sim.experiment.work import RunResult, Task, fly_batch
+from sortie.sim.folders import RunError
+
+pytestmark = pytest.mark.slow
+
+SMALL = """
+base: track_target
+set: [perception.detector=surrogate, duration_s=1, fleet.drones=3, "mission.phases=[{at_s: 0, phase: search}]"]
+seeds: []
+conditions:
+  - {name: poor, budget: 0.02, set: [seed=1]}
+  - {name: rich, budget: 0.25, set: [seed=2, perception.scene.seed=8]}
+"""
+MINE = """
+import sortie
+def boxes(view, *, sent_budget=0.5):
+    assert sent_budget in (0.02, 0.25), sent_budget
+    boxes = sortie.Representation.DETECTIONS
+    return [sortie.Directive(view.ego, p, boxes, 0.0, None, 5.0, reason="boxes") for p in view.peers]
+def fails(view, *, sent_budget=0.5):
+    if sent_budget > 0.1:
+        raise RuntimeError("boom")
+    return boxes(view, sent_budget=0.02)
+"""
+FINE = Verified(16, (), "proved", "proved")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A folder with a small suite and a policy; flights fly in this process, and are counted."""
+    flown: list[int] = []
+
+    class Engine:
+        def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
+            for task in tasks:
+                flown.append(task[0])
+                yield fly_batch(code, [task])[0]
+
+    @contextmanager
+    def open_engine(workers: int) -> Iterator[Engine]:
+        yield Engine()
+
+    monkeypatch.setattr(flights, "open_engine", open_engine)
+    monkeypatch.setattr(rank, "verify", lambda policy: FINE)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml").write_text(SMALL)
+    (tmp_path / "mine.py").write_text(MINE)
+    return flown
+
+
+def small() -> ConditionSet:
+    return rank.load_suite("small.yaml")
+
+
+# --- the suite -----------------------------------------------------------------------------------
+
+
+def test_the_generator_gives_the_suites_file_and_a_released_one_never_changes() -> None:
+    name = name_of(NEWEST)
+    assert name in condition_sets()
+    assert read(name)[0] == suite_text(NEWEST)
+    assert digest_of("ranking_v1") == "4d7e931438a5"
+
+
+def test_the_suite_crosses_troubles_and_missions_and_draws_all_else() -> None:
+    suite = rank.load_suite("ranking_v1")
+    names = [c.name for c in suite.conditions]
+    assert names == [f"{mission}_{trouble}" for mission in MISSIONS for trouble in TROUBLES]
+    flown = [scenario_of(suite, c, "all-4") for c in suite.conditions]
+    assert Counter(s.fleet.drones for s in flown) == {4: 10, 5: 10, 6: 10}
+    assert len({s.perception.scene.seed for s in flown}) == len({s.seed for s in flown}) == 30
+    budgets = np.sort(np.log([c.budget for c in suite.conditions]))
+    assert np.diff(budgets).max() < 2 * np.log(100) / 30, "spread evenly: one in each thirtieth of the range"
+    for condition, scenario in zip(suite.conditions, flown, strict=True):
+        mission, _, trouble = condition.name.partition("_")
+        assert (condition.metric == "mission") == (mission != "search")
+        assert len(scenario.events) == (trouble not in ("clear", "weak", "tired"))
+        assert (scenario.fleet.battery.initial_soc < 0.3) == (trouble == "tired")
+        assert scenario.policy.invariants.count("\n") == 1
+
+
+def test_the_suite_flies_under_every_policy_within_the_budget() -> None:
+    suite = rank.load_suite("ranking_v1")
+    for policy in POLICIES:
+        for condition in suite.conditions[::10]:
+            assert set(scenario_of(suite, condition, policy).policy.params.values()) <= {condition.budget}
+    own = scenario_of(suite, suite.conditions[0], "best-2(received_budget=0.3)")
+    assert own.policy.params == {"received_budget": 0.3}
+
+
+def test_a_set_with_seeds_of_its_own_is_no_suite(here: object) -> None:
+    Path("seeds.yaml").write_text(SMALL.replace("seeds: []", "seeds: [1, 2]"))
+    with pytest.raises(RunError, match=r"seeds is \[1, 2\], must be \[\]"):
+        rank.load_suite("seeds.yaml")
+    for field, own in (("seed", "seed=2, "), ("perception.scene.seed", ", perception.scene.seed=8")):
+        Path("seeds.yaml").write_text(SMALL.replace(own, ""))
+        with pytest.raises(RunError, match=rf"{field} is \d in poor and in rich, must differ .* write `{field}=` into"):
+            rank.load_suite("seeds.yaml")
+    with pytest.raises(RunError, match="holds no conditions"):
+        rank.load_suite("track_target")
+
+
+def test_further_draws_are_of_the_same_kinds_and_share_no_town_with_the_suite() -> None:
+    suite, more = rank.load_suite("ranking_v1"), further_conditions("ranking_v1", 2)
+    assert [c.name for c in more] == [f"{c.name}_{k}" for k in (1, 2) for c in suite.conditions]
+    assert [c.metric for c in more] == [c.metric for c in suite.conditions] * 2
+    towns = [o for c in (*suite.conditions, *more) for o in c.set if o.startswith("perception.scene.seed=")]
+    assert len(set(towns)) == 90
+    assert further_conditions("ranking_v1", 1) == more[:30]
+    assert further_conditions("small.yaml", 2) == []
+    wide = suite.model_copy(update={"conditions": tuple(more)})
+    assert scenario_of(wide, more[0], "all-4").perception.detector == "surrogate"
+
+
+# --- flights -------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_ranking_goes_on_where_it_was(here: list[int]) -> None:
+    first = fly(small(), ["boxes"], Path("out"))
+    file = Path("out") / KEPT
+    lines = file.read_bytes().splitlines()
+    file.write_bytes(b"\n".join(lines)[:-7])  # the last line was cut off
+    assert len(here) == 2
+    told: list[int] = []
+    again = fly(small(), ["boxes"], Path("out"), progress=told.append)
+    assert (len(here), told) == (3, [1, 2])
+    prints = [{c: f.fingerprint for c, f in found["boxes"].items()} for found in (first, again)]
+    assert prints[0] == prints[1]
+    assert again["boxes"]["poor"] == first["boxes"]["poor"]
+    fly(small(), ["boxes"], Path("out"))
+    assert len(here) == 3, "nothing is missing"
+
+
+def test_a_flight_is_flown_again_after_a_change_of_the_policys_file_and_after_a_failure(here: list[int]) -> None:
+    found = fly(small(), ["mine.py:boxes", "mine.py:fails"], Path("out"))
+    assert not found["mine.py:boxes"]["rich"].error
+    failed = found["mine.py:fails"]["rich"]
+    assert "RuntimeError: boom" in failed.error
+    assert set(failed.values.values()) == {None}
+    fly(small(), ["mine.py:boxes", "mine.py:fails"], Path("out"))
+    assert len(here) == 4 + 1
+    Path("mine.py").write_text(MINE + "# changed\n")
+    fly(small(), ["mine.py:boxes"], Path("out"))
+    assert len(here) == 5 + 2
+
+
+def test_a_callable_gets_the_budget_and_flies_as_its_name_does(here: list[int]) -> None:
+    budgets = set()
+
+    def decide(view: sortie.FleetView, *, rho: float = 1.0) -> list[sortie.Directive]:
+        budgets.add(rho)
+        return list(POLICIES["boxes"](view))
+
+    found = flights.fly_callable(small(), decide)
+    assert budgets == {0.02, 0.25}
+    named = fly(small(), ["boxes"], Path("out"))["boxes"]
+    scores = [[flight.values["ap50.full_scene"] for flight in each.values()] for each in (found, named)]
+    assert scores[0] == scores[1]
+
+
+# --- stored results, and the whole ---------------------------------------------------------------
+
+
+def test_the_stored_results_are_of_the_newest_suite_and_whole() -> None:
+    found = read_results(rank.SUITE, digest_of(rank.SUITE))
+    assert found is not None
+    assert set(found.flights) <= set(POLICIES)
+    assert rank.REFERENCE in found.flights
+    assert set(found.verified) == set(found.flights)
+    suite = load_conditions(rank.SUITE)
+    assert suite is not None
+    assert all(set(of) == {c.name for c in suite.conditions} for of in found.flights.values())
+
+
+def test_own_flights_are_all_that_a_ranking_costs(
+    here: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others = ["worked", "silence"]
+    flown = fly(small(), others, Path("elsewhere"))
+    save_results(made_now("small", digest_of("small.yaml"), flown, dict.fromkeys(others, FINE)), tmp_path)
+    here.clear()
+    monkeypatch.setattr(rank, "read_results", lambda suite, digest: read_results(suite, digest, tmp_path))
+    ranking = sortie.rank("mine.py:boxes", suite="small.yaml", against=others, folder="out")
+    assert len(here) == 2 + 1, "its own, and one to see whether the stored results are of this version"
+    assert set(ranking.places) == {"mine.py:boxes", *others}
+    assert not ranking.ranked.stale
+    assert "flies otherwise" not in str(ranking.summary())
+    again = sortie.rank("mine.py:boxes", suite="small.yaml", against=others, again=True, folder="again")
+    assert again.places == ranking.places
+    assert again.ranked.stored is None
+    worked = flown["worked"]["poor"]
+    flown["worked"]["poor"] = Flight("", "of another version", {**worked.values, "policy_eval_us.p50": 1e-3})
+    save_results(made_now("small", digest_of("small.yaml"), flown, dict.fromkeys(others, FINE)), tmp_path)
+    ranking = sortie.rank("mine.py:boxes", suite="small.yaml", against=others, folder="out")
+    assert ranking.ranked.stale
+    assert "flies otherwise" in str(ranking.summary())
+    slower = ranking.ranked.speed
+    assert 0.1 < slower / (1e3 * (worked.values["policy_eval_us.p50"] or 0)) < 10, "as this machine's own flight"
+    stored_us = ranking.ranked.row("silence").figures["policy_eval_us.p50"].mean
+    assert ranking.ranked.decision_us("silence") == pytest.approx(slower * stored_us)
+    alone = sortie.rank("mine.py:boxes", suite="small.yaml", against=[], folder="out")
+    assert (alone.ranked.stored, alone.ranked.stale) == (None, False), "stored results of which nothing is shown"
+
+
+def test_a_ranking_by_torch_flies_the_surrogate_too(here: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rank, "BY_TORCH", ("perception.sample_rate_hz=1",))  # cheaper than torch, and other flights
+    more = [c.model_copy(update={"name": f"{c.name}_{k}"}) for k in range(4) for c in small().conditions]
+    monkeypatch.setattr(rank, "further_conditions", lambda suite, draws: more[: 2 * draws])
+    ranking = sortie.rank(["boxes", POLICIES["silence"]], suite="small.yaml", against=[], by_torch=True, folder="out")
+    assert len(here) == 2 + 2 + 2 * 3, "by torch; by the surrogate in the same conditions and three further draws"
+    control = ranking.ranked.control
+    assert control is not None
+    assert [len(of) for of in control.flights.values()] == [8, 8]
+    assert "8 further" not in str(ranking.summary())
+    assert "6 further ones" in " ".join(str(ranking.summary()).split())
+    alone = sortie.rank("boxes", suite="small.yaml", against=[], by_torch=True, further=0, folder="out")
+    assert len(here) == 10, "nothing is missing"
+    assert (alone.ranked.control, alone.ranked.width) == (None, 1.0)
+    kept = json.loads((ranking.save("out") / "ranking.json").read_text())
+    assert set(kept["by_surrogate"]["boxes"]) == {"poor", "rich", *(c.name for c in more[:6])}
+
+
+def test_the_command_prints_keeps_and_says_by_its_exit_code_what_failed(here: list[int]) -> None:
+    command = ["rank", "mine.py:boxes,mine.py:fails", "--suite", "small.yaml", "--against", "silence", "--out", "out"]
+    done = CliRunner().invoke(app.app, command)
+    assert done.exit_code == 1, done.output
+    failed = "mine.py:fails failed in 1 of 2 conditions"
+    for words in ("mine.py:boxes takes place", "failed in rich: PolicyError", failed):
+        assert words in " ".join(done.output.split())
+    kept = json.loads((Path("out") / "ranking.json").read_text())
+    assert kept["digest"] == digest_of("small.yaml")
+    assert {row["policy"] for row in kept["policies"]} == {"mine.py:boxes", "mine.py:fails", "silence"}
+    assert "boom" in kept["flights"]["mine.py:fails"]["rich"]["error"]
+    assert (Path("out") / "ranking.png").read_bytes().startswith(b"\x89PNG")
+    done = CliRunner().invoke(app.app, [*command[:1], "mine.py:boxes", *command[2:]])
+    assert done.exit_code == 0, done.output
+
+
+WRONG: list[tuple[dict[str, object], str]] = [
+    ({"policies": "nobody"}, "nobody"),
+    ({"policies": ["boxes", "boxes"]}, "each named once"),
+    ({"policies": []}, "must be one or more"),
+    ({"policies": 3}, "must be a policy or a list"),
+    ({"policies": [3]}, "must be a name, file.py:function or a callable"),
+    ({"policies": "boxes", "workers": 0}, "workers: 0, must be a whole number from 1 on"),
+    ({"policies": "boxes", "against": "worked"}, "must be a list of names"),
+    ({"policies": "best-2(rho=0.1)"}, "rho"),
+    (
+        {"policies": "boxes", "against": [], "by_torch": True, "further": 2},
+        "--further 2: --suite small.yaml is not drawn",
+    ),
+    (
+        {"policies": "boxes", "by_torch": True, "further": -1},
+        "further: -1, must be None or a whole number from 0 to 100",
+    ),
+    ({"policies": "boxes", "suite": "ranking_v1", "further": 1}, "--further 1: needs --by-torch"),
+]
+
+
+def test_a_wrong_argument_is_named_before_anything_flies(here: list[int]) -> None:
+    wrong = {}
+    for asked, words in WRONG:
+        with pytest.raises(sortie.SortieError) as error:
+            sortie.rank(**{"suite": "small.yaml", "folder": "out"} | asked)  # type: ignore[arg-type]
+        if words not in str(error.value):
+            wrong[words] = str(error.value)
+    assert wrong == {}
+    assert not here
