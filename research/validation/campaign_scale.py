@@ -30,10 +30,10 @@ from scipy.optimize import nnls
 import sortie
 from research.validation.stored import Cell, Column, Table
 from sortie.scenarios.reading.campaign import load_campaign
-from sortie.sim.experiment.cluster import MAX_BATCH
 from sortie.sim.experiment.drive import run_campaign
+from sortie.sim.experiment.flight import Flight, Task
 from sortie.sim.experiment.plan import make_plan
-from sortie.sim.experiment.work import RunResult, Task, task_key
+from sortie.sim.experiment.pools import Landed
 
 BASE = "name: small\nduration_s: 1\nfleet: {drones: 2}\nperception: {detector: none}\n"
 CAMPAIGN = """
@@ -100,19 +100,23 @@ def fit(runs: Sequence[int], values: Sequence[float]) -> Line:
     return Line(float(a), float(b), float(np.max(np.abs(1 - (a + b * x) / y))))
 
 
+TOGETHER = 200
+"""Rows that a made-up pool gives at once."""
+
+
 class MadeUp:
-    """An engine that answers tasks with rows of the usual size, without flights, in the largest batches of a cluster."""
+    """A pool that answers tasks with rows of the usual size, without flights."""
 
-    workers = 1
-
-    def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
-        """As `Engine`."""
-        while batch := list(itertools.islice(tasks, MAX_BATCH)):
-            yield [_made_up(run, task_key(task, code)) for run, task in batch]
+    def rows(self, tasks: Iterator[Task]) -> Iterator[Landed]:
+        """As `Pool`."""
+        while batch := list(itertools.islice(tasks, TOGETHER)):
+            yield [(task, _made_up(task)) for task in batch]
 
 
-def _made_up(run: int, key: str) -> RunResult:
-    return RunResult(run, key, "done", "", key[:16], (float(int(key[:5], 16)), int(key[5:14], 16) / 1e9))
+def _made_up(task: Task) -> Flight:
+    key = task.key
+    values = float(int(key[:5], 16)), int(key[5:14], 16) / 1e9
+    return Flight("", key[:16], dict(zip(task.figures, values, strict=True)), key)
 
 
 def drive(runs: int, flown: bool) -> Cost:

@@ -85,7 +85,9 @@ def tables(work: Path, workers: int = 2) -> Mapping[str, Table]:
     against = planned["policies"]
 
     def ranked(suite: str, others: list[str], *, again: bool) -> Ranked:
-        return rank([Entry(LEARNED)], work, suite=suite, against=others, again=again, workers=workers)
+        return rank(
+            [Entry(LEARNED)], work / "flights.sqlite", suite=suite, against=others, again=again, workers=workers
+        )
 
     held_out = ranked(str(file), against, again=True)
     others = [p for p in against if "(" not in p]

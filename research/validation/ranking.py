@@ -20,6 +20,7 @@ from sortie.sim.experiment.stored import made_now, read_results, save_results
 from sortie.sim.experiment.suite import digest_of
 from sortie.sim.experiment.verdict import verify
 
+KEPT = "flights.sqlite"
 PICTURE = ROOT / "docs/results/ranking.png"
 
 
@@ -30,7 +31,7 @@ def measure(work: Path, workers: int = 2) -> Mapping[str, Table]:
         work: folder of the flights, so that a measurement that was cut off goes on.
         workers: number of processes.
     """
-    flights = fly(load_suite(SUITE), list(POLICIES), work, workers=workers)
+    flights = fly(load_suite(SUITE), dict.fromkeys(POLICIES), workers=workers, kept=work / KEPT)
     save_results(made_now(SUITE, digest_of(SUITE), flights, {p: verify(resolve(p), 120) for p in POLICIES}))
     return tables(work)
 
@@ -39,7 +40,7 @@ def tables(work: Path) -> Mapping[str, Table]:
     """The tables of the stored results; draws the figure too."""
     stored = read_results(SUITE, digest_of(SUITE))
     assert stored is not None
-    ranked = rank([Entry(p) for p in stored.flights], work)
+    ranked = rank([Entry(p) for p in stored.flights], work / KEPT)
     draw(replace(ranked, entries=()), PICTURE)
     return {"ranking": accuracy(ranked), "ranking_costs": costs(ranked)}
 
@@ -55,8 +56,8 @@ def by_torch(work: Path, workers: int = 2) -> Mapping[str, Table]:
         work: folder of the flights, so that a measurement that was cut off goes on.
     """
     first, *others = BY_TORCH
-    both = rank([Entry(first)], work, against=others, by_torch=True, workers=workers)
-    alone = rank([Entry(first)], work, against=others, by_torch=True, further=0, workers=workers)
+    both = rank([Entry(first)], work / KEPT, against=others, by_torch=True, workers=workers)
+    alone = rank([Entry(first)], work / KEPT, against=others, by_torch=True, further=0, workers=workers)
     assert both.control is not None
     cheap = scores(both.control.suite, both.control.flights)
     columns = [

@@ -12,7 +12,9 @@ from types import FrameType
 from sortie.sim.identity import file_digest
 
 _SORTIE = str(Path(__file__).parents[2]) + os.sep
-_SKIPPED = tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")} | {"<"})
+_LIBRARIES = tuple(
+    {sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")} | {"<"}
+)
 """Libraries, which read for whoever calls them."""
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _read: dict[str, str] = {}
@@ -55,9 +57,12 @@ def _note(event: str, arguments: tuple[object, ...]) -> None:
 
 
 def _is_users(frame: FrameType | None) -> bool:
-    """Whether the innermost code that is no library's is a user's."""
-    while frame is not None and frame.f_code.co_filename.startswith(_SKIPPED):
-        if frame.f_code.co_filename.startswith(_SORTIE):
-            return False
+    """Whether the innermost code that is no library's is a user's, and Sortie has called it: a user's program reads what it likes."""
+    users = False
+    while frame is not None:
+        file = frame.f_code.co_filename
+        if file.startswith(_SORTIE):
+            return users
+        users = users or not file.startswith(_LIBRARIES)
         frame = frame.f_back
-    return frame is not None and not frame.f_code.co_filename.startswith(_SORTIE)
+    return False

@@ -199,14 +199,15 @@ def fly(
     task: Task,
     progress: Callable[[float], None] | None = None,
     keep: Callable[[SortieRecord], None] = lambda record: None,
-    flown: Callable[..., Any] = run_sortie,
+    *,
+    in_worker: bool = False,
 ) -> Flight:
     """One flight's row.
 
     Args:
         progress: called with the simulated time, s.
         keep: called with the record.
-        flown: `run_sortie`, or `fly_here` in a process that has the limits.
+        in_worker: in a process that has the limits, so that the flight needs none of its own.
 
     Raises:
         ScenarioError, PolicyError, ...: whatever a sortie raises.
@@ -214,7 +215,7 @@ def fly(
     files_read.watch()
     begin_s = time.process_time()
     make, draws = maker(task.seen_by)
-    record: SortieRecord = flown(
+    record = (fly_here if in_worker else run_sortie)(
         scenario_of_task(task),
         task.function,
         task.seed,
@@ -256,7 +257,7 @@ def fly_in_worker(task: Task, memory_b: int | None = None) -> Flight:
     try:
         # sums in one order: a matrix product on two threads may round differently than on one
         with threadpool_limits(1), limited(memory_b):
-            return fly(task, flown=fly_here)
+            return fly(task, in_worker=True)
     except Exception as error:  # whatever it is, the others go on
         if memory_b is not None and isinstance(error, MemoryError):
             return failed(task, f"MemoryError: more than {memory_b / 1e9:.3g} GB (--worker-memory)")

@@ -11,11 +11,12 @@ import json
 import math
 import os
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -61,7 +62,8 @@ class FlightFile:
         RunError: it cannot be used, or holds something else.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, own: Collection[str] = ()) -> None:
+        """Args: `own` are tables that may stand beside that of the flights."""
         self.path = path
         with self.errors():
             ensure_place(path)
@@ -70,6 +72,9 @@ class FlightFile:
         try:
             with self.errors():
                 self.db.execute("PRAGMA synchronous = EXTRA")  # a committed row survives a power cut
+                tables = {name for (name,) in self.db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+                if others := sorted(tables - {"flights", *own}):
+                    raise RunError(f"{path}: holds the table {others[0]} of somebody else; name another file")
                 ensure_table(self.db)
         except BaseException:
             self.db.close()
@@ -84,9 +89,9 @@ class FlightFile:
         with self.errors():
             row = self.db.execute(f"SELECT {COLUMNS} FROM flights WHERE key = ?", (task.key,)).fetchone()  # noqa: S608
             flight = None if row is None else flight_of(row)
-        if flight is None or flight.error or not set(task.figures) <= set(flight.values):
-            return None
-        return flight if not changed(flight.files) else None
+            if flight is None or flight.error or not set(task.figures) <= set(flight.values):
+                return None
+            return None if changed(flight.files) else flight
 
     def add(self, tasks_and_rows: Iterable[tuple[Task, Flight]]) -> None:
         """Put rows on disk; a failed flight does not take the place of another.
@@ -167,7 +172,7 @@ def errors(path: Path) -> Iterator[None]:
         raise _refused(path, error.strerror or str(error)) from error
     except RunError:
         raise
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, EOFError, BadZipFile) as error:
         raise broken(path, f"{type(error).__name__}: {error}") from error
 
 

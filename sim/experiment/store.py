@@ -35,6 +35,8 @@ from sortie.sim.experiment.plan import FORMAT, CampaignPlan
 from sortie.sim.folders import RunError, ensure_place
 
 FILE = "campaign.sqlite"
+TABLES = ("plan", "runs", "rows")
+"""Beside the flights; `rows` is of older versions."""
 TOGETHER = 500
 """Rows that are written at once where they are there already."""
 TABLE = "runs/table.parquet"
@@ -190,7 +192,7 @@ class CampaignStore(CampaignTable):
         ensure_usable(folder, plan)
         if resume_only and not (folder / FILE).is_file():
             raise RunError(f"{folder}: no campaign there to resume ({FILE} is missing)")
-        self._file = FlightFile(folder / FILE)
+        self._file = FlightFile(folder / FILE, TABLES)
         self._db = self._file.db
         self.said: list[str] = []
         """Lines on flights that are there and are not taken."""

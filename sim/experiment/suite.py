@@ -129,7 +129,7 @@ def draw_conditions(version: int, draw: int = 0) -> list[Condition]:
 
 
 _HEAD = """\
-# The suite on which `sortie rank` ranks policies, version {version}. Drawn by sim/experiment/suite.py from the seed {seed}.
+# The suite on which `sortie rank` ranks policies, version {version}. Drawn by sim/ranking/suite.py from the seed {seed}.
 #
 # Fixed: results are cited by this version and the digest of this file. A new suite gets a new version.
 

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 import sortie
 from sortie.sim.cli.app import app
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.experiment import half_width
+from sortie.sim.experiment import half_width, pools
 from sortie.sim.experiment.compare import Contender, chosen_seeds
 from sortie.sim.results.outcome import outcome
 
@@ -224,8 +224,9 @@ def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.Monkey
     """The surrogate stands for torch; the command prints and writes the same."""
     fly = half_width.fly_torch
 
-    def stand_in(contenders: Sequence[Contender], seed: int) -> half_width.Row:
-        return fly([half_width.with_detector(c, "surrogate") for c in contenders], seed)._replace(processor_s=10.0)
+    def stand_in(contenders: Sequence[Contender], seed: int, kept: half_width.Kept) -> half_width.Row:
+        cheap = [half_width.with_detector(c, "surrogate") for c in contenders]
+        return fly(cheap, seed, kept)._replace(processor_s=10.0)
 
     monkeypatch.setattr(half_width, "fly_torch", stand_in)
     monkeypatch.chdir(tmp_path)
@@ -243,6 +244,7 @@ def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.Monkey
     assert "half-width of ap50.full_scene" in words_of(found)
     with pytest.raises(sortie.RunError, match="a comparison to a half-width keeps no records"):
         found.save_recording(tmp_path / "a.rrd")
+    monkeypatch.setenv("SORTIE_FLIGHTS", str(tmp_path / "flights.sqlite"))
     settings = [arg for key, value in SURROGATE.items() for arg in ("--set", f"{key}={value}")]
     command = [
         "compare",
@@ -261,9 +263,9 @@ def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.Monkey
         written = json.loads((tmp_path / "c.json").read_text())
         assert written["gains"] == [dataclasses.asdict(gain)]
         assert written["precision"]["paired"] == 4
-        monkeypatch.setattr(half_width, "fly_torch", None)
-    (kept,) = (tmp_path / "runs").iterdir()
-    assert kept.match("compare-track_target-????????.sqlite")
+        monkeypatch.setattr(pools, "fly", None)
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(half_width, "fly_torch", stand_in)
     assert CliRunner().invoke(app, [*command, "--seed", "3", "--out", "d.json"]).exit_code == 0
     sorties = json.loads((tmp_path / "d.json").read_text())["sorties"]

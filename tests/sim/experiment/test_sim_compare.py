@@ -12,8 +12,8 @@ from sim_examples import example
 
 from sortie.perception.metrics.ap import Matched
 from sortie.scenarios.intervals import SHARE, mean_interval
+from sortie.sim.experiment import compare, flight
 from sortie.sim.experiment.compare import Compared, Contender
-from sortie.sim.studies import compare
 
 
 def named(name: float, *keys: tuple[float, int]) -> dict[tuple[float, int], Matched]:
@@ -22,27 +22,15 @@ def named(name: float, *keys: tuple[float, int]) -> dict[tuple[float, int], Matc
     return {key: Matched(np.array([name + key[0] / 100 + key[1] / 1e4]), found, 1) for key in keys}
 
 
-def test_fusions_are_paired_by_sortie_time_and_drone_and_grouped_by_blocks_of_a_sortie(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Egos and instants of a block of 5 s stand or fall together; two sorties at the same times are still two."""
-    records: dict[str, Any] = {
-        "a0": named(10, (1.0, 0), (4.9, 1), (5.0, 0), (6.0, 2)),
-        "b0": named(20, (4.9, 1), (1.0, 0), (5.0, 0), (5.0, 1)),
-        "a1": named(30, (1.0, 0), (5.0, 2), (9.5, 0)),
-        "b1": named(40, (9.5, 0), (1.0, 0), (5.0, 2)),
-    }
-    monkeypatch.setattr(compare, "matched", lambda record, **how: records[record])
-    arms: tuple[Any, Any] = ["a0", "a1"], ["b0", "b1"]
-    first, second, groups = compare.pair_up(*arms, mission=False)
-    keys = [(1.0, 0), (4.9, 1), (5.0, 0), (1.0, 0), (5.0, 2), (9.5, 0)]
-    of_sortie = [0, 0, 0, 1, 1, 1]
-    for arm, names in ((first, (10, 30)), (second, (20, 40))):
-        wanted = [names[k] + t_s / 100 + drone / 1e4 for k, (t_s, drone) in zip(of_sortie, keys, strict=True)]
+def test_fusions_are_paired_by_time_and_drone_and_grouped_by_blocks() -> None:
+    """Egos and instants of a block of 5 s stand or fall together."""
+    one, other = named(10, (1.0, 0), (4.9, 1), (5.0, 0), (6.0, 2)), named(20, (4.9, 1), (1.0, 0), (5.0, 0), (5.0, 1))
+    first, second, groups = compare.pair_up(one, other)
+    keys = [(1.0, 0), (4.9, 1), (5.0, 0)]
+    for arm, name in ((first, 10), (second, 20)):
+        wanted = [name + t_s / 100 + drone / 1e4 for t_s, drone in keys]
         assert [float(m.score[0]) for m in arm] == pytest.approx(wanted)
-    assert groups == [0, 0, 1, 2, 3, 3]
-    without = compare.pair_up(*arms, mission=False, leaving_out={0})
-    assert (len(without[0]), without[2]) == (2, [0, 1])
+    assert groups == [0.0, 0.0, 1.0]
 
 
 def scored(*hits: bool) -> Matched:
@@ -57,18 +45,19 @@ def fake(monkeypatch: pytest.MonkeyPatch, frames: Frames) -> list[tuple[Any, ...
     """Nothing flies: a record says who flew, and its fusions are given by policy, seed and region."""
     calls: list[tuple[Any, ...]] = []
 
-    def run_sortie(scenario: Any, function: Any, seed: int, progress: Any = None) -> Any:
+    def run_sortie(scenario: Any, function: Any, seed: int, progress: Any, **_: Any) -> Any:
         calls.append((scenario.policy.name, function, seed, scenario.perception.scene.seed))
-        if progress is not None:
-            progress(0.25)
-        return SimpleNamespace(policy=scenario.policy.name, seed=seed)
+        progress(0.25)
+        return SimpleNamespace(policy=scenario.policy.name, seed=seed, fingerprint="")
 
     def outcome(made: Any) -> dict[str, Any]:
         return told_outcome(off=made.seed / 10 + (0.5 if made.policy == "silence" else 0.0))
 
-    monkeypatch.setattr(compare, "run_sortie", run_sortie)
-    monkeypatch.setattr(compare, "outcome", outcome)
-    monkeypatch.setattr(compare, "matched", lambda made, mission, begin_s: frames[made.policy, made.seed, mission])
+    def both_matched(made: Any) -> Any:
+        return {area: frames[made.policy, made.seed, area == "mission"] for area in compare.AREAS}
+
+    for name, fake in (("run_sortie", run_sortie), ("outcome", outcome), ("both_matched", both_matched)):
+        monkeypatch.setattr(flight, name, fake)
     return calls
 
 
@@ -101,7 +90,9 @@ def test_each_seed_has_its_town_its_first_policy_and_its_own_gains(monkeypatch: 
     assert calls == [
         (*who, seed, town) for seed, town in ((5, 12), (7, 14)) for who in (("worked", None), ("silence", quiet))
     ]
-    assert told == [("first", 5, 0.25), ("second", 5, 0.25), ("first", 7, 0.25), ("second", 7, 0.25)]
+    end_s = first.scenario.duration_s
+    flights = (("first", 5), ("second", 5), ("first", 7), ("second", 7))
+    assert told == [(*which, t_s) for which in flights for t_s in (0.25, end_s)]
     assert [(s.policy, s.seed, s.town_seed, s.gain, s.record is not None) for s in found.sorties] == [
         ("first", 5, 12, {"full_scene": None, "mission": None}, True),
         ("second", 5, 12, {"full_scene": -1.0, "mission": 1.0}, True),

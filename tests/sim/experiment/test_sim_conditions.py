@@ -14,8 +14,8 @@ from sortie.policies.registry import POLICIES
 from sortie.scenarios.reading.load import ScenarioError, condition_sets, library, load, load_conditions
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli import conditions as commands
-from sortie.sim.experiment.conditions import Cell, best_fixed, fly_all, scenario_of, summarise
-from sortie.sim.experiment.detectors import torch_answers
+from sortie.sim.experiment import detectors
+from sortie.sim.experiment.conditions import Cell, best_fixed, fly_conditions, scenario_of, summarise
 from sortie.sim.folders import RunError
 
 pytestmark = pytest.mark.slow
@@ -109,7 +109,7 @@ def test_conditions_without_a_detector_are_refused_before_anything_flies(tmp_pat
     assert conditions is not None
     told = r"condition poor: perception\.detector is none, conditions are compared by accuracy"
     with pytest.raises(RunError, match=told):
-        fly_all(conditions, ["all-4"], progress=lambda policy, k: pytest.fail("flown"))
+        fly_conditions(conditions, ["all-4"], progress=lambda policy, k: pytest.fail("flown"))
 
 
 def test_conditions_name_those_in_which_drones_left_the_air_and_take_policies_with_parameters(
@@ -137,7 +137,7 @@ def test_a_single_condition_has_no_interval(
     path, out = tmp_path / "one.yaml", tmp_path / "out.json"
     path.write_text(SMALL.partition("  - {name: rich")[0])
     cells = [cell(policy, "poor", ap) for policy, ap in (("all-4", 0.25), ("boxes", 0.375))]
-    monkeypatch.setattr(commands, "fly_all", lambda *_, **__: cells)
+    monkeypatch.setattr(commands, "fly_conditions", lambda *_, **__: cells)
     monkeypatch.setenv("COLUMNS", "200")
     assert command("compare", path, "--policies", "all-4,boxes", "--out", out) == 0
     printed = capsys.readouterr().out
@@ -154,9 +154,10 @@ def test_conditions_are_scored_by_torch_over_the_surrogates_traffic(
     path.write_text(SMALL)
     conditions = load_conditions(path)
     assert conditions is not None
-    ours = fly_all(conditions, ["all-4", "boxes"])
+    ours = fly_conditions(conditions, ["all-4", "boxes"])
     monkeypatch.setattr("sortie.perception.network.detector.TorchDetector", Seer)
-    theirs = fly_all(conditions, ["all-4", "boxes"], detector_of=torch_answers())
+    detectors._answers.cache_clear()
+    theirs = fly_conditions(conditions, ["all-4", "boxes"], by_torch=True)
     assert [c.data_bytes for c in theirs] == [c.data_bytes for c in ours]
     assert all(c.ap > 0.9 for c in theirs)
     assert Seer.asked == 2 * 2 * 5 * 6  # policies, conditions, drones, moments

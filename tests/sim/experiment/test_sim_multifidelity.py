@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 import sqlite3
 from collections.abc import Sequence
@@ -13,13 +14,13 @@ import numpy as np
 import pytest
 
 import sortie
+from sortie.perception.metrics.ap import Matched
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.experiment import detectors, half_width, pools
 from sortie.sim.experiment.compare import BY_BOTH, Contender, compare
-from sortie.sim.experiment.detectors import fly_with_draws
-from sortie.sim.experiment.half_width import FURTHER, Row, Settings, fly_surrogate, gains_between, with_detector
-from sortie.sim.experiment.kept_comparison import compare_to, kept
-from sortie.sim.results.accuracy import both_matched
-from sortie.sim.studies import kept_comparison, multifidelity
+from sortie.sim.experiment.flight import MATCHED, OUTCOME, PROCESSOR_S, Flight, Task, fly, task_of
+from sortie.sim.experiment.half_width import FURTHER, Settings, compare_to, fly_surrogate, gains_between, with_detector
+from sortie.sim.results.accuracy import Both, both_matched
 
 pytestmark = pytest.mark.slow
 
@@ -39,10 +40,6 @@ def contenders(settings: dict[str, object] = SHORT) -> list[Contender]:
     ]
 
 
-def row(by: str, seed: int, gain: float | None, processor_s: float = 1.0) -> Row:
-    return Row(by, seed, {"silence": {METRIC: gain, "ap50.mission": None}}, processor_s, {"worked": {}, "silence": {}})
-
-
 def world(correlation: float, deviation: float = 0.02) -> tuple[list[float], list[float], list[float]]:
     """Gains of 400 seeds by torch and by the surrogate, and of 400 further seeds by the surrogate."""
     z = np.random.default_rng(4).normal(size=(800, 2))
@@ -50,10 +47,16 @@ def world(correlation: float, deviation: float = 0.02) -> tuple[list[float], lis
     return (deviation * torch[:400]).tolist(), z[:400, 0].tolist(), z[400:, 0].tolist()
 
 
+def draws(scenario: sortie.Scenario) -> list[Both]:
+    """The matched boxes of two draws on one flight."""
+    found: list[Both] = fly(task_of(scenario, (MATCHED,), seed=3, seen_by=f"{detectors.DRAWS} 2")).values[MATCHED]
+    return found
+
+
 def test_the_first_draw_is_the_sortie_and_others_differ() -> None:
     """Also of a flight in which a drone is lost."""
     scenario = contenders(EVENTFUL)[0].scenario
-    first, second = fly_with_draws(scenario, None, 3, 2)
+    first, second = draws(scenario)
     recorded = both_matched(run_sortie(scenario, None, 3))
     for area in ("full_scene", "mission"):
         assert first[area].keys() == recorded[area].keys() == second[area].keys()
@@ -65,9 +68,8 @@ def test_the_first_draw_is_the_sortie_and_others_differ() -> None:
 
 def test_another_draw_answers_the_same_moments(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the flight's own draw in its place, it is the recorded sortie again, with a drone that was lost."""
-    made = half_width.fly_with_draws.__globals__["SurrogateDetector"]
-    monkeypatch.setitem(half_width.fly_with_draws.__globals__, "SurrogateDetector", _SameDraw(made))
-    first, again = fly_with_draws(contenders(EVENTFUL)[0].scenario, None, 3, 2)
+    monkeypatch.setattr(detectors, "SurrogateDetector", _SameDraw(detectors.SurrogateDetector))
+    first, again = draws(contenders(EVENTFUL)[0].scenario)
     for area, matches in first.items():
         assert matches.keys() == again[area].keys()
         assert all(np.array_equal(m.score, again[area][k].score) for k, m in matches.items())
@@ -95,9 +97,8 @@ def test_gains_are_those_of_a_plain_comparison() -> None:
 
 def test_a_gain_is_the_mean_over_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     both = contenders()
-    monkeypatch.setattr(
-        multifidelity, "fly_with_draws", lambda scenario, *rest: [scenario.policy.name + d for d in "ab"]
-    )
+    rows = [[Flight("", "", {MATCHED: [c.label + d for d in "ab"], PROCESSOR_S: 1.0}) for c in both]]
+    monkeypatch.setattr(half_width, "fly_all", lambda tasks, kept: rows[0])
     values = {("workeda", "silencea"): 0.1, ("workedb", "silenceb"): 0.4}
 
     def gains(policies: Sequence[str], matched: Sequence[object]) -> dict[str, dict[str, float | None]]:
@@ -124,18 +125,23 @@ def flights(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     torch, cheap, further = world(0.95)
     flown: list[tuple[str, int]] = []
 
-    def by_torch(contenders: Sequence[Contender], seed: int) -> Row:
-        assert {c.scenario.perception.detector for c in contenders} == {"torch"}
-        flown.append(("torch", seed))
-        return row("torch", seed, torch[seed], 15.0)
+    def fly(task: Task, *_: object) -> Flight:
+        scenario, seed = json.loads(task.scenario), task.seed
+        detector, policy = scenario["perception"]["detector"], scenario["policy"]["name"]
+        assert detector == ("torch" if task.group else "surrogate")
+        gain = torch[seed] if detector == "torch" else further[seed - FURTHER - 1] if seed > FURTHER else cheap[seed]
+        if policy == "silence":
+            flown.append((detector, seed))
+        boxes = Matched(np.array([gain if policy == "silence" else 0.0]), np.array([True]), 1)
+        took_s = 0.0 if policy == "worked" else 15.0 if detector == "torch" else 1.0
+        values = {MATCHED: [{"full_scene": {(0.0, 0): boxes}, "mission": {}}], OUTCOME: {}, PROCESSOR_S: took_s}
+        return Flight("", "", values, task.key)
 
-    def by_surrogate(contenders: Sequence[Contender], seed: int) -> Row:
-        assert {c.scenario.perception.detector for c in contenders} == {"surrogate"}
-        flown.append(("surrogate", seed))
-        return row("surrogate", seed, further[seed - FURTHER - 1] if seed > FURTHER else cheap[seed])
+    def gains(policies: Sequence[str], matched: Sequence[Both]) -> dict[str, dict[str, float | None]]:
+        return {"silence": {METRIC: float(matched[1]["full_scene"][0.0, 0].score[0]), "ap50.mission": None}}
 
-    monkeypatch.setattr(half_width, "fly_torch", by_torch)
-    monkeypatch.setattr(half_width, "fly_surrogate", by_surrogate)
+    monkeypatch.setattr(pools, "fly", fly)
+    monkeypatch.setattr(half_width, "gains_between", gains)
     return flown
 
 
@@ -176,48 +182,25 @@ def test_a_comparison_that_goes_on_flies_no_more_than_the_seeds_asked_now(
 
     with pytest.raises(Killed):
         compare_to(contenders(), narrow, path, kill)
-    found = compare_to(contenders(), Settings(0.004, most=16), path).precision
-    assert (found.paired, found.reached, torch()) == (16, False, 16), "24 were planned"
-    assert compare_to(contenders(), Settings(0.004, most=12), path).precision.paired == torch() == 16
-    assert compare_to(contenders(), Settings(0.004, most=24), path).precision.paired == 24
+    for most, flown in ((16, 16), (12, 16), (24, 24)):  # 24 were planned
+        found = compare_to(contenders(), Settings(0.004, most=most), path).precision
+        assert (found.paired, found.reached, torch()) == (most, most == 24, flown)
     assert len(set(flights)) == len(flights), "nothing is flown twice"
 
 
 def test_files_of_others_are_refused_and_stay_as_they_are(flights: list[tuple[str, int]], tmp_path: Path) -> None:
-    ours, text, other = (tmp_path / name for name in ("c.sqlite", "text", "campaign.sqlite"))
-    compare_to(contenders(), Settings(0.02), ours)
+    text, other = (tmp_path / name for name in ("text", "other.sqlite"))
     text.write_text("no database at all, but long enough to be read as one" * 20)
     with sqlite3.connect(other) as db:
-        db.execute("CREATE TABLE rows (run INTEGER)")
-    for path, asked, words in (
-        (ours, EVENTFUL, "holds a comparison of other policies, another scenario"),
-        (text, SHORT, r"text: no comparison there \(file is not a database\)"),
-        (other, SHORT, r"campaign\.sqlite: no comparison there \(it has other tables\)"),
+        db.execute("CREATE TABLE theirs (run INTEGER)")
+    for path, words in (
+        (text, r"text: is broken \(file is not a database\); remove it to fly again"),
+        (other, r"other\.sqlite: holds the table theirs of somebody else; name another file"),
     ):
         before = path.read_bytes()
         with pytest.raises(sortie.SortieError, match=words):
-            compare_to(contenders(asked), Settings(0.02), path)
+            compare_to(contenders(), Settings(0.02), path)
         assert path.read_bytes() == before
-
-
-def test_a_damaged_row_names_its_file(tmp_path: Path) -> None:
-    for number, content in enumerate(("{cut", '{"x": 1}', "[1]")):
-        path = tmp_path / f"{number}.sqlite"
-        with kept(path, "a") as (_, db):
-            db.execute("INSERT INTO flown VALUES ('row', ?)", (content,))
-        with pytest.raises(sortie.SortieError, match=r"\d\.sqlite: a row is damaged \("):
-            kept(path, "a").__enter__()
-
-
-def test_another_version_policy_or_pilot_is_another_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = contenders()
-    known = {kept_comparison.identity(base, 12), kept_comparison.identity(base, 8)}
-    known.add(kept_comparison.identity([base[0], base[1]._replace(function=mine)], 12))
-    known.add(kept_comparison.identity(base[::-1], 12))
-    known.add(kept_comparison.identity(contenders({**SHORT, "seed": 2}), 12))
-    monkeypatch.setattr(kept_comparison, "codes_here", lambda: ("0.2.0", "0.2.0 torch 2.14"))
-    known.add(kept_comparison.identity(base, 12))
-    assert len(known) == 6
 
 
 def mine(view: sortie.FleetView, *, x: object = 0) -> list[sortie.Directive]:
@@ -241,34 +224,24 @@ def typed_in() -> Any:
     return space["decide"]
 
 
-def identified(policy: Any) -> str:
-    scenario = contenders()[0].scenario
-    return kept_comparison.identity([Contender("mine", scenario), Contender("yours", scenario, policy)], 12)
+def task(policy: Any) -> Task:
+    return task_of(contenders()[0].scenario, (MATCHED,), function=policy, named=True)
 
 
-def test_functions_of_other_names_or_bound_values_are_other_comparisons() -> None:
-    policies = [mine, others, *(functools.partial(mine, x=x) for x in (0.1, 0.5, "0.1", None))]
-    assert len({identified(policy) for policy in policies}) == len(policies)
-    assert identified(functools.partial(mine, x=0.1)) == identified(functools.partial(mine, x=0.1))
+def test_functions_of_other_names_or_bound_values_are_other_flights() -> None:
+    policies = [None, mine, others, *(functools.partial(mine, x=x) for x in (0.1, 0.5, "0.1", None))]
+    assert len({task(policy).key for policy in policies}) == len(policies)
+    assert task(functools.partial(mine, x=0.1)).key == task(functools.partial(mine, x=0.1)).key
+    assert list(task(mine).files) == [__file__]
 
 
 def test_a_policy_that_its_name_and_its_file_do_not_decide_is_not_kept() -> None:
     nameless = (lambda view: [], Held(), Held().__call__, functools.wraps(mine)(lambda view: []), np.sin, typed_in())
     bound = (functools.partial(mine, x=np.zeros(2)), functools.partial(Held(), x=1))
     for policy in (*nameless, *bound):
-        with pytest.raises(
-            sortie.SortieError, match=r"policy yours, .*: must be a function at the top of a file, or a"
-        ):
-            identified(policy)
-
-
-def test_a_changed_file_of_ones_own_is_another_comparison(tmp_path: Path) -> None:
-    own, known = tmp_path / "mine.py", set()
-    for text in ("first", "second"):
-        own.write_text(f"def decide(view):\n    return []  # {text}\n")
-        mine = sortie.load("track_target", {**SHORT, "policy.name": f"{own}:decide", "policy.params": {}})
-        known.add(kept_comparison.identity([Contender("mine", mine)], 12))
-    assert len(known) == 2
+        with pytest.raises(sortie.SortieError, match=r"policy .*: must be a function at the top of a file, or a"):
+            task(policy)
+        assert not task_of(contenders()[0].scenario, (MATCHED,), function=policy).is_kept
 
 
 def test_what_the_surrogate_cannot_fly_is_refused_before_torch_flies(monkeypatch: pytest.MonkeyPatch) -> None:

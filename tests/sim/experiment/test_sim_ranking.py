@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,11 @@ from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli import app
 from sortie.sim.experiment import flights, rank
 from sortie.sim.experiment.conditions import scenario_of
-from sortie.sim.experiment.flights import KEPT, Flight, fly
+from sortie.sim.experiment.flight import Flight, Task, fly_in_worker
+from sortie.sim.experiment.flights import fly
 from sortie.sim.experiment.stored import made_now, read_results, save_results
 from sortie.sim.experiment.suite import MISSIONS, NEWEST, TROUBLES, digest_of, further_conditions, name_of, suite_text
 from sortie.sim.experiment.verdict import Verified
-from sortie.sim.experiment.work import RunResult, Task, fly_batch
 from sortie.sim.folders import RunError
 
 pytestmark = pytest.mark.slow
@@ -55,17 +56,17 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A folder with a small suite and a policy; flights fly in this process, and are counted."""
     flown: list[int] = []
 
-    class Engine:
-        def results(self, code: str, tasks: Iterator[Task]) -> Iterator[list[RunResult]]:
+    class Pool:
+        def rows(self, tasks: Iterator[Task]) -> Iterator[list[tuple[Task, Flight]]]:
             for task in tasks:
-                flown.append(task[0])
-                yield fly_batch(code, [task])[0]
+                flown.append(task.number)
+                yield [(task, fly_in_worker(task))]
 
     @contextmanager
-    def open_engine(workers: int) -> Iterator[Engine]:
-        yield Engine()
+    def processes(workers: int) -> Iterator[Pool]:
+        yield Pool()
 
-    monkeypatch.setattr(flights, "open_engine", open_engine)
+    monkeypatch.setattr(flights, "processes", processes)
     monkeypatch.setattr(rank, "verify", lambda policy: FINE)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.yaml").write_text(SMALL)
@@ -141,32 +142,54 @@ def test_further_draws_are_of_the_same_kinds_and_share_no_town_with_the_suite() 
 
 
 def test_an_interrupted_ranking_goes_on_where_it_was(here: list[int]) -> None:
-    first = fly(small(), ["boxes"], Path("out"))
-    file = Path("out") / KEPT
-    lines = file.read_bytes().splitlines()
-    file.write_bytes(b"\n".join(lines)[:-7])  # the last line was cut off
+    kept = Path("out.sqlite")
+    first = fly(small(), {"boxes": None}, kept=kept)
+    with closing(sqlite3.connect(kept)) as db, db:
+        db.execute("DELETE FROM flights WHERE key = ?", (first["boxes"]["rich"].key,))
     assert len(here) == 2
     told: list[int] = []
-    again = fly(small(), ["boxes"], Path("out"), progress=told.append)
+    again = fly(small(), {"boxes": None}, kept=kept, progress=told.append)
     assert (len(here), told) == (3, [1, 2])
     prints = [{c: f.fingerprint for c, f in found["boxes"].items()} for found in (first, again)]
     assert prints[0] == prints[1]
     assert again["boxes"]["poor"] == first["boxes"]["poor"]
-    fly(small(), ["boxes"], Path("out"))
+    fly(small(), {"boxes": None}, kept=kept)
     assert len(here) == 3, "nothing is missing"
 
 
 def test_a_flight_is_flown_again_after_a_change_of_the_policys_file_and_after_a_failure(here: list[int]) -> None:
-    found = fly(small(), ["mine.py:boxes", "mine.py:fails"], Path("out"))
+    kept = Path("out.sqlite")
+    found = fly(small(), dict.fromkeys(["mine.py:boxes", "mine.py:fails"]), kept=kept)
     assert not found["mine.py:boxes"]["rich"].error
     failed = found["mine.py:fails"]["rich"]
     assert "RuntimeError: boom" in failed.error
     assert set(failed.values.values()) == {None}
-    fly(small(), ["mine.py:boxes", "mine.py:fails"], Path("out"))
+    fly(small(), dict.fromkeys(["mine.py:boxes", "mine.py:fails"]), kept=kept)
     assert len(here) == 4 + 1
     Path("mine.py").write_text(MINE + "# changed\n")
-    fly(small(), ["mine.py:boxes"], Path("out"))
+    fly(small(), {"mine.py:boxes": None}, kept=kept)
     assert len(here) == 5 + 2
+
+
+def test_a_flight_is_flown_again_after_a_change_of_a_file_that_its_policy_opened(here: list[int]) -> None:
+    """Which no scenario names: when the policy was loaded, or in flight."""
+    kept = Path("out.sqlite")
+    loads = "GAIN = float((Path(__file__).parent / 'gain.txt').read_text())\n"
+    Path("gain.txt").write_text("0.5")
+    Path("reads.py").write_text(f"from pathlib import Path\n{loads}{MINE}")
+    Path("gain2.txt").write_text("0.5")
+    in_flight = MINE.replace("    boxes = ", f"    open({str(Path('gain2.txt').resolve())!r}).close()\n    boxes = ")
+    Path("opens.py").write_text(in_flight)
+    for number in range(2):
+        found = fly(small(), dict.fromkeys(["reads.py:boxes", "opens.py:boxes"]), kept=kept)
+        assert not [f.error for of in found.values() for f in of.values() if f.error]
+        assert len(here) == 4, f"try {number}"
+    Path("gain.txt").write_text("0.6")
+    fly(small(), {"reads.py:boxes": None}, kept=kept)
+    assert len(here) == 6
+    Path("gain2.txt").write_text("0.6")
+    fly(small(), {"opens.py:boxes": None}, kept=kept)
+    assert len(here) == 8
 
 
 def test_a_callable_gets_the_budget_and_flies_as_its_name_does(here: list[int]) -> None:
@@ -176,10 +199,9 @@ def test_a_callable_gets_the_budget_and_flies_as_its_name_does(here: list[int]) 
         budgets.add(rho)
         return list(POLICIES["boxes"](view))
 
-    found = flights.fly_callable(small(), decide)
+    found = fly(small(), {"mine": decide, "boxes": None})
     assert budgets == {0.02, 0.25}
-    named = fly(small(), ["boxes"], Path("out"))["boxes"]
-    scores = [[flight.values["ap50.full_scene"] for flight in each.values()] for each in (found, named)]
+    scores = [[flight.values["ap50.full_scene"] for flight in each.values()] for each in found.values()]
     assert scores[0] == scores[1]
 
 
@@ -201,7 +223,7 @@ def test_own_flights_are_all_that_a_ranking_costs(
     here: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     others = ["worked", "silence"]
-    flown = fly(small(), others, Path("elsewhere"))
+    flown = fly(small(), dict.fromkeys(others))
     save_results(made_now("small", digest_of("small.yaml"), flown, dict.fromkeys(others, FINE)), tmp_path)
     here.clear()
     monkeypatch.setattr(rank, "read_results", lambda suite, digest: read_results(suite, digest, tmp_path))

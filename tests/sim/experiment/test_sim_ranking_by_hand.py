@@ -15,7 +15,8 @@ from rich.table import Table
 from sortie.scenarios.intervals import Estimate
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.experiment import board, rank
-from sortie.sim.experiment.flights import KEPT, METRICS, Flight, _Kept
+from sortie.sim.experiment.flight import Flight
+from sortie.sim.experiment.flights import METRICS
 from sortie.sim.experiment.places import Control, PairDifference, Standing, standings
 from sortie.sim.experiment.rank import Ranked
 from sortie.sim.experiment.stored import made_now, read_results, save_results
@@ -228,17 +229,6 @@ def test_a_standing_has_the_mean_of_each_figure_over_the_conditions_that_were_fl
 # --- what is kept ---------------------------------------------------------------------------------------------------
 
 
-def test_flights_come_back_from_disk_figure_by_figure(tmp_path: Path) -> None:
-    kept = _Kept(tmp_path / KEPT)
-    kept.add("k1", flight(0.5))
-    kept.add("k2", flight(error="boom"))
-    kept.add("k3", replace(flight(2.0), values=dict.fromkeys(METRICS) | {"switches": 3.0}))
-    again = _Kept(tmp_path / KEPT).flights
-    assert list(again) == ["k1", "k3"]
-    assert again["k1"] == flight(0.5)
-    assert {name for name, value in again["k3"].values.items() if value is not None} == {"switches"}
-
-
 def test_stored_results_come_back_figure_by_figure_and_those_of_another_suite_do_not(tmp_path: Path) -> None:
     found = ranking()
     results = made_now("small", "abc", found.flights, found.verified)
@@ -258,16 +248,16 @@ def test_stored_results_come_back_figure_by_figure_and_those_of_another_suite_do
 def test_stored_results_are_compared_with_a_flight_of_the_reference_in_the_first_condition(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked: list[tuple[list[str], list[str], Any]] = []
+    asked: list[tuple[list[str], dict[str, None], Any]] = []
 
-    def fly(suite: ConditionSet, policies: list[str], folder: Any) -> Any:
-        asked.append(([c.name for c in suite.conditions], list(policies), folder))
+    def fly(suite: ConditionSet, decides: dict[str, None], kept: Any) -> Any:
+        asked.append(([c.name for c in suite.conditions], decides, kept))
         return {"worked": {"poor": replace(flight(1.0), values={**flight().values, "policy_eval_us.p50": 50.0})}}
 
     monkeypatch.setattr(rank, "fly", fly)
     stored = made_now("small", "abc", {"worked": {"poor": flight(1.0), "rich": flight(2.0)}}, {})
     assert rank._checked(stored, _suite("poor", "rich"), Path("out")) == (False, 2.5)
-    assert asked == [(["poor"], ["worked"], Path("out"))]
+    assert asked == [(["poor"], {"worked": None}, Path("out"))]
     other = made_now("small", "abc", {"worked": {"poor": replace(flight(1.0), fingerprint="x")}}, {})
     assert rank._checked(other, _suite("poor", "rich"), Path("out")) == (True, 2.5)
 

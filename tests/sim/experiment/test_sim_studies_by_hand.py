@@ -19,9 +19,9 @@ from sortie.perception.metrics.ap import Matched
 from sortie.policies.contract import Directive, Disc, Reposition, Representation
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli import conditions as command
+from sortie.sim.experiment import conditions, flight
 from sortie.sim.experiment.conditions import Cell
 from sortie.sim.results.views import Decision
-from sortie.sim.studies import conditions
 from sortie.sim.studies.replay import compare
 from sortie.sim.studies.replayed import NO_PEER, Difference, Replay
 
@@ -41,36 +41,35 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     """Nothing flies: of two boxes the surer one is a hit under seed 3 alone; figures follow from the seed."""
     calls: list[tuple[Any, ...]] = []
 
-    def run_sortie(scenario: Any, function: Any, seed: int, detector_of: Any) -> Any:
-        calls.append((scenario.policy.name, scenario.policy.params, scenario.fleet.drones, seed, detector_of))
-        return SimpleNamespace(seed=seed, policy=scenario.policy.name)
+    def run_sortie(scenario: Any, function: Any, seed: int, **_: Any) -> Any:
+        calls.append((scenario.policy.name, scenario.policy.params, scenario.fleet.drones, seed))
+        return SimpleNamespace(seed=seed, policy=scenario.policy.name, fingerprint="")
 
-    def matched(made: Any, mission: bool) -> dict[tuple[float, int], Matched]:
-        hits = [made.seed == 3, made.policy == "all-4"]
-        return {(1.0 + mission, 0): Matched(np.array([0.9, 0.8]), np.array(hits), 2 if mission else 4)}
+    def both_matched(made: Any) -> dict[str, dict[tuple[float, int], Matched]]:
+        hits = np.array([made.seed == 3, made.policy == "all-4"])
+        score = np.array([0.9, 0.8])
+        return {"full_scene": {(1.0, 0): Matched(score, hits, 4)}, "mission": {(2.0, 0): Matched(score, hits, 2)}}
 
     def outcome(made: Any) -> dict[str, Any]:
         made_up = told_outcome(off=float(made.seed))
         return made_up | {"deadline_miss_rate": None if made.policy == "silence" else 0.1 * made.seed}
 
-    for name, fake in (("run_sortie", run_sortie), ("matched", matched), ("outcome", outcome)):
-        monkeypatch.setattr(conditions, name, fake)
+    for name, fake in (("run_sortie", run_sortie), ("both_matched", both_matched), ("outcome", outcome)):
+        monkeypatch.setattr(flight, name, fake)
     return calls
 
 
 def test_every_policy_flies_every_condition_on_each_seed_within_its_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     """AP is of both seeds' fusions together; bytes and energy are means: 22,000 B · (4 + 5) / 2, 11,600 J · 4.5."""
     calls, told = flown(monkeypatch), []
-    maker = object()
-    cells = conditions.fly_all(suite(), ["all-4", "silence"], progress=lambda *p: told.append(p), detector_of=maker)
-    assert [call[:4] for call in calls] == [
+    cells = conditions.fly_conditions(suite(), ["all-4", "silence"], progress=lambda *p: told.append(p))
+    assert calls == [
         (policy, {"received_budget": budget} if policy == "all-4" else {}, drones, seed)
         for policy in ("all-4", "silence")
         for drones, budget in ((3, 0.02), (5, 0.25))
         for seed in (3, 4)
     ]
-    assert {call[4] for call in calls} == {maker}
-    assert told == [("all-4", 1), ("all-4", 2), ("silence", 1), ("silence", 2)]
+    assert told == [(policy, flights) for policy in ("all-4", "silence") for flights in (1, 2, 3, 4)]
     wanted = [(policy, condition) for policy in ("all-4", "silence") for condition in ("poor", "rich")]
     assert [(c.policy, c.condition) for c in cells] == wanted
     for c in cells:
@@ -86,9 +85,9 @@ def test_every_policy_flies_every_condition_on_each_seed_within_its_budget(monke
 def test_a_miss_rate_is_the_mean_over_the_seeds_that_sent_something(monkeypatch: pytest.MonkeyPatch) -> None:
     flown(monkeypatch)
     monkeypatch.setattr(
-        conditions, "outcome", lambda made: told_outcome() | {"deadline_miss_rate": 0.25 if made.seed == 3 else None}
+        flight, "outcome", lambda made: told_outcome() | {"deadline_miss_rate": 0.25 if made.seed == 3 else None}
     )
-    assert [c.miss_rate for c in conditions.fly_all(suite(), ["worked"])] == [0.25, 0.25]
+    assert [c.miss_rate for c in conditions.fly_conditions(suite(), ["worked"])] == [0.25, 0.25]
 
 
 CELLS = [
@@ -109,7 +108,7 @@ def test_a_condition_without_a_car_is_named_and_kept_as_null(monkeypatch: pytest
     """And a miss rate is the mean over the conditions that have one."""
     blind = [c if c.condition == "rich" else Cell(c.policy, "poor", math.nan, 1.0, 2.0, 0.3) for c in CELLS]
     shown: list[Any] = []
-    monkeypatch.setattr(command, "fly_all", lambda *a, **k: blind)
+    monkeypatch.setattr(command, "fly_conditions", lambda *a, **k: blind)
     monkeypatch.setattr(command, "out", SimpleNamespace(width=150, print=lambda what, **how: shown.append(what)))
     command.compare_conditions(suite(), ["all-4", "worked", "silence"], [], tmp_path / "c.json")
     assert any(isinstance(s, str) and s.startswith("no car was to be seen in poor:") for s in shown)
