@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,19 +12,18 @@ import numpy as np
 
 from sortie.policies.contract import Policy, PolicyError
 from sortie.policies.registry import POLICIES, resolve
-from sortie.scenarios.reading.load import load, load_conditions
+from sortie.scenarios.reading.load import condition_sets, load, load_conditions, read
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.experiment.conditions import scenario_of
 from sortie.sim.experiment.flight import Flight
 from sortie.sim.experiment.flights import BY_TORCH, Flights, fly
 from sortie.sim.experiment.places import Control, PairDifference, Standing, standings
 from sortie.sim.experiment.stored import Results, read_results
-from sortie.sim.experiment.suite import NEWEST, digest_of, further_conditions, name_of
 from sortie.sim.experiment.verdict import Verified, verify
 from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version
 
-SUITE = name_of(NEWEST)
+SUITE = "ranking_v1"
 REFERENCE = "worked"
 """The policy whose flight in the first condition is compared with the stored one: equal records show that the stored
 results are those of this version, and the times of its decisions how fast this machine is beside the other."""
@@ -207,18 +207,27 @@ def rank(
     )
 
 
-def _further(suite: str, draws: int | None) -> list[Condition]:
-    """The conditions that only the surrogate flies.
+def digest_of(suite: str) -> str:
+    """The first twelve hex digits of SHA-256 over a suite's file: what a citation names.
 
     Raises:
-        RunError: some are asked for, and there is no generator that draws them.
+        ScenarioError: no such file.
     """
-    found = further_conditions(suite, FURTHER if draws is None else draws)
-    if draws and not found:
-        raise RunError(
-            f"--further {draws}: --suite {suite} is not drawn by Sortie, so there are no further draws of it"
-        )
-    return found
+    return hashlib.sha256(read(suite)[0].encode()).hexdigest()[:12]
+
+
+def _further(suite: str, draws: int | None) -> list[Condition]:
+    """The conditions that only the surrogate flies: further draws of the suite, which lie beside it in the library.
+
+    Raises:
+        RunError: more are asked for than there are.
+    """
+    more = load_conditions(f"{suite}_further") if f"{suite}_further" in condition_sets() else None
+    found = () if more is None else more.conditions
+    draw = [int(c.name.rpartition("_")[2]) for c in found]
+    if draws is not None and draws > max(draw, default=0):
+        raise RunError(f"--further {draws}: --suite {suite} has {max(draw, default=0)} further draws")
+    return [c for c, number in zip(found, draw, strict=True) if number <= (FURTHER if draws is None else draws)]
 
 
 def _stage(

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import sortie
 from sortie.policies.registry import POLICIES
-from sortie.scenarios.reading.load import condition_sets, load_conditions, read
+from sortie.scenarios.reading.load import load_conditions
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli import app
 from sortie.sim.experiment import flights, rank
@@ -23,7 +21,6 @@ from sortie.sim.experiment.conditions import scenario_of
 from sortie.sim.experiment.flight import Flight, Task, fly_in_worker
 from sortie.sim.experiment.flights import fly
 from sortie.sim.experiment.stored import made_now, read_results, save_results
-from sortie.sim.experiment.suite import MISSIONS, NEWEST, TROUBLES, digest_of, further_conditions, name_of, suite_text
 from sortie.sim.experiment.verdict import Verified
 from sortie.sim.folders import RunError
 
@@ -81,30 +78,6 @@ def small() -> ConditionSet:
 # --- the suite -----------------------------------------------------------------------------------
 
 
-def test_the_generator_gives_the_suites_file_and_a_released_one_never_changes() -> None:
-    name = name_of(NEWEST)
-    assert name in condition_sets()
-    assert read(name)[0] == suite_text(NEWEST)
-    assert digest_of("ranking_v1") == "4d7e931438a5"
-
-
-def test_the_suite_crosses_troubles_and_missions_and_draws_all_else() -> None:
-    suite = rank.load_suite("ranking_v1")
-    names = [c.name for c in suite.conditions]
-    assert names == [f"{mission}_{trouble}" for mission in MISSIONS for trouble in TROUBLES]
-    flown = [scenario_of(suite, c, "all-4") for c in suite.conditions]
-    assert Counter(s.fleet.drones for s in flown) == {4: 10, 5: 10, 6: 10}
-    assert len({s.perception.scene.seed for s in flown}) == len({s.seed for s in flown}) == 30
-    budgets = np.sort(np.log([c.budget for c in suite.conditions]))
-    assert np.diff(budgets).max() < 2 * np.log(100) / 30, "spread evenly: one in each thirtieth of the range"
-    for condition, scenario in zip(suite.conditions, flown, strict=True):
-        mission, _, trouble = condition.name.partition("_")
-        assert (condition.metric == "mission") == (mission != "search")
-        assert len(scenario.events) == (trouble not in ("clear", "weak", "tired"))
-        assert (scenario.fleet.battery.initial_soc < 0.3) == (trouble == "tired")
-        assert scenario.policy.invariants.count("\n") == 1
-
-
 def test_the_suite_flies_under_every_policy_within_the_budget() -> None:
     suite = rank.load_suite("ranking_v1")
     for policy in POLICIES:
@@ -126,16 +99,11 @@ def test_a_set_with_seeds_of_its_own_is_no_suite(here: object) -> None:
         rank.load_suite("track_target")
 
 
-def test_further_draws_are_of_the_same_kinds_and_share_no_town_with_the_suite() -> None:
-    suite, more = rank.load_suite("ranking_v1"), further_conditions("ranking_v1", 2)
-    assert [c.name for c in more] == [f"{c.name}_{k}" for k in (1, 2) for c in suite.conditions]
-    assert [c.metric for c in more] == [c.metric for c in suite.conditions] * 2
-    towns = [o for c in (*suite.conditions, *more) for o in c.set if o.startswith("perception.scene.seed=")]
-    assert len(set(towns)) == 90
-    assert further_conditions("ranking_v1", 1) == more[:30]
-    assert further_conditions("small.yaml", 2) == []
-    wide = suite.model_copy(update={"conditions": tuple(more)})
-    assert scenario_of(wide, more[0], "all-4").perception.detector == "surrogate"
+def test_further_draws_come_with_a_suite_of_the_library() -> None:
+    assert [len(rank._further("ranking_v1", draws)) for draws in (None, 0, 1, 10)] == [90, 0, 30, 300]
+    assert rank._further("small.yaml", None) == []
+    with pytest.raises(RunError, match="--further 11: --suite ranking_v1 has 10 further draws"):
+        rank._further("ranking_v1", 11)
 
 
 # --- flights -------------------------------------------------------------------------------------
@@ -209,7 +177,7 @@ def test_a_callable_gets_the_budget_and_flies_as_its_name_does(here: list[int]) 
 
 
 def test_the_stored_results_are_of_the_newest_suite_and_whole() -> None:
-    found = read_results(rank.SUITE, digest_of(rank.SUITE))
+    found = read_results(rank.SUITE, rank.digest_of(rank.SUITE))
     assert found is not None
     assert set(found.flights) <= set(POLICIES)
     assert rank.REFERENCE in found.flights
@@ -224,7 +192,7 @@ def test_own_flights_are_all_that_a_ranking_costs(
 ) -> None:
     others = ["worked", "silence"]
     flown = fly(small(), dict.fromkeys(others))
-    save_results(made_now("small", digest_of("small.yaml"), flown, dict.fromkeys(others, FINE)), tmp_path)
+    save_results(made_now("small", rank.digest_of("small.yaml"), flown, dict.fromkeys(others, FINE)), tmp_path)
     here.clear()
     monkeypatch.setattr(rank, "read_results", lambda suite, digest: read_results(suite, digest, tmp_path))
     ranking = sortie.rank("mine.py:boxes", suite="small.yaml", against=others, folder="out")
@@ -237,7 +205,7 @@ def test_own_flights_are_all_that_a_ranking_costs(
     assert again.ranked.stored is None
     worked = flown["worked"]["poor"]
     flown["worked"]["poor"] = Flight("", "of another version", {**worked.values, "policy_eval_us.p50": 1e-3})
-    save_results(made_now("small", digest_of("small.yaml"), flown, dict.fromkeys(others, FINE)), tmp_path)
+    save_results(made_now("small", rank.digest_of("small.yaml"), flown, dict.fromkeys(others, FINE)), tmp_path)
     ranking = sortie.rank("mine.py:boxes", suite="small.yaml", against=others, folder="out")
     assert ranking.ranked.stale
     assert "flies otherwise" in str(ranking.summary())
@@ -252,7 +220,7 @@ def test_own_flights_are_all_that_a_ranking_costs(
 def test_a_ranking_by_torch_flies_the_surrogate_too(here: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rank, "BY_TORCH", ("perception.sample_rate_hz=1",))  # cheaper than torch, and other flights
     more = [c.model_copy(update={"name": f"{c.name}_{k}"}) for k in range(4) for c in small().conditions]
-    monkeypatch.setattr(rank, "further_conditions", lambda suite, draws: more[: 2 * draws])
+    monkeypatch.setattr(rank, "_further", lambda suite, draws: more[: 2 * (3 if draws is None else draws)])
     ranking = sortie.rank(["boxes", POLICIES["silence"]], suite="small.yaml", against=[], by_torch=True, folder="out")
     assert len(here) == 2 + 2 + 2 * 3, "by torch; by the surrogate in the same conditions and three further draws"
     control = ranking.ranked.control
@@ -275,7 +243,7 @@ def test_the_command_prints_keeps_and_says_by_its_exit_code_what_failed(here: li
     for words in ("mine.py:boxes takes place", "failed in rich: PolicyError", failed):
         assert words in " ".join(done.output.split())
     kept = json.loads((Path("out") / "ranking.json").read_text())
-    assert kept["digest"] == digest_of("small.yaml")
+    assert kept["digest"] == rank.digest_of("small.yaml")
     assert {row["policy"] for row in kept["policies"]} == {"mine.py:boxes", "mine.py:fails", "silence"}
     assert "boom" in kept["flights"]["mine.py:fails"]["rich"]["error"]
     assert (Path("out") / "ranking.png").read_bytes().startswith(b"\x89PNG")
@@ -294,7 +262,7 @@ WRONG: list[tuple[dict[str, object], str]] = [
     ({"policies": "best-2(rho=0.1)"}, "rho"),
     (
         {"policies": "boxes", "against": [], "by_torch": True, "further": 2},
-        "--further 2: --suite small.yaml is not drawn",
+        "--further 2: --suite small.yaml has 0 further draws",
     ),
     (
         {"policies": "boxes", "by_torch": True, "further": -1},

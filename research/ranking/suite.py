@@ -5,18 +5,17 @@ magnitude, sizes of fleet, formations and towns over what there is; which condit
 town and a seed of its own, so that conditions are independent draws. `scenarios/library/ranking_v1.yaml` is the text that
 `suite_text(1)` returns; a version that was released is never drawn anew.
 
-    python -m sortie.sim.experiment.suite        writes the newest version into the library
+    python -m research.ranking.suite        writes the newest version into the library, and its further draws beside it
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 
-from sortie.scenarios.reading.load import condition_sets, read
+from sortie.scenarios.reading.load import condition_sets
 from sortie.scenarios.schema.conditions import Condition
 from sortie.scenarios.streams import stream
 from sortie.sim.folders import write_text
@@ -24,6 +23,8 @@ from sortie.sim.folders import write_text
 SEEDS = {1: 211070638063016}
 """By version: drawn by the operating system's random numbers when the version was made, before any policy flew in it."""
 NEWEST = max(SEEDS)
+FURTHER = 10
+"""Further draws that come with a suite: `sortie rank --by-torch` has the surrogate fly some of them as well."""
 SECONDS = 20
 MISSIONS = ("search", "track", "handover")
 """`handover` searches first, and tracks from a third of the flight on."""
@@ -58,15 +59,6 @@ def name_of(version: int) -> str:
     return f"ranking_v{version}"
 
 
-def digest_of(suite: str) -> str:
-    """The first twelve hex digits of SHA-256 over a suite's file: what a citation names.
-
-    Raises:
-        ScenarioError: no such file.
-    """
-    return hashlib.sha256(read(suite)[0].encode()).hexdigest()[:12]
-
-
 def suite_text(version: int) -> str:
     """A suite's file, drawn from its version's seed.
 
@@ -74,25 +66,26 @@ def suite_text(version: int) -> str:
         >>> suite_text(1).count("{name: ")
         30
     """
-    lines = []
-    for c in draw_conditions(version):
-        told = ", ".join(f'"{one}"' if set(one) & set("[{") else one for one in c.set)
-        lines.append(f"  - {{name: {c.name}, budget: {c.budget:.3g}, metric: {c.metric}, set: [{told}]}}\n")
     head = _HEAD.format(version=version, seed=SEEDS[version], seconds=SECONDS, safety=r"\n".join(SAFETY))
-    return "".join([head, *lines])
+    return "".join([head, *map(_line, draw_conditions(version))])
 
 
-def further_conditions(suite: str, draws: int) -> list[Condition]:
-    """The conditions of as many more draws of a suite, each with the number of its draw behind its name; none for a suite that
-    this file did not draw."""
-    version = next((v for v in SEEDS if name_of(v) == suite), None)
-    if version is None:
-        return []
-    return [
-        c.model_copy(update={"name": f"{c.name}_{draw}"})
-        for draw in range(1, draws + 1)
-        for c in draw_conditions(version, draw)
-    ]
+def further_text(version: int) -> str:
+    """The file of a suite's further draws, each with the number of its draw behind its conditions' names."""
+    head = _HEAD.format(version=version, seed=SEEDS[version], seconds=SECONDS, safety=r"\n".join(SAFETY))
+    told = (
+        f"# {FURTHER} further draws of the suite ranking_v{version}: the surrogate alone flies them, with `sortie rank --by-torch`.\n"
+        f"# Drawn by research/ranking/suite.py from the seed {SEEDS[version]}; the number of the draw is behind each name.\n\n"
+        f"description: Further draws of ranking_v{version}, of thirty conditions each.\n"
+    )
+    head = told + head[head.index("base: ") :]
+    return "".join([head, *(_line(c, f"_{k}") for k in range(1, FURTHER + 1) for c in draw_conditions(version, k))])
+
+
+def _line(condition: Condition, draw: str = "") -> str:
+    told = ", ".join(f'"{one}"' if set(one) & set("[{") else one for one in condition.set)
+    budget = f"{condition.budget:.3g}"
+    return f"  - {{name: {condition.name}{draw}, budget: {budget}, metric: {condition.metric}, set: [{told}]}}\n"
 
 
 def draw_conditions(version: int, draw: int = 0) -> list[Condition]:
@@ -219,3 +212,4 @@ def _sensor_fault(rng: np.random.Generator, drone: int) -> tuple[str, str]:
 if __name__ == "__main__":
     library = next(iter(condition_sets().values())).parent
     write_text(library / f"{name_of(NEWEST)}.yaml", suite_text(NEWEST))
+    write_text(library / f"{name_of(NEWEST)}_further.yaml", further_text(NEWEST))

@@ -1,0 +1,1 @@
+"""How the suites of `sortie rank` are drawn."""
