@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -21,10 +19,11 @@ from sortie.sim.cli.options import (
     SetOption,
     loaded,
     refuse,
+    same_command,
     split_policies,
 )
-from sortie.sim.experiment.compare import MOST_SEEDS, Flown, chosen_seeds, in_town_of
-from sortie.sim.experiment.comparison_text import BEGIN, END, compare_command, comparison_markdown
+from sortie.sim.experiment.compare import MOST_SEEDS, Flown, chosen_seeds, in_town_of, kept_text
+from sortie.sim.experiment.comparison_text import BEGIN, END, comparison_markdown
 from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.readme import with_section
 from sortie.sim.results.html_page import GENERATOR
@@ -32,6 +31,17 @@ from sortie.sim.results.run_files import RECORDING_MARK
 
 PRECISE = ("metric", "pilot", "most_seeds")
 """Options that go with --half-width."""
+OF_ONE = ("seeds", "own_fusion", "recording", "report", "readme", "half_width", "workers", "kept", *PRECISE)
+"""Options that do not go with a set of conditions."""
+OUTPUTS = ("out_file", "recording", "report", "readme", "kept", "workers", "replace")
+
+Metric = Annotated[str | None, typer.Option(help="With --half-width: ap50.full_scene (the default) or ap50.mission.")]
+Readme = Annotated[Path | None, typer.Option(help="Write the comparison between the markers of this Markdown file.")]
+Recording = Annotated[
+    Path | None, typer.Option(help="Save the first seed's sorties side by side as a Rerun recording.")
+]
+Report = Annotated[Path | None, typer.Option(help="Write the comparison as one self-contained HTML page here.")]
+Workers = Annotated[int, typer.Option(help="Number of processes that fly; with --half-width one.", min=1)]
 
 
 def compare(
@@ -54,23 +64,6 @@ def compare(
         ),
     ] = None,
     set_: SetOption = None,
-    own_fusion: Annotated[
-        bool,
-        typer.Option(
-            "--own-fusion",
-            help="Fly each prior method that was published with a fusion of its own with that fusion, and with its network.",
-        ),
-    ] = False,
-    out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
-    recording: Annotated[
-        Path | None, typer.Option(help="Save the first seed's sorties side by side as a Rerun recording.")
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option(help="Write the comparison as one self-contained HTML page here.")
-    ] = None,
-    readme: Annotated[
-        Path | None, typer.Option(help="Write the comparison between the markers of this Markdown file.")
-    ] = None,
     half_width: Annotated[
         float | None,
         typer.Option(
@@ -81,9 +74,7 @@ def compare(
             max=1.0,
         ),
     ] = None,
-    metric: Annotated[
-        str | None, typer.Option(help="With --half-width: ap50.full_scene (the default) or ap50.mission.")
-    ] = None,
+    metric: Metric = None,
     pilot: Annotated[
         int | None,
         typer.Option(
@@ -96,16 +87,27 @@ def compare(
             help="With --half-width: seeds flown by the torch detector at most. Default: 200.", min=4, max=MOST_SEEDS
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(help="Number of processes that fly; with --half-width one.", min=1)] = 1,
+    own_fusion: Annotated[
+        bool,
+        typer.Option(
+            "--own-fusion",
+            help="Fly each prior method that was published with a fusion of its own with that fusion, and with its network.",
+        ),
+    ] = False,
+    by_torch: Annotated[
+        bool, typer.Option("--by-torch", help="With conditions: fly with the surrogate, score with the torch detector.")
+    ] = False,
+    workers: Workers = 1,
     kept: Annotated[
         Path | None,
         typer.Option(
             help="The file to which finished flights are written. Default: flights.sqlite in your cache folder."
         ),
     ] = None,
-    by_torch: Annotated[
-        bool, typer.Option("--by-torch", help="With conditions: fly with the surrogate, score with the torch detector.")
-    ] = False,
+    out_file: Annotated[Path | None, typer.Option("--out", help="Write the outcomes as JSON here.")] = None,
+    recording: Recording = None,
+    report: Report = None,
+    readme: Readme = None,
     replace: ReplaceOption = False,
 ) -> None:
     """Fly a scenario or a set of conditions under several policies with equal seeds and draws, and print the comparison.
@@ -114,9 +116,8 @@ def compare(
     """
     conditions = load_conditions(scenario)
     if conditions is not None:
-        one = ("seeds", "own_fusion", "recording", "report", "readme", "half_width", "workers", "kept", *PRECISE)
         refuse(context, ("seed",), "a scenario, not with a set of conditions: its file has its seeds")
-        refuse(context, one, "a scenario, not with a set of conditions")
+        refuse(context, OF_ONE, "a scenario, not with a set of conditions")
         named = list(POLICIES) if policies == "all" else split_policies(policies)
         return compare_conditions(conditions, named, set_ or [], out_file, by_torch=by_torch, replace=replace)
     if by_torch:
@@ -134,24 +135,22 @@ def compare(
         first = []
         if seed is not None:  # in the town that a comparison of several seeds gives it
             first = [f"seed={seed}", f"perception.scene.seed={in_town_of(base, seed).perception.scene.seed}"]
-        with stages() as stage_bar:
+        how = {"half_width": half_width, "metric": metric, "pilot": pilot, "most_seeds": most_seeds}
+        with stages() as bar:
             compared = sortie.compare(
                 scenario,
                 labels,
                 [*(set_ or []), *first],
                 own_fusion=own_fusion,
-                progress=lambda stage, done, of: stage_bar(stage, done, round(of)),
-                half_width=half_width,
-                metric=metric,
-                pilot=pilot,
-                most_seeds=most_seeds,
+                progress=lambda stage, done, of: bar(stage, done, round(of)),
                 kept=kept,
+                **how,  # type: ignore[arg-type]
             )
     else:
         refuse(context, PRECISE, "--half-width")
         chosen = chosen_seeds(base, seed, seeds)
-        with bars() as bar:
-            each = {label: bar(label, len(chosen) * base.duration_s) for label in labels}
+        with bars() as several:
+            each = {label: several(label, len(chosen) * base.duration_s) for label in labels}
             compared = sortie.compare(
                 scenario,
                 labels,
@@ -163,48 +162,17 @@ def compare(
                 progress=lambda label, at, t_s: each[label](chosen.index(at) * base.duration_s + t_s),
             )
     out.print(compared.summary())
+    flown = Flown(compared.sorties, compared.gains)
     if out_file is not None:
-        write_text(out_file, json.dumps(_plain(compared), indent=2, allow_nan=False) + "\n")
+        write_text(out_file, kept_text(flown, compared.precision))
         print_written("kept in", out_file)
     if report is not None:
         compared.report(report)
         print_written("kept in", report)
     if readme is not None:
-        command = compare_command(
-            scenario,
-            policies,
-            seed,
-            seeds,
-            set_ or [],
-            own_fusion=own_fusion,
-            half_width=half_width,
-            metric=metric,
-            pilot=pilot,
-            most_seeds=most_seeds,
-        )
-        section = comparison_markdown(Flown(compared.sorties, compared.gains), command, compared.precision)
+        section = comparison_markdown(flown, same_command(context, OUTPUTS), compared.precision)
         write_text(readme, with_section(readme, section, BEGIN, END))
         print_written("the comparison in", readme, " written")
     if recording is not None:
         compared.save_recording(recording)
         print_written("kept in", recording, f", see it with: rerun {recording}")
-
-
-def _plain(compared: sortie.Comparison) -> dict[str, Any]:
-    """What `--out` holds."""
-    sorties = [
-        {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, "gain_over_first": s.gain, "outcome": s.outcome}
-        for s in compared.sorties
-    ]
-    gains = _without_nan([asdict(gain) for gain in compared.gains])  # NaN: no interval
-    plain: dict[str, Any] = {"gains": gains, "sorties": sorties}
-    return plain if compared.precision is None else {**plain, "precision": _without_nan(asdict(compared.precision))}
-
-
-def _without_nan(value: Any) -> Any:
-    """As JSON has it, which has no NaN."""
-    if isinstance(value, dict):
-        return {key: _without_nan(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(v) for v in value]
-    return None if value != value else value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection
 from enum import StrEnum
 from typing import Annotated
@@ -61,6 +62,24 @@ def loaded(scenario: str, set_: list[str] | None, policy: str | None) -> Scenari
             f"{policy} flies to the end: the changes and commands of {own.name} are its own policy's", soft_wrap=True
         )
     return flown
+
+
+def same_command(context: typer.Context, leaving_out: Collection[str]) -> str:
+    """The command that was given, without some of its options."""
+    said = ["sortie", str(context.info_name)]
+    for parameter in context.command.params:
+        name, value = str(parameter.name), context.params.get(str(parameter.name))
+        source = context.get_parameter_source(name)
+        if name in leaving_out or source is None or source.name != "COMMANDLINE":
+            continue
+        if parameter.param_type_name == "argument":
+            said.append(str(value))
+        elif isinstance(value, bool):
+            said.append(parameter.opts[0])
+        else:
+            for one in value if isinstance(value, list | tuple) else [value]:
+                said += [parameter.opts[0], f"{one:g}" if isinstance(one, float) else str(one)]
+    return shlex.join(said)
 
 
 def refuse(context: typer.Context, names: Collection[str], goes_with: str) -> None:

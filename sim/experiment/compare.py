@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -272,3 +273,28 @@ def pair_up(
     """
     both = [key for key in first if key in other]
     return [first[k] for k in both], [other[k] for k in both], [t_s // BLOCK_S for t_s, _ in both]
+
+
+def kept_text(flown: Flown, precision: Any = None) -> str:
+    """What `--out` holds, as JSON; where there is no interval, or nothing was found, null.
+
+    Args:
+        precision: a dataclass, of a comparison to a half-width.
+    """
+    sorties = [
+        {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, "gain_over_first": s.gain, "outcome": s.outcome}
+        for s in flown.sorties
+    ]
+    plain: dict[str, Any] = {"gains": [_known(asdict(gain)) for gain in flown.gains], "sorties": sorties}
+    if precision is not None:
+        plain["precision"] = _known(asdict(precision))
+    return json.dumps(plain, indent=2, allow_nan=False) + "\n"
+
+
+def _known(value: Any) -> Any:
+    """With null for NaN, which JSON has not."""
+    if isinstance(value, dict):
+        return {key: _known(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_known(v) for v in value]
+    return None if value != value else value
