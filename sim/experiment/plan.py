@@ -33,7 +33,7 @@ from sortie.scenarios.schema.campaign import PARAMS, Campaign
 from sortie.sim.engine.pilot import named_policy
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.experiment.flight import Task, file_digests, found_file
-from sortie.sim.experiment.spread import TAIL, Floats, design, drawn_fields, grid, quantile
+from sortie.sim.experiment.spread import TAIL, Floats, design, drawn_fields, grid, quantiles
 from sortie.sim.folders import RunError
 from sortie.sim.identity import flight_code, packages
 from sortie.sim.policy_text import policy_overrides
@@ -136,10 +136,15 @@ class CampaignPlan:
     def varied(self, cell: int) -> dict[str, Any]:
         """A cell's values of the varied fields, in the campaign's order."""
         draw, point = divmod(cell, len(self.grid))
-        vary, at = self.campaign.vary, self.grid[point]
-        drawn = dict(zip(drawn_fields(self.campaign), self.points[draw].tolist(), strict=True))
+        at, drawn = self.grid[point], self._drawn
+        return {name: at[name] if name in at else drawn[name][draw] for name in self.campaign.vary}
+
+    @cached_property
+    def _drawn(self) -> dict[str, Sequence[Any]]:
+        """The values of the drawn fields, draw by draw."""
         tail = TAIL if self.campaign.sample.method == "morris" else 0.0
-        return {name: at[name] if name in at else quantile(vary[name], drawn[name], tail=tail) for name in vary}
+        columns = zip(drawn_fields(self.campaign), self.points.T, strict=True)
+        return {name: quantiles(self.campaign.vary[name], u, tail=tail) for name, u in columns}
 
     def seed(self, cell: int) -> int:
         """The seed of a cell's runs, whichever the policy: a function of the campaign's seed and the cell."""

@@ -74,45 +74,35 @@ def unit_problem(fields: int, names: Sequence[str] = ()) -> dict[str, Any]:
     return {"num_vars": fields, "names": list(names) or [f"x{i}" for i in range(fields)], "bounds": [[0, 1]] * fields}
 
 
-def quantile(spread: Spread, u: float, *, tail: float = 0.0) -> Any:
-    """The value of a drawn field at quantile u in [0, 1]."""
-    from scipy.special import ndtr, ndtri  # here, as elsewhere in campaigns: light commands do without scipy
-
+def quantiles(spread: Spread, u: Floats, *, tail: float = 0.0) -> Sequence[Any]:
+    """The values of a drawn field at quantiles u [draws], each in [0, 1]."""
     if isinstance(spread, Uniform):
-        return spread.low + u * (spread.high - spread.low)
+        uniform: list[float] = (spread.low + u * (spread.high - spread.low)).tolist()
+        return uniform
     if isinstance(spread, Integers):
-        return min(spread.high, spread.low + int(u * (spread.high - spread.low + 1)))
-    if isinstance(spread, Triangular):
-        width, rise = spread.high - spread.low, spread.mode - spread.low
-        if u * width < rise:
-            return spread.low + float(np.sqrt(u * width * rise))
-        return spread.high - float(np.sqrt((1 - u) * width * (spread.high - spread.mode)))
+        return [min(spread.high, spread.low + int(v * (spread.high - spread.low + 1))) for v in u]
     if isinstance(spread, Choice):
         weights = np.ones(len(spread.values)) if spread.weights is None else np.asarray(spread.weights)
-        upto = np.cumsum(weights) / weights.sum()
-        likely = np.flatnonzero(weights > 0)
-        return spread.values[min(int(np.searchsorted(upto, u, side="right")), int(likely[-1]))]
-    if isinstance(spread, Normal):
+        last = np.flatnonzero(weights > 0)[-1]
+        at = np.searchsorted(np.cumsum(weights) / weights.sum(), u, side="right")
+        return [spread.values[k] for k in np.minimum(at, last)]
+    from scipy.special import ndtri  # here, as elsewhere in campaigns: light commands do without scipy
+    from scipy.stats import triang, truncnorm
+
+    if isinstance(spread, Triangular):
+        width = spread.high - spread.low
+        found = triang.ppf(u, (spread.mode - spread.low) / width, spread.low, width)
+    elif isinstance(spread, Normal):
         low = -np.inf if spread.low is None else spread.low
         high = np.inf if spread.high is None else spread.high
         cut = np.clip(u, tail if spread.low is None else 0.0, 1.0 - (tail if spread.high is None else 0.0))
-        a, b = ((end - spread.mean) / spread.sd for end in (low, high))
-        if a < 0 < b:
-            below, above = float(ndtr(a)), float(ndtr(b))
-            z = ndtri(below + cut * (above - below))
-        else:
-            z = _in_tail(a, b, cut) if b <= 0 else -_in_tail(-b, -a, 1.0 - cut)
-        return float(np.clip(spread.mean + spread.sd * z, low, high))
-    assert isinstance(spread, LogNormal)  # noqa: S101
-    return spread.median * float(np.exp(spread.sigma * ndtri(np.clip(u, tail, 1.0 - tail))))
-
-
-def _in_tail(a: float, b: float, u: float) -> float:
-    """The standard normal's quantile u between a and b, both at most 0; in logarithms, where tails do not vanish."""
-    from scipy.special import log_ndtr, ndtri_exp
-
-    with np.errstate(divide="ignore"):  # u is 0 or 1 at the ends
-        return float(ndtri_exp(np.logaddexp(log_ndtr(a) + np.log1p(-u), log_ndtr(b) + np.log(u))))
+        ends = ((end - spread.mean) / spread.sd for end in (low, high))
+        found = np.clip(truncnorm.ppf(cut, *ends, spread.mean, spread.sd), low, high)
+    else:
+        assert isinstance(spread, LogNormal)  # noqa: S101
+        found = spread.median * np.exp(spread.sigma * ndtri(np.clip(u, tail, 1.0 - tail)))
+    values: list[float] = found.tolist()
+    return values
 
 
 def grid(campaign: Campaign, columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:

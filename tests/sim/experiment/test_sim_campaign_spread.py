@@ -20,7 +20,7 @@ from sortie.scenarios.schema.campaign import (
     Triangular,
     Uniform,
 )
-from sortie.sim.experiment.spread import design, quantile
+from sortie.sim.experiment.spread import design, quantiles
 
 U = st.floats(0.001, 0.999)
 
@@ -37,7 +37,7 @@ def test_quantiles_are_those_of_scipy(u: float) -> None:
         (Triangular(kind="triangular", low=1, mode=5, high=5), stats.triang(1, 1, 4)),
     ]
     for spread, reference in pairs:
-        assert quantile(spread, u) == pytest.approx(reference.ppf(u), abs=1e-9)  # type: ignore[attr-defined]
+        assert quantiles(spread, np.array([u]))[0] == pytest.approx(reference.ppf(u), abs=1e-9)  # type: ignore[attr-defined]
 
 
 def test_a_normal_cut_off_in_its_tail_is_that_of_scipy() -> None:
@@ -49,15 +49,15 @@ def test_a_normal_cut_off_in_its_tail_is_that_of_scipy() -> None:
         reference = stats.truncnorm(-np.inf if low is None else low, np.inf if high is None else high, 1, 2)
         for u in (0.0, 1e-12, 0.001, 0.3, 0.5, 0.9, 1 - 1e-12):
             if math.isfinite(reference.ppf(u)):
-                assert quantile(spread, u) == pytest.approx(reference.ppf(u), rel=1e-9), (low, high, u)
+                assert quantiles(spread, np.array([u]))[0] == pytest.approx(reference.ppf(u), rel=1e-9), (low, high, u)
 
 
 def test_choices_and_integers_come_as_often_as_they_should() -> None:
     u = (np.arange(1000) + 0.5) / 1000
     choice = Choice(kind="choice", values=("a", "b", "c"), weights=(1, 0, 3))
-    drawn = [quantile(choice, x) for x in [*u.tolist(), 1.0]]
+    drawn = list(quantiles(choice, np.array([*u.tolist(), 1.0])))
     assert (drawn.count("a"), drawn.count("b"), drawn.count("c")) == (250, 0, 751)
-    whole = [quantile(Integers(kind="integers", low=3, high=6), x) for x in [*u.tolist(), 1.0]]
+    whole = list(quantiles(Integers(kind="integers", low=3, high=6), np.array([*u.tolist(), 1.0])))
     assert [whole.count(v) for v in (3, 4, 5, 6)] == [250, 250, 250, 251]
 
 
