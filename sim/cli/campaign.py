@@ -21,7 +21,6 @@ from sortie.sim.experiment.signals import EndedError, ended_by_sigterm
 
 if TYPE_CHECKING:
     from sortie.scenarios.reading.campaign import Study
-    from sortie.scenarios.schema import Scenario
     from sortie.sim.experiment.drive import Progress
 
 
@@ -46,11 +45,7 @@ def run(
     context: typer.Context,
     campaign: Annotated[str, typer.Argument(help="A campaign file, or a library campaign's name.")],
     workers: Annotated[
-        int | None,
-        typer.Option(
-            help="Number of worker processes, at least one; default: one per core.",
-            min=0,
-        ),
+        int | None, typer.Option(help="Number of worker processes, at least one; default: one per core.", min=0)
     ] = None,
     scheduler: Annotated[str | None, typer.Option(help="Use a running dask cluster: tcp://host:8786.")] = None,
     security: Annotated[
@@ -149,32 +144,6 @@ def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")])
 
     path = write_report(folder)
     print_written("report written to", path, f", rows in {folder / TABLE}")
-
-
-def again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> tuple[Scenario, int, int, str | None]:
-    """A campaign's run for `sortie fly`: scenario, seed, replication, and the fingerprint it had.
-
-    Raises:
-        RunError: half of the two options, others beside them, no such run, or code that is not the campaign's.
-    """
-    from sortie.sim.experiment.flight import scenario_of_task
-    from sortie.sim.experiment.rows import find_row
-    from sortie.sim.folders import RunError
-    from sortie.sim.identity import codes_here
-
-    if folder is None or run is None:
-        raise RunError("--from-campaign DIR and --run ID go together")
-    if any(other is not None and other != [] for other in others):
-        raise RunError("--from-campaign: the run has its own scenario, policy, seed and settings; name nothing else")
-    plan, row = find_row(folder, run)
-    if plan.code not in (here := codes_here()):
-        _notice(f"this is Sortie {here[' torch ' in plan.code]}, the campaign was flown with {plan.code}")
-    if row is None:
-        err.print(f"the campaign has not flown run {run} yet: there is no record to compare with")
-    elif row["status"] == "failed":
-        err.print(f"in the campaign run {run} failed: {row['error']}", soft_wrap=True)
-    task = plan.task(run)
-    return scenario_of_task(task), task.seed, task.replication, (row or {}).get("fingerprint") or None
 
 
 def _print_plan(study: Study, workers: int | None) -> None:

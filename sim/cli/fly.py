@@ -13,9 +13,9 @@ import typer
 import sortie
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.exit_codes import FAILED
+from sortie.scenarios.schema import Scenario
 from sortie.sim.cli import tables
-from sortie.sim.cli.campaign import again
-from sortie.sim.cli.console import bars, line_printer, out, print_failure, print_written
+from sortie.sim.cli.console import bars, err, line_printer, out, print_failure, print_written
 from sortie.sim.cli.options import PolicyOption, SeedOption, SetOption, loaded, refuse
 from sortie.sim.cli.view import view
 from sortie.sim.engine.needs import Forecast, ensure_room, needs
@@ -95,7 +95,7 @@ def fly(
     if mavlink is None:
         refuse(context, ("pace", "mavlink_key"), "--mavlink")
     if campaign is not None or run is not None:
-        flown, seed, number, expected = again(campaign, run, (scenario, policy, seed, set_, replication))
+        flown, seed, number, expected = _again(campaign, run, (scenario, policy, seed, set_, replication))
     else:
         flown, number, expected = loaded(_named(scenario), set_, policy), replication or 0, None
     if out_dir is not None:
@@ -175,3 +175,30 @@ def _profiled(wanted: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
         yield lambda result: out.print(tables.profile_table(profiler, result))
     finally:
         profiler.disable()
+
+
+def _again(folder: Path | None, run: int | None, others: tuple[object, ...]) -> tuple[Scenario, int, int, str | None]:
+    """A campaign's run for `sortie fly`: scenario, seed, replication, and the fingerprint it had.
+
+    Raises:
+        RunError: half of the two options, others beside them, no such run, or code that is not the campaign's.
+    """
+    from sortie.sim.experiment.flight import scenario_of_task
+    from sortie.sim.experiment.rows import find_row
+    from sortie.sim.folders import RunError
+    from sortie.sim.identity import codes_here
+
+    if folder is None or run is None:
+        raise RunError("--from-campaign DIR and --run ID go together")
+    if any(other is not None and other != [] for other in others):
+        raise RunError("--from-campaign: the run has its own scenario, policy, seed and settings; name nothing else")
+    plan, row = find_row(folder, run)
+    if plan.code not in (here := codes_here()):
+        here_is = f"this is Sortie {here[' torch ' in plan.code]}, the campaign was flown with {plan.code}"
+        err.print(here_is, style="yellow", soft_wrap=True)
+    if row is None:
+        err.print(f"the campaign has not flown run {run} yet: there is no record to compare with")
+    elif row["status"] == "failed":
+        err.print(f"in the campaign run {run} failed: {row['error']}", soft_wrap=True)
+    task = plan.task(run)
+    return scenario_of_task(task), task.seed, task.replication, (row or {}).get("fingerprint") or None
