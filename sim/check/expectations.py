@@ -10,7 +10,7 @@ from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.report_text import interval
 from sortie.scenarios.schema import DecisionExpectation, Expectation, Scenario
 from sortie.sim.results.outcome import changes, describe
-from sortie.sim.results.outcome_fields import is_zero_count, possible
+from sortie.sim.results.outcome_fields import metric, possible
 from sortie.sim.results.record import SortieRecord
 
 TOLERANCE = 1e-9
@@ -32,33 +32,6 @@ class Verdict:
     """The replication that shows the result best."""
     whole: str = ""
     """Of a golden outcome that moved, a line for each figure."""
-
-
-def metric(result: dict[str, Any], dotted: str) -> Any:
-    """A field of an outcome by its dotted name; list items by number. A count that is not there is 0.
-
-    Raises:
-        KeyError: no such field, naming the fields that there are.
-    """
-    value: Any = result
-    for depth, part in enumerate(dotted.split(".")):
-        if isinstance(value, list) and part.isdigit() and int(part) < len(value):
-            value = value[int(part)]
-        elif isinstance(value, dict) and part in value:
-            value = value[part]
-        elif is_zero_count(dotted, len(result.get("battery", ()))):
-            return 0
-        else:
-            known = (
-                ", ".join(value)
-                if isinstance(value, dict)
-                else f"0 … {len(value) - 1}"
-                if isinstance(value, list)
-                else "nothing"
-            )
-            where = ".".join(dotted.split(".")[:depth]) or "the outcome"
-            raise KeyError(f"{dotted}: {where} has no {part!r}, it has {known}")
-    return value
 
 
 def check(

@@ -29,7 +29,6 @@ from sortie.scenarios.reading.nodes import ScenarioError
 from sortie.scenarios.schema import Limits, Scenario
 from sortie.scenarios.schema.limits import IN_CAMPAIGNS
 from sortie.scenarios.shipped import located
-from sortie.sim.check.expectations import metric
 from sortie.sim.engine.sortie import fly_here, run_sortie
 from sortie.sim.experiment import files_read
 from sortie.sim.experiment.detectors import boxes_of_draws, maker
@@ -39,7 +38,7 @@ from sortie.sim.identity import codes_here, file_digest, flight_code, name_of, p
 from sortie.sim.process import own_process
 from sortie.sim.results.accuracy import both_matched
 from sortie.sim.results.outcome import outcome
-from sortie.sim.results.outcome_fields import lacking
+from sortie.sim.results.outcome_fields import lacking, metric
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.user_errors import in_line
 

@@ -56,7 +56,7 @@ def users_file() -> Path | None:
 
 
 class FlightFile:
-    """A file of flights, open for reading and writing.
+    """A file of flights, for reading and writing; it is made with its first row.
 
     Raises:
         RunError: it cannot be used, or holds something else.
@@ -64,30 +64,37 @@ class FlightFile:
 
     def __init__(self, path: Path, own: Collection[str] = ()) -> None:
         """Args: `own` are tables that may stand beside that of the flights."""
-        self.path = path
-        with self.errors():
-            ensure_place(path)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self.db = sqlite3.connect(path, timeout=TIMEOUT_S)
-        try:
+        self.path, self._own = path, own
+        self._db: sqlite3.Connection | None = None
+        ensure_place(path)
+        if path.exists():
+            self.db  # noqa: B018 - opens it, so that what is wrong comes before the flights
+
+    @property
+    def db(self) -> sqlite3.Connection:
+        """The database, which has a table of flights."""
+        if self._db is None:
             with self.errors():
-                self.db.execute("PRAGMA synchronous = EXTRA")  # a committed row survives a power cut
-                tables = {name for (name,) in self.db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-                if others := sorted(tables - {"flights", *own}):
-                    raise RunError(f"{path}: holds the table {others[0]} of somebody else; name another file")
-                ensure_table(self.db)
-        except BaseException:
-            self.db.close()
-            raise
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._db = sqlite3.connect(self.path, timeout=TIMEOUT_S)
+                self._db.execute("PRAGMA synchronous = EXTRA")  # a committed row survives a power cut
+                tables = {name for (name,) in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+                if others := sorted(tables - {"flights", *self._own}):
+                    raise RunError(f"{self.path}: holds the table {others[0]} of somebody else; name another file")
+                ensure_table(self._db)
+        return self._db
 
     def close(self) -> None:
         """Close the file."""
-        self.db.close()
+        if self._db is not None:
+            self._db.close()
 
     def find(self, task: Task) -> Flight | None:
         """A task's row, if it flew to the end, has all that is asked, and its files hold what they held."""
+        if self._db is None:
+            return None
         with self.errors():
-            row = self.db.execute(f"SELECT {COLUMNS} FROM flights WHERE key = ?", (task.key,)).fetchone()  # noqa: S608
+            row = self._db.execute(f"SELECT {COLUMNS} FROM flights WHERE key = ?", (task.key,)).fetchone()  # noqa: S608
             flight = None if row is None else flight_of(row)
             if flight is None or flight.error or not set(task.figures) <= set(flight.values):
                 return None
@@ -104,6 +111,8 @@ class FlightFile:
 
     def forget_other_code(self) -> None:
         """Remove what no flight of this version can use."""
+        if self._db is None:
+            return
         with self.errors(), self.db:
             self.db.execute("DELETE FROM flights WHERE code NOT IN (?, ?)", codes_here())
 

@@ -193,10 +193,10 @@ class CampaignStore(CampaignTable):
         if resume_only and not (folder / FILE).is_file():
             raise RunError(f"{folder}: no campaign there to resume ({FILE} is missing)")
         self._file = FlightFile(folder / FILE, TABLES)
-        self._db = self._file.db
         self.said: list[str] = []
         """Lines on flights that are there and are not taken."""
         try:
+            self._db = self._file.db
             self._open(retry_failed)
         except BaseException:
             self.close()

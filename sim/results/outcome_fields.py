@@ -413,6 +413,33 @@ def is_zero_count(name: str, drones: int) -> bool:
     return name.startswith(COUNTS[:-1]) and key in open_keys(drones, 0, (), traced=False)[section]
 
 
+def metric(result: dict[str, Any], dotted: str) -> Any:
+    """A field of an outcome by its dotted name; list items by number. A count that is not there is 0.
+
+    Raises:
+        KeyError: no such field, naming the fields that there are.
+    """
+    value: Any = result
+    for depth, part in enumerate(dotted.split(".")):
+        if isinstance(value, list) and part.isdigit() and int(part) < len(value):
+            value = value[int(part)]
+        elif isinstance(value, dict) and part in value:
+            value = value[part]
+        elif is_zero_count(dotted, len(result.get("battery", ()))):
+            return 0
+        else:
+            known = (
+                ", ".join(value)
+                if isinstance(value, dict)
+                else f"0 … {len(value) - 1}"
+                if isinstance(value, list)
+                else "nothing"
+            )
+            where = ".".join(dotted.split(".")[:depth]) or "the outcome"
+            raise KeyError(f"{dotted}: {where} has no {part!r}, it has {known}")
+    return value
+
+
 def lacking(name: str, drones: int) -> int | None:
     """What a run of so many drones has of a number that another run has and its own outcome lacks: 0 of a count, but for
     one of a drone that is not there; else None.

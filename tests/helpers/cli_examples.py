@@ -41,7 +41,8 @@ def refused(folder: Path, table: Sequence[tuple[str, str]], capsys: pytest.Captu
             one_line = printed.err.startswith("error: ") and printed.err.count("\n") == 1
             if code != 2 or printed.out or not one_line or words not in printed.err:
                 wrong[line] = f"{code}: {printed.out}{printed.err}"
-    assert sorted(folder.iterdir()) == before, "nothing was left behind"
+    left = sorted(set(folder.iterdir()) - set(before))
+    assert not left, f"left behind: {left}"
     return wrong
 
 
@@ -57,7 +58,8 @@ def refusal(
     assert printed.out == ""
     assert printed.err.startswith("error: ")
     assert printed.err.count("\n") == 1
-    assert sorted(folder.iterdir()) == before, "nothing was left behind"
+    left = sorted(set(folder.iterdir()) - set(before))
+    assert not left, f"left behind: {left}"
     return printed.err
 
 

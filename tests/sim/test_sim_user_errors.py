@@ -18,7 +18,7 @@ from sortie.scenarios.plugins.user_calls import guarded
 from sortie.sim.check import checking
 from sortie.sim.check.plugin import ScenarioFile
 from sortie.sim.engine import pilot
-from sortie.sim.experiment.work import _result
+from sortie.sim.experiment import flight
 from sortie.sim.folders import RunError
 from sortie.sim.user_errors import as_text, defect, missing, of_user, user_errors
 
@@ -120,8 +120,8 @@ def test_pytest_shows_the_traceback_of_a_defect(
     assert file._fly().error.startswith("ScenarioError: nothing: no such file")
 
 
-def test_the_row_of_a_run_says_that_it_is_a_defect() -> None:
-    row = _result(0, "", broken, ())  # type: ignore[arg-type]
-    assert row.status == "failed"
+def test_the_row_of_a_flight_says_that_it_is_a_defect(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "fly", lambda *_, **__: broken())
+    row = flight.fly_in_worker(flight.task_of(sortie.load(SHORT), ()))
     assert row.error.startswith("a defect of Sortie (test_sim_user_errors.py, line ")
     assert "ValueError: operands could not be broadcast" in row.error

@@ -46,7 +46,8 @@ COMPARE = f"compare s.yaml --policies 'worked,{BEST},silence' --set duration_s=2
 TOWN = example().perception.scene.seed + 3
 """Another seed is another town: --seed 4 is three further than the first."""
 RESEEDED = ["duration_s=2", "seed=4", f"perception.scene.seed={TOWN}"]
-HALF_WIDTH = {"half_width": 0.02, "metric": None, "pilot": None, "most_seeds": None, "kept": True, "own_fusion": False}
+HALF_WIDTH = {"half_width": 0.02, "metric": None, "pilot": None, "most_seeds": None, "kept": None, "own_fusion": False}
+KEPT = {"kept": None, "workers": 1}
 CHOSEN = {"metric": "ap50.mission", "pilot": 6, "most_seeds": 90, "kept": Path("k.sqlite")}
 CAMPAIGN = {
     "scheduler": None,
@@ -69,12 +70,17 @@ LOGS = ([Path("a.bin"), Path("b.tlog")], Path("o"), 5.0, 1.5, 2.5, 3.5, [7, 2])
 MORE = "--further 2 --workers 3"
 SYSTEMS = "--system 7 --system 2 --together"
 PASSED: list[tuple[str, str, tuple[Any, ...], dict[str, Any]]] = [
-    (COMPARE, "sortie.compare", ("s.yaml", POLICIES, ["duration_s=2"]), {"seeds": range(1, 2), "own_fusion": False}),
+    (
+        COMPARE,
+        "sortie.compare",
+        ("s.yaml", POLICIES, ["duration_s=2"]),
+        {"seeds": range(1, 2), "own_fusion": False, **KEPT},
+    ),
     (
         f"{COMPARE} --seed 4 --seeds 3 --own-fusion",
         "sortie.compare",
         ("s.yaml", POLICIES, ["duration_s=2"]),
-        {"seeds": range(4, 7), "own_fusion": True},
+        {"seeds": range(4, 7), "own_fusion": True, **KEPT},
     ),
     (f"{COMPARE} --half-width 0.02", "sortie.compare", ("s.yaml", POLICIES, ["duration_s=2"]), HALF_WIDTH),
     (
@@ -101,12 +107,12 @@ PASSED: list[tuple[str, str, tuple[Any, ...], dict[str, Any]]] = [
             **{"wait_for_workers_s": 7.0, "resume": False, "retry_failed": False},
         },
     ),
-    ("rank boxes", "sortie.rank", (["boxes"],), {**RANK, "folder": Path("runs/rank")}),
+    ("rank boxes", "sortie.rank", (["boxes"],), RANK),
     (
         f"rank 'boxes,{BEST}' --suite x.yaml --against worked,silence --again --by-torch {MORE} --out o",
         "sortie.rank",
         (["boxes", BEST],),
-        {**SUITE, "folder": Path("o")},
+        SUITE,
     ),
     (
         f"import a.bin b.tlog --rate 5 --from 1.5 --until 2.5 --lift 3.5 {SYSTEMS} --ground 47,8 --out o",

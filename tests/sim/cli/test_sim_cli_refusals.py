@@ -57,7 +57,6 @@ REFUSED = [
     (f"{SET} --recording c.rrd", "--recording goes with a scenario"),
     (f"{SET} --readme c.md", "--readme goes with a scenario"),
     (f"{ONE} --pilot 8", "--pilot goes with --half-width"),
-    (f"{ONE} --kept c.sqlite", "--kept goes with --half-width"),
     (f"{TWO} --seeds 3", "--seeds does not go with --half-width"),
     (f"{TWO} --recording c.rrd", "--recording does not go with --half-width"),
     (f"{AGAIN} --seed 0", "name nothing else"),

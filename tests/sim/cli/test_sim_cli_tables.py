@@ -89,14 +89,13 @@ def test_compare_over_conditions(
     (here / "c.yaml").write_text(CONDITIONS)
     cells = [Cell(p, c, ap, 2e6 if p == "boxes" else 0.0, 4000.0, 0.25) for (p, c), ap in LATER.items()]
     flown = Seen(cells)
-    monkeypatch.setattr("sortie.sim.cli.conditions.fly_all", flown)
-    monkeypatch.setattr("sortie.sim.cli.conditions.torch_answers", lambda: "by torch")
+    monkeypatch.setattr("sortie.sim.cli.conditions.fly_conditions", flown)
     assert run_line("compare c.yaml --policies silence,boxes --set duration_s=4 --by-torch --out o.json") == 0
     conditions, policies = flown.args
     assert policies == ["silence", "boxes"]
     sets = ["perception.detector=surrogate", "duration_s=3", "duration_s=4"]
     assert list(conditions.set) == sets, "the last one holds"
-    assert flown.kwargs["detector_of"] == "by torch"
+    assert flown.kwargs["by_torch"] is True
     rows = table_rows(capsys.readouterr().out)
     assert ["wide", "0.5", "0.5", "0.75"] in [[*cells[:2], *(c.rstrip("0") for c in cells[2:])] for cells in rows]
     (silence,), (boxes,) = ([cells for cells in rows if cells[0] == p] for p in ("silence", "boxes"))
@@ -108,7 +107,7 @@ def test_compare_over_conditions(
     figures = {"ap": 0.125, "data_bytes": 2e6, "energy_j": 4000.0, "miss_rate": 0.25, "flown_share": 1.0}
     assert kept["cells"][3] == {"policy": "boxes", "condition": "narrow", **figures}
     command("compare", "c.yaml", "--policies", "silence")
-    assert flown.kwargs["detector_of"] not in (None, "by torch")
+    assert flown.kwargs["by_torch"] is False
 
 
 def test_the_best_of_a_condition_is_bold_in_whichever_table_it_stands(

@@ -313,7 +313,7 @@ def test_no_text_of_a_run_is_obeyed_by_its_page(forged: Path, tmp_path: Path) ->
 
 def test_no_label_of_a_comparison_is_obeyed_by_its_page(forged: Path) -> None:
     opened = sortie.open_run(forged)
-    flown = Flown((Compared(CANARY, 1, 1, opened.outcome, {}, opened.record),), ())
+    flown = Flown((Compared(CANARY, 1, 1, opened.outcome, {}, lambda: opened.record),), ())
     ensure_harmless(comparison_page(flown))
 
 
