@@ -24,6 +24,7 @@ _USED_UP = (errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE)
 
 EXTRAS = {
     "matplotlib": "report",
+    "jinja2": "report",
     "SALib": "campaign",
     "threadpoolctl": "campaign",
     "cyclonedds": "dds",

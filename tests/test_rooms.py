@@ -32,6 +32,7 @@ HOMES = {
     "rerun": ("sim/playback/*",),
     "pymavlink": ("fleet/logs/ground_station.py", "fleet/logs/mavlink.py", "fleet/logs/tlog.py"),
     "yaml": ("scenarios/reading/strict_yaml.py", "scenarios/reading/top_keys.py"),
+    "jinja2": ("sim/results/blocks.py",),
     "distributed": ("sim/experiment/cluster.py",),
     "dask": ("sim/experiment/cluster.py",),
     "SALib": ("sim/experiment/*",),

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sortie.sim.experiment.compare import Flown
-from sortie.sim.experiment.comparison_text import explanations, heading, precision_lines, side_by_side
+from sortie.sim.experiment.comparison_text import at, comparison_blocks, heading, what_gains_are
 from sortie.sim.experiment.half_width import Precision
 from sortie.sim.folders import write_text
-from sortie.sim.results.html_page import figures_html, html, html_page, joined, table, table_row
+from sortie.sim.results.blocks import Figure, Heading, Paragraph, html_page
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report_figures import (
     accuracy_points,
@@ -56,31 +56,29 @@ def comparison_page(flown: Flown, precision: Precision | None = None) -> str:
         precision: of a comparison to a half-width, what it flew.
     """
     labels = list(dict.fromkeys(s.policy for s in flown.sorties))
-    rows = [table_row("td", name.strip(), *cells) for name, cells in side_by_side(flown).items()]
-    told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
-    body = html(
-        _BODY,
-        table=table(table_row("th", "", *labels), *rows),
-        why=joined(html("<li>{}{}</li>", html("<b>{}</b>", name) if name else "", text) for name, text in told),
-        figures=figures_html(drawn([*_dots(flown, labels), *_over_time(flown)])),
+    plots = drawn([*_dots(flown, labels), *_over_time(flown)])
+    return html_page(
+        [
+            Heading("Policies compared", 1),
+            Paragraph(heading(flown)),
+            Heading("In numbers"),
+            Paragraph(what_gains_are(flown)),
+            *comparison_blocks(flown, precision),
+            Heading("In figures"),
+            Paragraph(
+                "A small dot is one sortie, a large one the mean of a policy's sorties. Figures over time show the first seed's "
+                "sorties."
+            ),
+            *(Figure(caption, svg=svg) for caption, svg in plots.items()),
+        ]
     )
-    return html_page("Policies compared", heading(flown), body)
-
-
-_BODY = """<h2>In numbers</h2>
-{table}
-<ul>{why}</ul>
-<h2>In figures</h2>
-<p>A small dot is one sortie, a large one the mean of a policy's sorties. Figures over time show the first seed's sorties.</p>
-{figures}
-"""
 
 
 def _dots(flown: Flown, labels: Sequence[str]) -> Iterator[Plot]:
     """A figure for each of `DOTS` that any sortie has."""
     for caption, place, factor in DOTS:
         values = [
-            [factor * v for s in flown.sorties if s.policy == label and (v := _at(s.outcome, place)) is not None]
+            [factor * v for s in flown.sorties if s.policy == label and (v := at(s.outcome, place)) is not None]
             for label in labels
         ]
         if any(values):
@@ -130,9 +128,3 @@ def _draw_lines(axes: Axes, *, lines: dict[str, Any], record: SortieRecord, top:
     axes.set_ylim(0.0, top)
     mark_moments(axes, record)
     legend_beside(axes)
-
-
-def _at(result: Any, place: Sequence[str]) -> float | None:
-    for part in place:
-        result = result[part]
-    return None if result is None else float(result)

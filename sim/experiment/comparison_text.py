@@ -5,20 +5,58 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
-from rich.table import Table
+from rich import table
 from rich.text import Text
 
 from sortie.radio.transmission import Status
-from sortie.scenarios.report_text import number, percent, points, size, table
+from sortie.scenarios.report_text import number, percent, points, size
 from sortie.sim.experiment.compare import BLOCK_S, BY_BOTH, Compared, Flown, Gain
 from sortie.sim.experiment.conditions import mean_of_known
 from sortie.sim.experiment.half_width import Precision
+from sortie.sim.results.blocks import Block, Items, Paragraph, Table, markdown
 from sortie.sim.results.sentences import turns_in_words
-from sortie.sim.results.summary import PLURAL, titled
+from sortie.sim.results.summary import titled
 
 BEGIN, END = "<!-- compare:begin -->", "<!-- compare:end -->"
+JAMMED = 0.5
+"""Of a policy's payloads: where so many miss their deadline, what is compared is a full channel."""
+
+
+def _kilojoules(value: float) -> str:
+    return f"{value / 1e3:.2f} kJ"
+
+
+ROWS: tuple[tuple[str, str, Callable[[Any], str] | None], ...] = (
+    ("flown", "mission.flown_share", percent),
+    ("AP@0.5 full scene", "ap50.full_scene", number),
+    ("  gain", "ap50.full_scene", None),
+    ("  grounded drones blind", "ap50.grounded_blind.full_scene", number),
+    ("    gain", "ap50.grounded_blind.full_scene", None),
+    ("AP@0.5 mission", "ap50.mission", number),
+    ("  gain ", "ap50.mission", None),
+    ("  grounded drones blind ", "ap50.grounded_blind.mission", number),
+    ("    gain ", "ap50.grounded_blind.mission", None),
+    ("AP of trucks, full scene", "ap_by_class.truck.full_scene", number),
+    ("AP of people, full scene", "ap_by_class.person.full_scene", number),
+    ("people located", "people.located_share", percent),
+    ("data sent", "bytes.data_sent", size),
+    ("data delivered", "bytes.data_delivered", size),
+    ("  handshakes", "bytes.handshakes_sent", size),
+    ("deadlines missed", "deadline_miss_rate", percent),
+    ("medium busy", "medium_busy_fraction", percent),
+    ("context sent", "bytes.context_sent", size),
+    ("descriptors lost", "context.lost", percent),
+    ("data age, median", "data_age_s.p50", lambda v: number(v, ".2f", "s")),
+    ("energy", "energy_j.total", _kilojoules),
+    ("  radio", "energy_j.radio", _kilojoules),
+    ("  compute", "energy_j.compute", _kilojoules),
+)
+"""Name, place in the outcome, and how a mean of it is written; a row without that has the gains."""
+IF_GROUNDED, IF_KNOWN = ("mission.flown_share", "ap50.grounded_blind"), ("ap_by_class", "people")
+"""Places of rows that are left out where all drones fly to the end, or where no sortie has a value."""
 
 
 class Line(NamedTuple):
@@ -33,39 +71,36 @@ class Line(NamedTuple):
         return Text.assemble((self.name, "bold"), self.text)
 
 
-def comparison_table(flown: Flown) -> Table:
+def comparison_table(flown: Flown) -> table.Table:
     """Policies side by side, a column each; gains are over the first, in AP points with paired 95 % intervals."""
-    table = titled(heading(flown), caption=_what_gains_are(flown) or None)
-    table.add_column("", style="bold")
+    made = titled(heading(flown), caption=what_gains_are(flown) or None)
+    made.add_column("", style="bold")
     for policy in _by_policy(flown):
-        table.add_column(policy, justify="right", overflow="fold")
+        made.add_column(policy, justify="right", overflow="fold")
     for name, cells in side_by_side(flown).items():
-        table.add_row(name, *cells)
-    return table
+        made.add_row(name, *cells)
+    return made
+
+
+def comparison_blocks(flown: Flown, precision: Precision | None = None) -> list[Block]:
+    """The same for a Markdown file or a page, with why the figures differ."""
+    rows = [(name.strip(), *cells) for name, cells in side_by_side(flown).items()]
+    told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
+    return [
+        Table(("", *_by_policy(flown)), rows),
+        Items([f"**{name}**{text}" if name else text for name, text in told]),
+    ]
 
 
 def comparison_markdown(flown: Flown, command: str, precision: Precision | None = None) -> str:
-    """The same for a Markdown file, between its markers, with why the figures differ."""
+    """The section of a Markdown file, between its markers."""
     first = flown.sorties[0].outcome
     head = f"`{command}`: {first['duration_s']:g} s, {len(first['battery'])} drones, {_seeds(flown)}"
     if first["ap50"]["scored_fusions"]:
         head += f", accuracy scored at {first['ap50']['sample_rate_hz']:g} Hz by `{first['ap50']['detector']}`"
         head += turns_in_words(first["ap50"])
-    what = " ".join(filter(None, [f"{head}.", _what_gains_are(flown)]))
-    cells = ((name.strip(), *values) for name, values in side_by_side(flown).items())
-    told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
-    lines = [
-        BEGIN,
-        "",
-        what,
-        "",
-        *table(("", *_by_policy(flown)), cells),
-        "",
-        *(f"- **{name}**{text}" if name else f"- {text}" for name, text in told),
-        "",
-        END,
-    ]
-    return "\n".join(lines)
+    what = Paragraph(f"{head}. {what_gains_are(flown)}".rstrip())
+    return f"{BEGIN}\n\n{markdown([what, *comparison_blocks(flown, precision)])}\n{END}"
 
 
 def compare_command(
@@ -82,19 +117,18 @@ def compare_command(
     most_seeds: int | None = None,
 ) -> str:
     """The command that gives the same comparison again."""
-    said = ["sortie", "compare", scenario, "--policies", policies]
-    said += [] if seed is None else ["--seed", str(seed)]
-    said += [] if seeds is None else ["--seeds", str(seeds)]
-    said += [x for override in overrides for x in ("--set", override)]
-    said += [] if half_width is None else ["--half-width", f"{half_width:g}"]
-    said += [] if metric is None else ["--metric", metric]
-    said += [] if pilot is None else ["--pilot", str(pilot)]
-    said += [] if most_seeds is None else ["--most-seeds", str(most_seeds)]
-    return shlex.join(said + ["--own-fusion"] * own_fusion)
-
-
-JAMMED = 0.5
-"""Of a policy's payloads: where so many miss their deadline, what is compared is a full channel."""
+    options = [
+        ("--policies", policies),
+        ("--seed", seed),
+        ("--seeds", seeds),
+        *(("--set", override) for override in overrides),
+        ("--half-width", None if half_width is None else f"{half_width:g}"),
+        ("--metric", metric),
+        ("--pilot", pilot),
+        ("--most-seeds", most_seeds),
+    ]
+    said = [str(word) for name, value in options if value is not None for word in (name, value)]
+    return shlex.join(["sortie", "compare", scenario, *said, *["--own-fusion"] * own_fusion])
 
 
 def heading(flown: Flown) -> str:
@@ -175,7 +209,8 @@ def _seeds(flown: Flown) -> str:
     return f"means of {len(seeds)} sorties, seeds {listed}, each with a town and random draws of its own"
 
 
-def _what_gains_are(flown: Flown) -> str:
+def what_gains_are(flown: Flown) -> str:
+    """What the gains are over, and what their intervals cover."""
     if not flown.gains:
         return ""
     covers = {
@@ -188,72 +223,33 @@ def _what_gains_are(flown: Flown) -> str:
 
 def side_by_side(flown: Flown) -> dict[str, list[str]]:
     """What is compared, a row each: its name and a cell a policy. Figures are means over the policy's sorties."""
+    policies, sorties = _by_policy(flown), len({s.seed for s in flown.sorties})
     gains = {(g.policy, g.metric): g for g in flown.gains}
-    sorties = {s.seed for s in flown.sorties}
 
-    def mean(*path: str, text: Callable[[Any], str]) -> list[str]:
-        values = [[_at(s.outcome, path) for s in of] for of in _by_policy(flown).values()]
-        return [text(mean_of_known(of)) + _some(sum(v is not None for v in of), len(sorties)) for of in values]
+    def means(value: Callable[[Any], float | None], text: Callable[[Any], str]) -> list[str]:
+        values = [[value(s.outcome) for s in of] for of in policies.values()]
+        return [text(mean_of_known(of)) + _some(sum(v is not None for v in of), sorties) for of in values]
 
-    def gain(metric: str) -> list[str]:
-        return [_gain(gains.get((policy, metric)), len(sorties)) for policy in _by_policy(flown)]
-
-    grounded = any(s.outcome["mission"]["flown_share"] < 1.0 for s in flown.sorties)
-    blind = {
-        area: mean("ap50", "grounded_blind", area, text=number) if grounded else []
-        for area in ("full_scene", "mission")
-    }
-    rows = {
-        "flown": mean("mission", "flown_share", text=percent) if grounded else [],
-        "AP@0.5 full scene": mean("ap50", "full_scene", text=number),
-        "  gain": gain("ap50.full_scene"),
-        "  grounded drones blind": blind["full_scene"],
-        "    gain": gain("ap50.grounded_blind.full_scene") if grounded else [],
-        "AP@0.5 mission": mean("ap50", "mission", text=number),
-        "  gain ": gain("ap50.mission"),
-        "  grounded drones blind ": blind["mission"],
-        "    gain ": gain("ap50.grounded_blind.mission") if grounded else [],
-        **_of_classes(flown, mean),
-        "data sent": mean("bytes", "data_sent", text=size),
-        "data delivered": mean("bytes", "data_delivered", text=size),
-        "  handshakes": mean("bytes", "handshakes_sent", text=size),
-        "deadlines missed": mean("deadline_miss_rate", text=percent),
-        "medium busy": mean("medium_busy_fraction", text=percent),
-        "context sent": mean("bytes", "context_sent", text=size),
-        "descriptors lost": mean("context", "lost", text=percent),
-        "data age, median": mean("data_age_s", "p50", text=lambda v: number(v, ".2f", "s")),
-        "energy": mean("energy_j", "total", text=_kilojoules),
-        "  radio": mean("energy_j", "radio", text=_kilojoules),
-        "  compute": mean("energy_j", "compute", text=_kilojoules),
-    }
-    least = [[min(s.outcome["battery"].values(), default=None) for s in of] for of in _by_policy(flown).values()]
-    rows["charge left, least"] = [percent(mean_of_known(values)) for values in least]
-    own = dict.fromkeys(name for s in flown.sorties for name in s.outcome["metrics"])
-    rows |= {f"metrics.{name}": mean("metrics", name, text=lambda v: number(v, ".4g")) for name in own}
-    return {name: cells for name, cells in rows.items() if cells}
-
-
-def _of_classes(flown: Flown, mean: Callable[..., list[str]]) -> dict[str, list[str]]:
-    """Rows of trucks and people, where a sortie has a figure of them."""
-
-    def known(*path: str) -> bool:
-        return any(_at(s.outcome, path) is not None for s in flown.sorties)
-
-    of = [name for name in PLURAL if name != "car" and known("ap_by_class", name, "full_scene")]
-    rows = {f"AP of {PLURAL[name]}, full scene": mean("ap_by_class", name, "full_scene", text=number) for name in of}
-    if known("people", "located_share"):
-        rows["people located"] = mean("people", "located_share", text=percent)
+    rows = {}
+    for name, place, text in ROWS:
+        value = partial(at, place=place.split("."))
+        if place.startswith(IF_GROUNDED) and all(s.outcome["mission"]["flown_share"] == 1.0 for s in flown.sorties):
+            continue
+        if place.startswith(IF_KNOWN) and all(value(s.outcome) is None for s in flown.sorties):
+            continue
+        gain = [_gain(gains.get((policy, place)), sorties) for policy in policies]
+        rows[name] = gain if text is None else means(value, text)
+    rows["charge left, least"] = means(lambda outcome: min(outcome["battery"].values(), default=None), percent)
+    for own in dict.fromkeys(name for s in flown.sorties for name in s.outcome["metrics"]):
+        rows[f"metrics.{own}"] = means(partial(at, place=("metrics", own)), lambda v: number(v, ".4g"))
     return rows
 
 
-def _at(result: Any, path: Sequence[str]) -> float | None:
-    for part in path:
-        result = result[part]
-    return None if result is None else float(result)
-
-
-def _kilojoules(value: float) -> str:
-    return f"{value / 1e3:.2f} kJ"
+def at(outcome: Any, place: Sequence[str]) -> float | None:
+    """A figure of an outcome."""
+    for part in place:
+        outcome = outcome[part]
+    return None if outcome is None else float(outcome)
 
 
 def _gain(gain: Gain | None, sorties: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from sortie.scenarios.reading.load import dump
 from sortie.scenarios.report_text import number, percent, size
 from sortie.scenarios.schema import Fleet, GroundStation
 from sortie.sim.folders import write_text
-from sortie.sim.results.html_page import Html, figures_html, html, html_page, joined, table, table_row
+from sortie.sim.results.blocks import Block, Code, Figure, Heading, Items, Paragraph, Table, Tiles, html_page
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.report_figures import colour, figures, moments
@@ -31,52 +32,41 @@ def save_page(record: SortieRecord, path: Path) -> None:
 
 def page(record: SortieRecord) -> str:
     """A run's page as HTML: no script, and nothing fetched from anywhere."""
+    return html_page(list(_blocks(record)))
+
+
+def _blocks(record: SortieRecord) -> Iterator[Block]:
     result, scenario = outcome(record), record.scenario
-    title = f"{scenario.name} under {record.policy}"
-    of = f"{scenario.fleet.drones} drones, {scenario.duration_s:g} s, seed {record.seed}, Sortie {record.version}"
-    body = html(
-        _BODY,
-        description=scenario.description,
-        tiles=joined(_tile(*tile) for tile in _tiles(result)),
-        happened=_happened(record),
-        figures=figures_html(figures(record)),
-        decisions=_decisions(result),
-        numbers=_numbers(result, scenario.fleet),
-        scenario=dump(scenario),
-        own_files=_own_files(result),
-        fingerprint=result["fingerprint"],
+    yield Heading(f"{scenario.name} under {record.policy}", 1)
+    yield Paragraph(
+        f"{scenario.fleet.drones} drones, {scenario.duration_s:g} s, seed {record.seed}, Sortie {record.version}"
     )
-    return html_page(title, of, body)
+    yield Paragraph(scenario.description)
+    yield Tiles(_tiles(result))
+    yield Heading("What happened")
+    yield Paragraph(
+        "Dashed lines: the mission's phase changes. Dotted lines: something happened to the fleet, by number:"
+    )
+    yield Items(_happened(record) or ["nothing"])
+    yield from (Figure(caption, svg=svg) for caption, svg in figures(record).items())
+    yield Heading("Who decided what, and why")
+    yield _decisions(result)
+    yield Heading("In numbers")
+    yield from _numbers(result, scenario.fleet)
+    yield Code(dump(scenario), folded="The scenario as it was flown")
+    if own := "\n".join(f"{name}  {digest}" for name, digest in result["own_files"].items()):
+        yield Code(own, folded="Own files, SHA-256")
+    yield Paragraph(
+        f"Fingerprint {result['fingerprint']}: the same scenario, policy, seed and version give the same one."
+    )
 
 
-_BODY = """<p>{description}</p>
-<div class="tiles">{tiles}</div>
-<h2>What happened</h2>
-<p>Dashed lines: the mission's phase changes. Dotted lines: something happened to the fleet, by number:</p>
-{happened}{figures}
-<h2>Who decided what, and why</h2>
-{decisions}
-<h2>In numbers</h2>
-{numbers}
-<details><summary>The scenario as it was flown</summary><pre>{scenario}</pre></details>
-{own_files}<footer>Fingerprint {fingerprint}: the same scenario, policy, seed and version give the same one.</footer>
-"""
-
-
-def _happened(record: SortieRecord) -> Html:
+def _happened(record: SortieRecord) -> list[str]:
     """The events by the numbers that they have in the figures."""
     events = moments(record)
-    items = [
-        html("<li><b>{}</b> {} s: {}</li>", k, f"{t_s:g}", "; ".join(texts))
-        for k, (t_s, texts) in enumerate(events[:MOST_EVENTS], start=1)
-    ]
-    if (more := len(events) - MOST_EVENTS) > 0:
-        items.append(html("<li>and {} more in the table below</li>", more))
-    return html('<ul class="events">{}</ul>', joined(items) or Html("<li>nothing</li>"))
-
-
-def _tile(name: str, value: str, note: str) -> Html:
-    return html('<div class="tile"><span>{}</span><b>{}</b><span>{}</span></div>', name, value, note)
+    items = [f"**{k}** {t_s:g} s: {'; '.join(texts)}" for k, (t_s, texts) in enumerate(events[:MOST_EVENTS], start=1)]
+    more = len(events) - MOST_EVENTS
+    return [*items, f"and {more} more in the table below"] if more > 0 else items
 
 
 def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -130,35 +120,20 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _own_files(result: dict[str, Any]) -> Html:
-    """The files beside the package that flew, with their digests; empty where there are none."""
-    lines = "\n".join(f"{name}  {digest}" for name, digest in result["own_files"].items())
-    page = "<details><summary>Own files, SHA-256</summary><pre>{}</pre></details>\n"
-    return html(page, lines) if lines else Html()
-
-
-def _decisions(result: dict[str, Any]) -> Html:
-    """Decisions and events in one list, in order of time."""
-    rows = [
-        (t["t_s"], "", html('<i style="background:{}"></i>{}', colour(t["drone"]), decision_in_words(t)))
-        for t in result["transitions"]
-    ]
-    rows += [(e["t_s"], Html(' class="event"'), html("{}", event_in_words(e))) for e in result["events"]]
+def _decisions(result: dict[str, Any]) -> Block:
+    """Decisions and events in one table, in order of time; decisions have their drone's colour."""
+    rows = [(t["t_s"], colour(t["drone"]), decision_in_words(t)) for t in result["transitions"]]
+    rows += [(e["t_s"], "", event_in_words(e)) for e in result["events"]]
+    rows.sort(key=lambda row: row[0])
     if not rows:
-        return Html("<p>Nobody ever sent anything, and nothing happened to the fleet.</p>")
-    return table(
-        *(
-            html('<tr{}><td class="t">{} s</td><td>{}</td></tr>', kind, f"{t_s:.2f}", text)
-            for t_s, kind, text in sorted(rows, key=lambda r: r[0])
-        )
-    )
+        return Paragraph("Nobody ever sent anything, and nothing happened to the fleet.")
+    return Table((), [(f"{t_s:.2f} s", text) for t_s, _, text in rows], [ink for _, ink, _ in rows])
 
 
-def _numbers(result: dict[str, Any], fleet: Fleet) -> Html:
+def _numbers(result: dict[str, Any], fleet: Fleet) -> tuple[Table, Table]:
     """Phases, then drones and ground stations."""
     phases = [
-        table_row(
-            "td",
+        (
             f"{p['phase']}, {p['begin_s']:g}–{p['end_s']:g} s",
             number(p["ap50"]["full_scene"]),
             number(p["ap50"]["mission"]),
@@ -169,16 +144,17 @@ def _numbers(result: dict[str, Any], fleet: Fleet) -> Html:
         for p in result["phases"]
     ]
     drones = [_drone_row(i, d, fleet.station(int(i))) for i, d in result["drones"].items()]
-    head = table_row("th", "phase", "AP full scene", "AP mission", "data", "deadlines missed", "descriptors lost")
-    other = table_row("th", "drone", "charge left", "energy", "voltage", "AP full scene", "AP mission", "at the end")
-    return html("{}<br>{}", table(head, *phases), table(other, *drones))
+    return (
+        Table(("phase", "AP full scene", "AP mission", "data", "deadlines missed", "descriptors lost"), phases),
+        Table(("drone", "charge left", "energy", "voltage", "AP full scene", "AP mission", "at the end"), drones),
+    )
 
 
-def _drone_row(drone_id: str, drone: dict[str, Any], station: GroundStation | None) -> Html:
+def _drone_row(drone_id: str, drone: dict[str, Any], station: GroundStation | None) -> list[str]:
     """A drone or a ground station at the end."""
     energy = [percent(drone["soc"]), f"{drone['energy_j'] / 1e3:.1f} kJ", f"{drone['voltage_v']:.2f} V"]
     if station is not None and station.mains:
         energy = ["mains", "", ""]
     name, up, down = ("drone", "flying", "down") if station is None else ("station", "on", "off")
     accuracy = [number(drone["ap50"][area]) for area in ("full_scene", "mission")]
-    return table_row("td", f"{name} {drone_id}", *energy, *accuracy, up if drone["airborne"] else down)
+    return [f"{name} {drone_id}", *energy, *accuracy, up if drone["airborne"] else down]

@@ -145,9 +145,10 @@ def rows_of(tmp_path: Path, text: str, value: object, metric: str = "bytes.data_
 
 def report_lines(rows: CampaignRows, folder: Path) -> list[str]:
     """A campaign's report without its figures."""
-    from sortie.sim.experiment.report import _lines
+    from sortie.sim.experiment.report import report_blocks
+    from sortie.sim.results.blocks import markdown
 
-    return list(_lines(rows, folder, {"varied.png": False, "pareto.png": False}))
+    return markdown(report_blocks(rows, folder)).splitlines()
 
 
 def failed(task: Task, error: str = "ValueError: planted") -> Flight:

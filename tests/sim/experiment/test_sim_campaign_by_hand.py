@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from campaign_examples import plan
+from campaign_examples import plan, report_lines
 
 from sortie.sim.experiment import figures, report
 from sortie.sim.experiment.flight import Flight
 from sortie.sim.experiment.plan import CampaignPlan
 from sortie.sim.experiment.rows import CampaignRows
 from sortie.sim.experiment.store import CampaignStore, columns
+from sortie.sim.results.blocks import markdown
 
 TEXT = """
 campaign: by_hand
@@ -67,7 +68,7 @@ def rows(tmp_path: Path, failed: dict[int, str] | None = None) -> CampaignRows:
 
 
 def told(flown: CampaignRows, tmp_path: Path) -> str:
-    return "\n".join(report._lines(flown, tmp_path, {"varied.png": False, "pareto.png": False}))
+    return "\n".join(report_lines(flown, tmp_path))
 
 
 def amount(mean: float, step: float) -> str:
@@ -135,9 +136,10 @@ def test_of_many_failures_the_first_twenty_are_listed(tmp_path: Path) -> None:
                 "status": ["failed"] * count + ["done"] * (24 - count),
             }
         )
-        lines = list(report._failed(CampaignRows(p, table, np.zeros(24, np.int64), np.zeros(24, np.int64)), tmp_path))
+        flown = CampaignRows(p, table, np.zeros(24, np.int64), np.zeros(24, np.int64))
+        lines = markdown(report._failed(flown, tmp_path)).splitlines()
         assert [line.split(" ")[2] for line in lines if line.startswith("- run")] == [str(k) for k in range(20)]
-        assert (f"The first 20 of {count}; the table's column `error` has all.\n" in lines) == (count > 20)
+        assert (f"The first 20 of {count}; the table's column `error` has all." in lines) == (count > 20)
 
 
 class Drawn:

@@ -22,7 +22,7 @@ from sortie.sim.experiment.comparison_text import (
     side_by_side,
 )
 from sortie.sim.experiment.half_width import Contrast, Precision
-from sortie.sim.studies import comparison_page
+from sortie.sim.experiment import comparison_page
 
 
 def flown(seeds: tuple[int, ...] = (3, 4)) -> Flown:
