@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
@@ -35,43 +36,30 @@ def place_text(place: tuple[int, int]) -> str:
 
 def summary(ranked: Ranked) -> Summary:
     """The ranking as it is printed: tables of 80 columns, and what they say of the policies that were asked for."""
-    title = f"{ranked.suite} ({ranked.digest}), {ranked.conditions} conditions, {ranked.detector}"
-    tables = [
-        _table(
-            ranked,
-            title,
-            {
-                "AP, 95 % interval": lambda r: interval(r.score.mean, r.score.low, r.score.high, lambda v: f"{v:.3f}"),
-                "mission": _of("ap50.mission", number),
-                "full": _of("ap50.full_scene", number),
-                "HOTA": _of("tracking.hota", number),
-                "failed": lambda r: f"{len(r.failed)}" if r.failed else NONE,
-            },
-        ),
-        _table(
-            ranked,
-            "mission and cost, a sortie",
-            {
-                "found": _of("mission.target_detected_share", percent),
-                "seen": _of("mission.region_observed_share", percent),
-                "data": _of("bytes.data_sent", size),
-                "missed": _of("deadline_miss_rate", percent),
-                "energy": lambda r: number(r.energy_j / 1e3, ".2f", "kJ"),
-            },
-        ),
-        _table(
-            ranked,
-            "context, rules and time, a sortie",
-            {
-                "context": _of("bytes.context_sent", size),
-                "radio": _of("energy_j.radio", lambda v: f"{v:.0f} J"),
-                "unsafe": _of("policies.violated_ticks", lambda v: f"{v:.0f}"),
-                "verified": lambda r: ranked.verified[r.policy].text,
-                "decides": lambda r: number(ranked.decision_us(r.policy), ".0f", "µs"),
-            },
-        ),
-    ]
-    return Summary(*tables, *sentences(ranked))
+    tables: dict[str, dict[str, Callable[[Standing], str]]] = {
+        f"{ranked.suite} ({ranked.digest}), {ranked.conditions} conditions, {ranked.detector}": {
+            "AP, 95 % interval": lambda r: interval(r.score.mean, r.score.low, r.score.high, lambda v: f"{v:.3f}"),
+            "mission": _of("ap50.mission", number),
+            "full": _of("ap50.full_scene", number),
+            "HOTA": _of("tracking.hota", number),
+            "failed": lambda r: f"{len(r.failed)}" if r.failed else NONE,
+        },
+        "mission and cost, a sortie": {
+            "found": _of("mission.target_detected_share", percent),
+            "seen": _of("mission.region_observed_share", percent),
+            "data": _of("bytes.data_sent", size),
+            "missed": _of("deadline_miss_rate", percent),
+            "energy": lambda r: number(r.energy_j / 1e3, ".2f", "kJ"),
+        },
+        "context, rules and time, a sortie": {
+            "context": _of("bytes.context_sent", size),
+            "radio": _of("energy_j.radio", lambda v: f"{v:.0f} J"),
+            "unsafe": _of("policies.violated_ticks", lambda v: f"{v:.0f}"),
+            "verified": lambda r: ranked.verified[r.policy].text,
+            "decides": lambda r: number(ranked.decision_us(r.policy), ".0f", "µs"),
+        },
+    }
+    return Summary(*(_table(ranked, title, columns) for title, columns in tables.items()), *sentences(ranked))
 
 
 def _table(ranked: Ranked, title: str, columns: Mapping[str, Callable[[Standing], str]]) -> Table:
@@ -192,8 +180,7 @@ def draw(ranked: Ranked, path: Path) -> Path:
     figure = Figure(figsize=(10, 6.5), dpi=120, layout="constrained")
     ax = figure.subplots()
     rows = [r for r in ranked.rows if r.figures["bytes.data_sent"].count]  # the others failed everywhere
-    sent = [r.figures["bytes.data_sent"].mean / 1e6 for r in rows]
-    seen = [r.score.mean for r in rows]
+    sent, seen = [r.figures["bytes.data_sent"].mean / 1e6 for r in rows], [r.score.mean for r in rows]
     front = on_front(sent, seen)
     colours = [
         "tab:red" if row.policy in ranked.entries else "tab:blue" if best else "0.45"
@@ -231,13 +218,10 @@ def draw(ranked: Ranked, path: Path) -> Path:
 
 def _spread(heights: Sequence[float], apart: float = 0.044) -> list[float]:
     """Heights of labels, from the top down: near those of their points, and so far apart that none covers another."""
-    found: list[float] = []
-    for height in heights:
-        found.append(min(height, found[-1] - apart) if found else height)
-    lift = max(0.0, -min(found, default=0.0))
-    for k in range(len(found) - 1, -1, -1):  # what was pushed below the axes goes up again
-        below = found[k + 1] + apart if k + 1 < len(found) else found[k] + lift
-        found[k] = max(found[k], below if lift else found[k])
+    steps = apart * np.arange(len(heights))
+    down = np.minimum.accumulate(np.array(heights) + steps) - steps
+    down[-1:] = np.maximum(down[-1:], 0.0)  # what was pushed below the axes goes up again
+    found: list[float] = (np.maximum.accumulate((down + steps)[::-1])[::-1] - steps).tolist()
     return found
 
 

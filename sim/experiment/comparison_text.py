@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-from rich import table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from sortie.radio.transmission import Status
@@ -71,25 +72,23 @@ class Line(NamedTuple):
         return Text.assemble((self.name, "bold"), self.text)
 
 
-def comparison_table(flown: Flown) -> table.Table:
+def comparison_table(flown: Flown) -> RichTable:
     """Policies side by side, a column each; gains are over the first, in AP points with paired 95 % intervals."""
-    made = titled(heading(flown), caption=what_gains_are(flown) or None)
-    made.add_column("", style="bold")
+    table = titled(heading(flown), caption=what_gains_are(flown) or None)
+    table.add_column("", style="bold")
     for policy in _by_policy(flown):
-        made.add_column(policy, justify="right", overflow="fold")
+        table.add_column(policy, justify="right", overflow="fold")
     for name, cells in side_by_side(flown).items():
-        made.add_row(name, *cells)
-    return made
+        table.add_row(name, *cells)
+    return table
 
 
 def comparison_blocks(flown: Flown, precision: Precision | None = None) -> list[Block]:
     """The same for a Markdown file or a page, with why the figures differ."""
     rows = [(name.strip(), *cells) for name, cells in side_by_side(flown).items()]
     told = [*explanations(flown), *([] if precision is None else precision_lines(precision))]
-    return [
-        Table(("", *_by_policy(flown)), rows),
-        Items([f"**{name}**{text}" if name else text for name, text in told]),
-    ]
+    items = [f"**{name}**{text}" if name else text for name, text in told]
+    return [Table(("", *_by_policy(flown)), rows), Items(items)]
 
 
 def comparison_markdown(flown: Flown, command: str, precision: Precision | None = None) -> str:
@@ -140,24 +139,22 @@ def heading(flown: Flown) -> str:
 def explanations(flown: Flown) -> Iterator[Line]:
     """Why the figures differ, a line a policy, from the records of all its sorties."""
     for policy, sorties in _by_policy(flown).items():
-        fates: dict[str, int] = {}
+        fates: Counter[str] = Counter()
         for s in sorties:
-            for fate, n in s.outcome["payload_fates"].items():
-                fates[fate] = fates.get(fate, 0) + n
+            fates.update(s.outcome["payload_fates"])
         total, in_all = sum(fates.values()), " in all sorties" * (len(sorties) > 1)
         if not total:
             yield Line(policy, ": sent nothing; every drone saw with its own eyes only")
             continue
-        parts = ", ".join(f"{percent(n / total)} {fate}" for fate, n in sorted(fates.items(), key=lambda f: -f[1]))
+        parts = ", ".join(f"{percent(n / total)} {fate}" for fate, n in fates.most_common())
         age = mean_of_known(s.outcome["data_age_s"]["p50"] for s in sorties)
         fused = "nothing fused" if age is None else f"fused data {age:.2f} s old at the median"
         yield Line(policy, f": {total} payloads{in_all}, {parts}; {fused}")
         late = sum(n for fate, n in fates.items() if fate.startswith(Status.EXPIRED))
         if late >= JAMMED * total:
             cure = f"compare it with a smaller budget as well, {policy}(received_budget=0.1) for one"
-            yield Line(
-                policy, f": the channel is full, {percent(late / total)} of its payloads miss their deadline; {cure}"
-            )
+            missed = f"{percent(late / total)} of its payloads miss their deadline"
+            yield Line(policy, f": the channel is full, {missed}; {cure}")
 
 
 def precision_lines(found: Precision) -> Iterator[Line]:
@@ -166,11 +163,8 @@ def precision_lines(found: Precision) -> Iterator[Line]:
     widest = max((c.half_width for c in found.contrasts if c.metric == found.metric), default=math.nan)
     verdict = "reached" if found.reached else "not reached, as the seeds were used up: --most-seeds allows more"
     width = f"{100 * widest:.2f} AP points" if widest else f"none, as the gains are all equal in {found.paired} seeds"
-    yield Line(
-        "half-width",
-        f" of {found.metric}: {width}, {100 * found.asked:g} asked, {verdict}; "
-        "intervals are widened for stopping there",
-    )
+    asked = f"{100 * found.asked:g} asked, {verdict}; intervals are widened for stopping there"
+    yield Line("half-width", f" of {found.metric}: {width}, {asked}")
     further = f", and {found.further} further seeds by the surrogate" if found.further else ""
     correlate = f"gains in the surrogate's scores correlate with those in {name}'s:"
     yield Line("flown", f": {found.paired} seeds by {name}{further}; {correlate}")
@@ -179,16 +173,11 @@ def precision_lines(found: Precision) -> Iterator[Line]:
         known = f"correlation {number(c.correlation)}, predicted variance {percent(c.explained)}, {used}"
         yield Line("", f"  {c.policy}, {c.metric}: {known}")
     if not found.control:
-        yield Line(
-            f"{name} alone",
-            f": the surrogate was not used, because {name} alone reaches the half-width about as "
-            "cheaply. Gains are plain means over the seeds",
-        )
-    yield Line(
-        "cost",
-        f": {found.seconds[0]:.1f} s of processor time for a seed by {name}, {found.seconds[1]:.1f} s by the surrogate; in all "
-        f"{number(found.cost_ratio, '.2f')} of what {name} alone is predicted to take",
-    )
+        why = f"the surrogate was not used, because {name} alone reaches the half-width about as cheaply"
+        yield Line(f"{name} alone", f": {why}. Gains are plain means over the seeds")
+    each = "{:.1f} s of processor time for a seed by {}, {:.1f} s by the surrogate"
+    in_all = f"in all {number(found.cost_ratio, '.2f')} of what {name} alone is predicted to take"
+    yield Line("cost", f": {each.format(found.seconds[0], name, found.seconds[1])}; {in_all}")
 
 
 def _by_policy(flown: Flown) -> dict[str, list[Compared]]:
@@ -203,10 +192,9 @@ def _seeds(flown: Flown) -> str:
     seeds = list(dict.fromkeys(s.seed for s in flown.sorties))
     if len(seeds) == 1:
         return f"seed {seeds[0]}, in this town, this flight"
-    listed = (
-        f"{seeds[0]} to {seeds[-1]}" if seeds == list(range(seeds[0], seeds[-1] + 1)) else ", ".join(map(str, seeds))
-    )
-    return f"means of {len(seeds)} sorties, seeds {listed}, each with a town and random draws of its own"
+    in_a_row = seeds == list(range(seeds[0], seeds[-1] + 1))
+    which = f"{seeds[0]} to {seeds[-1]}" if in_a_row else ", ".join(map(str, seeds))
+    return f"means of {len(seeds)} sorties, seeds {which}, each with a town and random draws of its own"
 
 
 def what_gains_are(flown: Flown) -> str:
