@@ -109,17 +109,7 @@ def test_ctrl_c_while_a_sortie_flies_is_one_line(
     assert not (tmp_path / "run").exists()
 
 
-HEAVY = {
-    "torch",
-    "numba",
-    "scipy.stats",
-    "scipy.signal",
-    "scipy.interpolate",
-    "networkx",
-    "rerun",
-    "matplotlib",
-    "jinja2",
-}
+HEAVY = {"torch", "numba", "scipy.stats", "scipy.signal", "scipy.interpolate", "networkx", "rerun", "matplotlib"}
 """Each takes from a fifth of a second to some seconds, for which users and workers of a campaign would wait."""
 LOADED = """
 import sys

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from sortie import Comparison
 from sortie._run import Metrics, UnknownMetricError
+from sortie.sim.experiment import comparison_page
 from sortie.sim.experiment.compare import BY_BOTH, Compared, Flown, Gain
 from sortie.sim.experiment.comparison_text import (
     comparison_markdown,
@@ -22,7 +23,6 @@ from sortie.sim.experiment.comparison_text import (
     side_by_side,
 )
 from sortie.sim.experiment.half_width import Contrast, Precision
-from sortie.sim.experiment import comparison_page
 
 
 def flown(seeds: tuple[int, ...] = (3, 4)) -> Flown:
