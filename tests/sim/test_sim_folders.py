@@ -19,7 +19,7 @@ from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.folders import RunError, ensure_files, ensure_folder, write_text
 from sortie.sim.readme import with_section
 from sortie.sim.results import run_folder
-from sortie.sim.results.html_page import GENERATOR
+from sortie.sim.results.blocks import GENERATOR
 
 FLY = "from sortie.sim.cli.app import main; main()"
 KILLED = """

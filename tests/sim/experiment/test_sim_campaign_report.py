@@ -143,6 +143,10 @@ def test_the_report_tells_all_of_it_and_the_same_each_time(tmp_path: Path) -> No
         "## Where the winner changes",
     ):
         assert part in text
+    page = (folder / "report.html").read_text("utf-8")
+    assert [f"## {heading}" for heading in re.findall("<h2>(.*)</h2>", page)] == re.findall("## .*", text)
+    assert page.count("<tr>") == len(re.findall(r"^\|(?!---)", text, re.MULTILINE))
+    assert page.count("data:image/png;base64,") == text.count("![") == 1
     assert (folder / "varied.png").stat().st_size > 10_000
     means = read_rows(folder).by_unit("bytes.data_sent")
     soc = [p.varied(2 * u)["fleet.battery.initial_soc"] for u in range(6)]
