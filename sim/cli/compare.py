@@ -26,7 +26,7 @@ from sortie.sim.experiment.compare import MOST_SEEDS, Flown, chosen_seeds, in_to
 from sortie.sim.experiment.comparison_text import BEGIN, END, comparison_markdown
 from sortie.sim.folders import RunError, ensure_files, write_text
 from sortie.sim.readme import with_section
-from sortie.sim.results.html_page import GENERATOR
+from sortie.sim.results.blocks import GENERATOR
 from sortie.sim.results.run_files import RECORDING_MARK
 
 PRECISE = ("metric", "pilot", "most_seeds")

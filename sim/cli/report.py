@@ -11,7 +11,7 @@ import sortie
 from sortie.sim.cli.console import print_written
 from sortie.sim.cli.options import ReplaceOption
 from sortie.sim.folders import ensure_files
-from sortie.sim.results.html_page import GENERATOR
+from sortie.sim.results.blocks import GENERATOR
 from sortie.sim.results.run_files import PAGE
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -100,34 +99,6 @@ def comparison_markdown(flown: Flown, command: str, precision: Precision | None 
         head += turns_in_words(first["ap50"])
     what = Paragraph(f"{head}. {what_gains_are(flown)}".rstrip())
     return f"{BEGIN}\n\n{markdown([what, *comparison_blocks(flown, precision)])}\n{END}"
-
-
-def compare_command(
-    scenario: str,
-    policies: str,
-    seed: int | None,
-    seeds: int | None,
-    overrides: Sequence[str],
-    *,
-    own_fusion: bool,
-    half_width: float | None = None,
-    metric: str | None = None,
-    pilot: int | None = None,
-    most_seeds: int | None = None,
-) -> str:
-    """The command that gives the same comparison again."""
-    options = [
-        ("--policies", policies),
-        ("--seed", seed),
-        ("--seeds", seeds),
-        *(("--set", override) for override in overrides),
-        ("--half-width", None if half_width is None else f"{half_width:g}"),
-        ("--metric", metric),
-        ("--pilot", pilot),
-        ("--most-seeds", most_seeds),
-    ]
-    said = [str(word) for name, value in options if value is not None for word in (name, value)]
-    return shlex.join(["sortie", "compare", scenario, *said, *["--own-fusion"] * own_fusion])
 
 
 def heading(flown: Flown) -> str:

@@ -5,12 +5,14 @@ What the commands call is stood in for, so that nothing is flown.
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import typer
 from campaign_examples import Pretended, plan
 from cli_examples import Seen, command, run_line, table_rows
 from sim_examples import BASE, example
@@ -19,9 +21,9 @@ import sortie
 from sortie.fleet.logs.geodesy import Origin
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.reading.load import ScenarioError
-from sortie.sim.cli import console, fly
+from sortie.sim.cli import compare, console, fly
 from sortie.sim.cli import verify as verify_command
-from sortie.sim.cli.options import loaded, split_policies
+from sortie.sim.cli.options import loaded, same_command, split_policies
 from sortie.sim.experiment.drive import run_campaign
 from sortie.sim.experiment.worst import Worst
 from sortie.sim.results import run_folder
@@ -142,6 +144,15 @@ def test_every_option_arrives_in_its_place(here: Path, monkeypatch: pytest.Monke
         if code != 2 or [(args, kwargs)] != seen.calls:
             wrong[line] = (code, seen.calls)
     assert wrong == {}
+
+
+def test_the_command_of_a_comparison_is_the_one_that_was_given_without_its_outputs() -> None:
+    app = typer.Typer()
+    app.command("compare")(compare.compare)
+    given = "track_target --policies 'worked,best-2(rho=0.1)' --seed 4 --set a=1 --set b=2 --half-width 0.02 --pilot 8 --own-fusion"
+    outputs = "--out a.json --report a.html --readme a.md --replace --kept b --workers 2"
+    context = typer.main.get_command(app).make_context("compare", shlex.split(f"{given} {outputs}"))
+    assert same_command(context, compare.OUTPUTS) == f"sortie compare {given}"
 
 
 def test_fly_and_live_pass_on_the_scenario_with_its_changes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ import sortie
 from sortie.scenarios.reading.load import loads
 from sortie.sim.experiment import half_width
 from sortie.sim.experiment.compare import Contender
-from sortie.sim.experiment.comparison_text import compare_command, precision_lines
+from sortie.sim.experiment.comparison_text import precision_lines
 from sortie.sim.experiment.detectors import KeepsMoments
 from sortie.sim.experiment.half_width import FURTHER, METRICS, Batch, Flown, Row, Settings, next_batch, precision_of
 
@@ -144,13 +144,6 @@ def test_nothing_can_be_planned_without_gains() -> None:
         flown.add(row("surrogate", seed, None))
     with pytest.raises(sortie.SortieError, match=r"ap50\.full_scene: fewer than two of 12 seeds have a gain"):
         next_batch(flown, ["silence"], Settings(0.01))
-
-
-def test_the_command_that_gives_the_comparison_again_has_its_pilot_and_its_most_seeds() -> None:
-    options = {"own_fusion": False, "half_width": 0.02, "pilot": 8, "most_seeds": 90}
-    told = compare_command("track_target", "worked,silence", 4, None, [], **options)
-    again = "track_target --policies worked,silence --seed 4 --half-width 0.02 --pilot 8 --most-seeds 90"
-    assert told == f"sortie compare {again}"
 
 
 def _rows(by: str, count: int) -> list[Row]:
