@@ -386,7 +386,7 @@ class CampaignResult:
         return read_rows(self.path).all
 
     def report(self) -> Path:
-        """Write `report.md` with its figures into the folder, and return its path.
+        """Write `report.md` and `report.html` with their figures into the folder; returns the path of the first.
 
         Raises:
             RunError: nothing is finished, matplotlib is missing, or the files cannot be written.

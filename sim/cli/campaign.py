@@ -138,7 +138,7 @@ def run(
 
 @app.command("report")
 def report(folder: Annotated[Path, typer.Argument(help="A campaign's folder.")]) -> None:
-    """Write report.md and its figures from the finished runs."""
+    """Write report.md, report.html and their figures from the finished runs."""
     from sortie.sim.experiment.report import write_report
     from sortie.sim.experiment.store import TABLE
 
