@@ -289,10 +289,11 @@ def compare(
         how = "; give functions of one name, such as lambdas, a __name__ of their own"
         raise PolicyError(f"policies: {', '.join(labels) or 'none'}, must be one or more, each named once{how}")
     path, named = _kept(kept)
+    flown = [contender._replace(named=named) for contender in flown]
     if half_width is not None:
         settings = _precision_settings(half_width, seeds, metric, pilot, most_seeds)
         with _stages_shown(progress) as watch:
-            return Comparison(*compare_to(flown, settings, path, watch, named=named))
+            return Comparison(*compare_to(flown, settings, path, watch))
     for name, value in (("metric", metric), ("pilot", pilot), ("most_seeds", most_seeds)):
         if value is not None:
             raise RunError(f"{name}: goes with half_width, which is missing")
@@ -307,7 +308,7 @@ def compare(
         raise ScenarioError(f"seeds: {chosen}, must be one or more, each named once")
     with _shown(progress, base.name, len(flown) * len(chosen) * base.duration_s) as watch:
         shown = _summed(watch) if progress is True else watch
-        return Comparison(*compare_policies(flown, chosen, progress=shown, workers=workers, kept=path, named=named))
+        return Comparison(*compare_policies(flown, chosen, progress=shown, workers=workers, kept=path))
 
 
 def _kept(kept: str | Path | bool | None) -> tuple[Path | None, bool]:

@@ -46,6 +46,8 @@ class Contender(NamedTuple):
     """With this policy in it; otherwise alike among contenders."""
     function: Policy | None = None
     """Decides in place of the scenario's policy; None where the scenario names it."""
+    named: bool = False
+    """Whether the function's name and file decide what it does, so that its flights may be kept."""
 
     def with_own_fusion(self) -> Contender:
         """The same with the fusion that its method was published with, where it is a prior method, and with that fusion's network.
@@ -141,7 +143,6 @@ def compare(
     progress: Callable[[str, int, float], None] | None = None,
     workers: int = 1,
     kept: Path | None = None,
-    named: bool = False,
 ) -> Flown:
     """Fly a scenario under several policies on the same seeds.
 
@@ -151,7 +152,6 @@ def compare(
         progress: called with the label, the seed and the simulated time.
         workers: more than one fly in processes of their own; a policy that is a function flies in this one.
         kept: the file that flights are taken from, and kept in.
-        named: keep those of functions too.
 
     Raises:
         PolicyError: an unknown policy or parameter, before anything is flown.
@@ -161,7 +161,7 @@ def compare(
     asked = [(seed, contender) for seed in seeds for contender in contenders]
     towns = [c.scenario if len(seeds) == 1 else in_town_of(c.scenario, seed) for seed, c in asked]
     tasks = [
-        task_of(town, (OUTCOME, MATCHED), seed=seed, function=c.function, named=named)
+        task_of(town, (OUTCOME, MATCHED), seed=seed, function=c.function, named=c.named)
         for town, (seed, c) in zip(towns, asked, strict=True)
     ]
     records: dict[int, SortieRecord] = {}

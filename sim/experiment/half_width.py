@@ -63,17 +63,6 @@ Report = Callable[[str, int, float], None]
 """Called with a stage, the seeds flown in it and all its seeds."""
 
 
-class Kept(NamedTuple):
-    """Where flights are kept."""
-
-    file: Path | None = None
-    functions: bool = False
-    """Whether those of functions are kept too."""
-
-
-NOT_KEPT = Kept()
-
-
 class Row(NamedTuple):
     """One seed by one detector, under all policies."""
 
@@ -250,7 +239,7 @@ def with_detector(contender: Contender, detector: str) -> Contender:
     return contender._replace(scenario=build(changed.model_dump(mode="json", exclude_none=True), source=scenario.name))
 
 
-def fly_torch(contenders: Sequence[Contender], seed: int, kept: Kept = NOT_KEPT) -> Row:
+def fly_torch(contenders: Sequence[Contender], seed: int, kept: Path | None = None) -> Row:
     """One seed under every policy by the detector of the contenders' scenarios, which they share."""
     flights = _fly(contenders, seed, SHARED, (OUTCOME, MATCHED, PROCESSOR_S), kept)
     gains = gains_between([c.label for c in contenders], [flight.values[MATCHED][0] for flight in flights])
@@ -258,7 +247,7 @@ def fly_torch(contenders: Sequence[Contender], seed: int, kept: Kept = NOT_KEPT)
     return Row("torch", seed, gains, _processor_s(flights), outcomes)
 
 
-def fly_surrogate(contenders: Sequence[Contender], seed: int, draws: int = DRAWS, kept: Kept = NOT_KEPT) -> Row:
+def fly_surrogate(contenders: Sequence[Contender], seed: int, draws: int = DRAWS, kept: Path | None = None) -> Row:
     """One seed under every policy by the surrogate; gains are means over draws of its boxes."""
     flights = _fly(contenders, seed, f"{SURROGATE_DRAWS} {draws}", (MATCHED, PROCESSOR_S), kept)
     labels = [c.label for c in contenders]
@@ -266,7 +255,9 @@ def fly_surrogate(contenders: Sequence[Contender], seed: int, draws: int = DRAWS
     return Row("surrogate", seed, _mean_of([gains_between(labels, draw) for draw in of_draws]), _processor_s(flights))
 
 
-def _fly(contenders: Sequence[Contender], seed: int, seen_by: str, figures: Sequence[str], kept: Kept) -> list[Flight]:
+def _fly(
+    contenders: Sequence[Contender], seed: int, seen_by: str, figures: Sequence[str], kept: Path | None
+) -> list[Flight]:
     towns = [in_town_of(c.scenario, seed) for c in contenders]
     group = ""
     if seen_by == SHARED:  # boxes depend on who shares the detector
@@ -277,10 +268,10 @@ def _fly(contenders: Sequence[Contender], seed: int, seen_by: str, figures: Sequ
         group = f"{seed} {hashlib.sha256(together.encode()).hexdigest()}"
     return fly_all(
         [
-            task_of(town, figures, seed=seed, function=c.function, named=kept.functions, seen_by=seen_by, group=group)
+            task_of(town, figures, seed=seed, function=c.function, named=c.named, seen_by=seen_by, group=group)
             for c, town in zip(contenders, towns, strict=True)
         ],
-        kept=kept.file,
+        kept=kept,
     )
 
 
@@ -289,13 +280,13 @@ def _processor_s(flights: Sequence[Flight]) -> float:
 
 
 def run(
-    contenders: Sequence[Contender], settings: Settings, kept: Kept = NOT_KEPT, report: Report | None = None
+    contenders: Sequence[Contender], settings: Settings, kept: Path | None = None, report: Report | None = None
 ) -> Flown:
     """Fly batches until the intervals are narrow enough or the seeds are used up.
 
     Args:
         contenders: two or more; their scenarios have the detector that answers.
-        kept: where flights are taken from, and kept.
+        kept: the file that flights are taken from, and kept in.
         report: called after each seed.
 
     Raises:
@@ -435,8 +426,6 @@ def compare_to(
     settings: Settings,
     kept: Path | None,
     report: Report | None = None,
-    *,
-    named: bool = False,
 ) -> Answered:
     """Compare policies until the intervals of a metric are narrow enough.
 
@@ -444,7 +433,6 @@ def compare_to(
         contenders: two or more. Their scenario's detector answers; where it is the surrogate, the torch detector.
         kept: keeps what is flown, so that the same call goes on after an interruption; None keeps nothing.
         report: called with a stage, the seeds flown in it and all its seeds.
-        named: keep the flights of functions too.
 
     Raises:
         RunError: a detector that cannot answer, or a file that cannot be used.
@@ -459,6 +447,6 @@ def compare_to(
     detector = "torch" if asked == "surrogate" else asked
     answering = [with_detector(c, detector) for c in contenders]
     with user_errors():
-        flown = run(answering, settings, Kept(kept, named), report)
+        flown = run(answering, settings, kept, report)
     precision = precision_of(flown, [c.label for c in contenders[1:]], settings, detector)
     return Answered(*results(flown, answering), precision)

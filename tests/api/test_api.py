@@ -224,7 +224,7 @@ def test_a_comparison_to_a_half_width_is_a_comparison(monkeypatch: pytest.Monkey
     """The surrogate stands for torch; the command prints and writes the same."""
     fly = half_width.fly_torch
 
-    def stand_in(contenders: Sequence[Contender], seed: int, kept: half_width.Kept) -> half_width.Row:
+    def stand_in(contenders: Sequence[Contender], seed: int, kept: Path | None) -> half_width.Row:
         cheap = [half_width.with_detector(c, "surrogate") for c in contenders]
         return fly(cheap, seed, kept)._replace(processor_s=10.0)
 
