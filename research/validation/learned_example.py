@@ -24,7 +24,7 @@ from sortie.scenarios.intervals import Estimate, mean_interval
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.env import COST_PER_KJ, COST_PER_MB
 from sortie.sim.experiment.conditions import scenario_of
-from sortie.sim.experiment.flights import Flights
+from sortie.sim.experiment.places import Flights
 from sortie.sim.experiment.rank import SUITE, Entry, Ranked, load_suite, rank
 
 PAGE = ROOT / "docs/guide/learn.md"

@@ -13,9 +13,8 @@ from research.validation.stored import ROOT, Cell, Column, Table
 from sortie.policies.registry import POLICIES, resolve
 from sortie.scenarios.intervals import Estimate
 from sortie.sim.experiment.board import draw, place_text
-from sortie.sim.experiment.flights import fly
 from sortie.sim.experiment.places import scores
-from sortie.sim.experiment.rank import SUITE, Entry, Ranked, digest_of, load_suite, rank
+from sortie.sim.experiment.rank import SUITE, Entry, Ranked, digest_of, fly, load_suite, rank
 from sortie.sim.experiment.stored import made_now, read_results, save_results
 from sortie.sim.experiment.verdict import verify
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sortie.perception.metrics.ap import average_precision
+from sortie.policies.contract import Policy
 from sortie.policies.registry import resolve, within_budget
 from sortie.scenarios.intervals import SHARE, mean_interval
 from sortie.scenarios.reading.load import load
@@ -19,6 +21,7 @@ from sortie.scenarios.schema.conditions import Condition, ConditionSet
 from sortie.sim.experiment.detectors import ANSWERS
 from sortie.sim.experiment.flight import MATCHED, OUTCOME, Flight, Task, task_of
 from sortie.sim.experiment.flight_file import fly_all
+from sortie.sim.experiment.pools import Pool
 from sortie.sim.folders import RunError
 from sortie.sim.policy_text import policy_overrides
 
@@ -84,23 +87,62 @@ def fly_conditions(
             raise RunError(
                 f"condition {condition.name}: perception.detector is none, conditions are compared by accuracy"
             )
-    tasks, whose = [], []
-    for cell, (policy, _, scenario) in enumerate(planned):
-        for seed in conditions.seeds or (scenario.seed,):
-            tasks.append(task_of(scenario, (OUTCOME, MATCHED), seed=seed, seen_by=ANSWERS if by_torch else ""))
-            whose.append((cell, policy))
     done: Counter[str] = Counter()
 
-    def watch(task: Task, t_s: float) -> None:
-        if progress is not None and math.isinf(t_s):
-            policy = whose[task.number][1]
-            done[policy] += 1
+    def watch(policy: str) -> None:
+        done[policy] += 1
+        if progress is not None:
             progress(policy, done[policy])
 
-    flights: list[list[Flight]] = [[] for _ in planned]
-    for (cell, _), flight in zip(whose, fly_all(tasks, kept=kept, watch=watch), strict=True):
-        flights[cell].append(flight)
-    return [_cell(policy, condition, its) for (policy, condition, _), its in zip(planned, flights, strict=True)]
+    seen_by = ANSWERS if by_torch else ""
+    flights = fly_suite(
+        conditions, dict.fromkeys(policies), (OUTCOME, MATCHED), seen_by=seen_by, kept=kept, landed=watch
+    )
+    return [_cell(policy, condition, flights[policy][condition.name]) for policy, condition, _ in planned]
+
+
+def fly_suite(
+    suite: ConditionSet,
+    decides: Mapping[str, Policy | None],
+    figures: Sequence[str],
+    *,
+    seen_by: str = "",
+    pool: Pool | None = None,
+    kept: Path | None = None,
+    landed: Callable[[str], None] = lambda policy: None,
+) -> dict[str, dict[str, list[Flight]]]:
+    """Fly policies in every condition on every seed; by policy and condition.
+
+    Args:
+        decides: by label the function that decides; None for what the label names: `name(key=value)` or
+            `path/to/file.py:function`. A budget reaches a function by its parameter `received_budget`, `sent_budget` or
+            `rho`, where it has one.
+        figures, seen_by: as `Task` has them.
+        pool, kept: as `fly_all` takes them. With a pool, what fails is a row.
+        landed: called with the policy of each flight that is there.
+
+    Raises:
+        ScenarioError, PolicyError: a policy or its parameters are wrong; raised before anything flies.
+    """
+    tasks: list[Task] = []
+    place: list[tuple[str, str]] = []
+    for label, function in decides.items():
+        for condition in suite.conditions:
+            scenario = scenario_of(suite, condition, label if function is None else "silence")
+            budget = {} if function is None else within_budget(function, condition.budget)
+            flies = functools.partial(function, **budget) if function is not None and budget else function
+            for seed in suite.seeds or (scenario.seed,):
+                tasks.append(task_of(scenario, figures, seed=seed, function=flies, seen_by=seen_by))
+                place.append((label, condition.name))
+
+    def watch(task: Task, t_s: float) -> None:
+        if math.isinf(t_s):
+            landed(place[task.number][0])
+
+    flights: dict[str, dict[str, list[Flight]]] = {p: {c.name: [] for c in suite.conditions} for p in decides}
+    for (label, name), flight in zip(place, fly_all(tasks, pool, kept, watch, failing=pool is not None), strict=True):
+        flights[label][name].append(flight)
+    return flights
 
 
 def scenario_of(conditions: ConditionSet, condition: Condition, policy: str) -> Scenario:

@@ -15,9 +15,33 @@ from sortie.scenarios.control_variates import controlled_mean
 from sortie.scenarios.intervals import AMOUNT, LEVEL, SHARE, Estimate, Floats, Range, mean_interval
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.experiment.flight import Flight
-from sortie.sim.experiment.flights import METRICS
 from sortie.sim.folders import RunError
 from sortie.sim.results.outcome_fields import possible
+
+METRICS = (
+    "ap50.mission",
+    "ap50.full_scene",
+    "tracking.hota",
+    "bytes.data_sent",
+    "bytes.context_sent",
+    "energy_j.total",
+    "energy_j.fault",
+    "energy_j.radio",
+    "deadline_miss_rate",
+    "mission.target_detected_share",
+    "mission.target_in_view_share",
+    "mission.region_observed_share",
+    "mission.flown_share",
+    "policies.violated_ticks",
+    "policies.invariant_violations",
+    "switches",
+    "age_s.p99",
+    "policy_eval_us.p50",
+    "policy_eval_us.p99",
+)
+"""What is kept of each flight: numbers of its outcome, by their names."""
+Flights = dict[str, dict[str, Flight]]
+"""By policy and condition."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,16 +16,18 @@ from sortie.policies.contract import Policy, PolicyError
 from sortie.policies.registry import POLICIES, resolve
 from sortie.scenarios.reading.load import condition_sets, load, load_conditions, read
 from sortie.scenarios.schema.conditions import Condition, ConditionSet
-from sortie.sim.experiment.conditions import scenario_of
+from sortie.sim.experiment.conditions import fly_suite, scenario_of
 from sortie.sim.experiment.flight import Flight
-from sortie.sim.experiment.flights import BY_TORCH, Flights, fly
-from sortie.sim.experiment.places import Control, PairDifference, Standing, standings
+from sortie.sim.experiment.places import METRICS, Control, Flights, PairDifference, Standing, standings
+from sortie.sim.experiment.pools import processes
 from sortie.sim.experiment.stored import Results, read_results
 from sortie.sim.experiment.verdict import Verified, verify
 from sortie.sim.folders import RunError
 from sortie.sim.identity import code_version
 
 SUITE = "ranking_v1"
+BY_TORCH = ("perception.detector=torch", "perception.sample_rate_hz=0.5")
+"""What makes a suite fly with the neural detector, which takes most of a second for each scored instant."""
 REFERENCE = "worked"
 """The policy whose flight in the first condition is compared with the stored one: equal records show that the stored
 results are those of this version, and the times of its decisions how fast this machine is beside the other."""
@@ -173,12 +177,12 @@ def rank(
     if not taken:
         stored = None  # nothing of it is shown, so that it need not be this version's
     todo = {p: f for p, f in decides.items() if p not in flights}
-    flights |= fly(asked, todo, workers=workers, kept=kept, progress=_stage("flights", todo, asked, progress))
+    flights |= fly(asked, todo, workers=workers, kept=kept, progress=functools.partial(progress, "flights"))
     control = None
     if more:
         plain = load_suite(suite)
         wide = plain.model_copy(update={"conditions": (*plain.conditions, *more)})
-        watch = _stage("flights by the surrogate", decides, wide, progress)
+        watch = functools.partial(progress, "flights by the surrogate")
         control = Control(wide, fly(wide, decides, workers=workers, kept=kept, progress=watch))
     for k, policy in enumerate(unproved := [p for p in decides if p not in verified]):
         progress("verification", k, len(unproved))
@@ -230,10 +234,24 @@ def _further(suite: str, draws: int | None) -> list[Condition]:
     return [c for c, number in zip(found, draw, strict=True) if number <= (FURTHER if draws is None else draws)]
 
 
-def _stage(
-    stage: str, decides: Mapping[str, Policy | None], suite: ConditionSet, progress: Callable[[str, int, int], None]
-) -> Callable[[int], None]:
-    return lambda done: progress(stage, done, len(decides) * len(suite.conditions))
+def fly(
+    suite: ConditionSet,
+    decides: Mapping[str, Policy | None],
+    *,
+    workers: int = 1,
+    kept: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Flights:
+    """Fly policies once in each condition, those that are names in processes of their own.
+
+    Args:
+        decides, kept: as `fly_suite`.
+        progress: called with how many flights there are, and of how many.
+    """
+    of, done = len(decides) * len(suite.conditions), itertools.count(1)
+    with processes(min(workers, of)) as pool:
+        found = fly_suite(suite, decides, METRICS, pool=pool, kept=kept, landed=lambda policy: progress(next(done), of))
+    return {policy: {name: flight for name, (flight,) in its.items()} for policy, its in found.items()}
 
 
 def _width(pairs: Sequence[PairDifference], alone: Sequence[PairDifference]) -> float:

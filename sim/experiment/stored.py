@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from sortie.sim.experiment.flight import Flight
-from sortie.sim.experiment.flights import METRICS, Flights
+from sortie.sim.experiment.places import METRICS, Flights
 from sortie.sim.experiment.verdict import Verified
 from sortie.sim.folders import RunError, write_text
 from sortie.sim.identity import code_version

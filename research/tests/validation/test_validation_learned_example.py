@@ -12,7 +12,8 @@ from research.validation import learned_example as example
 from sortie.policies.registry import resolve
 from sortie.policies.verification.kit.conformance import conform
 from sortie.scenarios.reading.load import load, load_conditions
-from sortie.sim.experiment.flights import METRICS, Flight
+from sortie.sim.experiment.flight import Flight
+from sortie.sim.experiment.places import METRICS
 from sortie.sim.experiment.rank import load_suite
 
 TWO = [1001, 1002]

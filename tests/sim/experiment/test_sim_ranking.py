@@ -16,10 +16,10 @@ from sortie.policies.registry import POLICIES
 from sortie.scenarios.reading.load import load_conditions
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli import app
-from sortie.sim.experiment import flights, rank
+from sortie.sim.experiment import rank
 from sortie.sim.experiment.conditions import scenario_of
 from sortie.sim.experiment.flight import Flight, Task, fly_in_worker
-from sortie.sim.experiment.flights import fly
+from sortie.sim.experiment.rank import fly
 from sortie.sim.experiment.stored import made_now, read_results, save_results
 from sortie.sim.experiment.verdict import Verified
 from sortie.sim.folders import RunError
@@ -63,7 +63,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     def processes(workers: int) -> Iterator[Pool]:
         yield Pool()
 
-    monkeypatch.setattr(flights, "processes", processes)
+    monkeypatch.setattr(rank, "processes", processes)
     monkeypatch.setattr(rank, "verify", lambda policy: FINE)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.yaml").write_text(SMALL)
@@ -116,7 +116,7 @@ def test_an_interrupted_ranking_goes_on_where_it_was(here: list[int]) -> None:
         db.execute("DELETE FROM flights WHERE key = ?", (first["boxes"]["rich"].key,))
     assert len(here) == 2
     told: list[int] = []
-    again = fly(small(), {"boxes": None}, kept=kept, progress=told.append)
+    again = fly(small(), {"boxes": None}, kept=kept, progress=lambda done, of: told.append(done))
     assert (len(here), told) == (3, [1, 2])
     prints = [{c: f.fingerprint for c, f in found["boxes"].items()} for found in (first, again)]
     assert prints[0] == prints[1]

@@ -16,8 +16,7 @@ from sortie.scenarios.intervals import Estimate
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.experiment import board, rank
 from sortie.sim.experiment.flight import Flight
-from sortie.sim.experiment.flights import METRICS
-from sortie.sim.experiment.places import Control, PairDifference, Standing, standings
+from sortie.sim.experiment.places import METRICS, Control, PairDifference, Standing, standings
 from sortie.sim.experiment.rank import Ranked
 from sortie.sim.experiment.stored import made_now, read_results, save_results
 from sortie.sim.experiment.verdict import WORDS, Verified

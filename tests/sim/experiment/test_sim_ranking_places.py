@@ -14,8 +14,17 @@ from sortie.scenarios.intervals import SHARE, Estimate
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.experiment import rank
 from sortie.sim.experiment.board import _spread
-from sortie.sim.experiment.flights import METRICS, Flight
-from sortie.sim.experiment.places import Control, PairDifference, Scored, differences, places, scores, standings
+from sortie.sim.experiment.flight import Flight
+from sortie.sim.experiment.places import (
+    METRICS,
+    Control,
+    PairDifference,
+    Scored,
+    differences,
+    places,
+    scores,
+    standings,
+)
 from sortie.sim.experiment.rank import FURTHER, SUITE, _further
 from sortie.sim.folders import RunError
 
