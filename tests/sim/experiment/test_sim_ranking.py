@@ -99,13 +99,6 @@ def test_a_set_with_seeds_of_its_own_is_no_suite(here: object) -> None:
         rank.load_suite("track_target")
 
 
-def test_further_draws_come_with_a_suite_of_the_library() -> None:
-    assert [len(rank._further("ranking_v1", draws)) for draws in (None, 0, 1, 10)] == [90, 0, 30, 300]
-    assert rank._further("small.yaml", None) == []
-    with pytest.raises(RunError, match="--further 11: --suite ranking_v1 has 10 further draws"):
-        rank._further("ranking_v1", 11)
-
-
 # --- flights -------------------------------------------------------------------------------------
 
 
