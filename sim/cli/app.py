@@ -55,16 +55,21 @@ class Commands(TyperGroup):
 @contextmanager
 def _notes_once() -> Iterator[None]:
     """Print each note of a command once: a scenario is read for each policy that flies it."""
-    log, said = logging.getLogger("sortie"), set[str]()
+    log, said, printing = logging.getLogger("sortie"), set[str](), logging.StreamHandler()
 
     def first(record: logging.LogRecord) -> bool:
         text = record.getMessage()
         return text not in said and not said.add(text)  # type: ignore[func-returns-value]
 
+    level = log.level
     log.addFilter(first)
+    log.addHandler(printing)
+    log.setLevel(logging.INFO)
     try:
         yield
     finally:
+        log.setLevel(level)
+        log.removeHandler(printing)
         log.removeFilter(first)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 import os
 import sqlite3
@@ -28,6 +29,7 @@ from sortie.sim.identity import codes_here, file_digest
 from sortie.sim.results.accuracy import FULL_SCENE, MISSION, Both
 from sortie.sim.results.record import SortieRecord
 
+_LOG = logging.getLogger("sortie")
 PLACE = "SORTIE_FLIGHTS"
 """The environment's variable that names another file than the one in the user's cache folder; empty keeps nothing."""
 TIMEOUT_S = 60
@@ -261,6 +263,8 @@ def fly_all(
         groups = {task.group for task in numbered if task.group and task.number not in found}
         for number in [n for n in found if numbered[n].group in groups]:
             del found[number]  # the boxes of a group's flights depend on one another
+        if found:
+            _LOG.info("flights that were flown before are taken from %s", kept)
         for number in found:
             watch(numbered[number], math.inf)
         todo = [task for task in numbered if task.number not in found]

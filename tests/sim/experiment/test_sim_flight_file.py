@@ -96,6 +96,14 @@ def test_failed_flights_fly_again_and_do_not_take_the_place_of_others(tmp_path: 
     assert (bad.flown, good.flown) == ([1], [1])
 
 
+def test_what_is_taken_from_a_file_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    kept = tmp_path / "a"
+    with caplog.at_level("INFO", "sortie"):
+        for said in ([], [f"flights that were flown before are taken from {kept}"]):
+            fly_all([task()], Counts(), kept)  # type: ignore[arg-type]
+            assert caplog.messages == said
+
+
 def test_flights_of_a_group_fly_together_or_not_at_all(tmp_path: Path) -> None:
     kept, pool = tmp_path / "a", Counts()
     group = [task(seed=seed, group="g") for seed in (1, 2)]
