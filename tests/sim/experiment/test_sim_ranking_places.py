@@ -168,7 +168,7 @@ def test_as_many_draws_are_further_ones_as_are_asked_for_also_none() -> None:
     assert len(_further(SUITE, 2)) == 60
     assert len(_further(SUITE, None)) == 30 * FURTHER
     assert _further("mine.yaml", None) == _further("mine.yaml", 0) == []
-    with pytest.raises(RunError, match="--further 2: --suite mine.yaml has 0 further draws"):
+    with pytest.raises(RunError, match=r"--further 2: --suite mine.yaml has 0 further draws"):
         _further("mine.yaml", 2)
     with pytest.raises(RunError, match="--further 11: --suite ranking_v1 has 10 further draws"):
         _further(SUITE, 11)
