@@ -28,6 +28,8 @@ from sortie.sim.results.record import SortieRecord
 SEEDS = 8
 """Sorties a policy where nothing else is asked and the detector is quick."""
 MOST_SEEDS = 10_000
+TOGETHER = 50
+"""Seeds that fly together; of the others the outcomes alone stay in memory."""
 TOWNS = 2**63
 BLOCK_S = 5.0
 """Instants of a sortie that are resampled together. Neighbouring instants see the same cars over the same links. On
@@ -158,50 +160,58 @@ def compare(
         RunError: a flight failed in its worker.
     """
     ensure_known(contenders)
-    asked = [(seed, contender) for seed in seeds for contender in contenders]
-    towns = [c.scenario if len(seeds) == 1 else in_town_of(c.scenario, seed) for seed, c in asked]
-    tasks = [
-        task_of(town, (OUTCOME, MATCHED), seed=seed, function=c.function, named=c.named)
-        for town, (seed, c) in zip(towns, asked, strict=True)
-    ]
-    records: dict[int, SortieRecord] = {}
+    flown: list[Compared] = []
+    within: list[Gain] = []
+    with nullcontext() if workers == 1 else processes(min(workers, len(seeds) * len(contenders))) as pool:
+        for begin in range(0, len(seeds), TOGETHER):
+            asked = [(seed, contender) for seed in seeds[begin : begin + TOGETHER] for contender in contenders]
+            towns = [c.scenario if len(seeds) == 1 else in_town_of(c.scenario, seed) for seed, c in asked]
+            tasks = [
+                task_of(town, (OUTCOME, MATCHED), seed=seed, function=c.function, named=c.named)
+                for town, (seed, c) in zip(towns, asked, strict=True)
+            ]
+            records: dict[int, SortieRecord] = {}
+            watch, keep = _watching(asked, progress), _keeping(asked, seeds[0], records)
+            rows = fly_all(tasks, pool, kept, watch, keep)
+            for k, ((seed, contender), town, row) in enumerate(zip(asked, towns, rows, strict=True)):
+                if row.error:
+                    raise RunError(f"{contender.label}, seed {seed}: {row.error}")
+                again: Callable[[], SortieRecord] | None = None
+                if seed == seeds[0]:
+                    again = functools.partial(run_sortie, town, contender.function, seed)
+                    again = functools.partial(records.__getitem__, k) if k in records else again
+                gains: dict[str, float | None] = dict.fromkeys(AREAS)
+                if first := k % len(contenders):
+                    ours, its = (rows[n].values[MATCHED][0] for n in (k - first, k))
+                    gains = gains_over(ours, its)
+                    within += _within(contender.label, ours, its, gains) if len(seeds) == 1 else ()
+                town_seed = town.perception.scene.seed
+                flown.append(Compared(contender.label, seed, town_seed, row.values[OUTCOME], gains, again))
+    return Flown(tuple(flown), tuple(within if len(seeds) == 1 else _over_sorties(flown)))
+
+
+Asked = Sequence[tuple[int, Contender]]
+
+
+def _watching(asked: Asked, progress: Callable[[str, int, float], None] | None) -> Callable[[Task, float], None]:
+    """Tells of the sortie that flies."""
 
     def watch(task: Task, t_s: float) -> None:
         seed, contender = asked[task.number]
         if progress is not None:
             progress(contender.label, seed, min(t_s, contender.scenario.duration_s))
 
+    return watch
+
+
+def _keeping(asked: Asked, first: int, records: dict[int, SortieRecord]) -> Callable[[Task, SortieRecord], None]:
+    """Keeps the records of the first seed."""
+
     def keep(task: Task, record: SortieRecord) -> None:
-        if asked[task.number][0] == seeds[0]:
+        if asked[task.number][0] == first:
             records[task.number] = record
 
-    with nullcontext() if workers == 1 else processes(min(workers, len(tasks))) as pool:
-        rows = fly_all(tasks, pool, kept, watch, keep)
-    flown: list[Compared] = []
-    within: list[Gain] = []
-    for k, ((seed, contender), town, row) in enumerate(zip(asked, towns, rows, strict=True)):
-        if row.error:
-            raise RunError(f"{contender.label}, seed {seed}: {row.error}")
-        first = k - k % len(contenders)
-        gains: dict[str, float | None] = dict.fromkeys(AREAS)
-        if k != first:
-            ours, its = (rows[n].values[MATCHED][0] for n in (first, k))
-            gains = gains_over(ours, its)
-            if len(seeds) == 1:
-                within += _within(contender.label, ours, its, gains)
-        again = functools.partial(run_sortie, town, contender.function, seed)
-        record = functools.partial(records.get, k) if k in records else again
-        flown.append(
-            Compared(
-                contender.label,
-                seed,
-                town.perception.scene.seed,
-                row.values[OUTCOME],
-                gains,
-                record if seed == seeds[0] else None,  # type: ignore[arg-type]
-            )
-        )
-    return Flown(tuple(flown), tuple(within if len(seeds) == 1 else _over_sorties(flown)))
+    return keep
 
 
 def ensure_known(contenders: Sequence[Contender]) -> None:

@@ -95,10 +95,11 @@ def fly_conditions(
             progress(policy, done[policy])
 
     seen_by = ANSWERS if by_torch else ""
-    flights = fly_suite(
-        conditions, dict.fromkeys(policies), (OUTCOME, MATCHED), seen_by=seen_by, kept=kept, landed=watch
-    )
-    return [_cell(policy, condition, flights[policy][condition.name]) for policy, condition, _ in planned]
+    figures, cells = (OUTCOME, MATCHED), list[Cell]()
+    for policy in policies:  # whose matched boxes alone are in memory
+        found = fly_suite(conditions, {policy: None}, figures, seen_by=seen_by, kept=kept, landed=watch)[policy]
+        cells += [_cell(policy, condition, found[condition.name]) for condition in conditions.conditions]
+    return cells
 
 
 def fly_suite(
