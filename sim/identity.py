@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
+import os
 import platform
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -202,6 +203,16 @@ def file_digest(path: Path) -> str:
     """
     now = regular(path).stat()
     return _digest_as_it_stands(path, now.st_size, now.st_mtime_ns)
+
+
+def content_digest(path: str) -> str:
+    """SHA-256 of a file, or of the names in a folder, as they are now; empty where there is nothing to read."""
+    try:
+        if os.path.isdir(path):
+            return hashlib.sha256("\0".join(sorted(os.listdir(path))).encode()).hexdigest()
+        return file_digest(Path(path))
+    except OSError:
+        return ""
 
 
 @functools.lru_cache(maxsize=4096)

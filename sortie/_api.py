@@ -22,9 +22,12 @@ from sortie.scenarios.reading.load import Overrides
 from sortie.scenarios.reading.nodes import ScenarioError
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.whole import whole
+from sortie.sim.experiment import files_read
 from sortie.sim.folders import RunError
 from sortie.sim.policy_text import flown_by
 from sortie.sim.user_errors import user_errors
+
+files_read.watch()  # before any code of a user is loaded
 
 if TYPE_CHECKING:
     import pyarrow as pa

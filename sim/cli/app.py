@@ -63,7 +63,8 @@ def _notes_once() -> Iterator[None]:
 
     level = log.level
     log.addFilter(first)
-    log.addHandler(printing)
+    if not log.hasHandlers():
+        log.addHandler(printing)
     log.setLevel(logging.INFO)
     try:
         yield

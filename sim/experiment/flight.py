@@ -10,6 +10,7 @@ import hashlib
 import inspect
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -46,6 +47,7 @@ OUTCOME, MATCHED, PROCESSOR_S = "outcome", "matched", "processor_s"
 """What may be asked of a flight beside the outcome's metrics: the whole outcome, the matched boxes of each draw of them
 (`accuracy.Both`), and the processor time that it took."""
 MAX_ERROR = 300
+files_read.watch()  # before any code of a user is loaded
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,8 @@ class Task:
     files: Mapping[str, str] = field(default_factory=dict)
     """Digests of the files that the scenario names, by absolute path."""
     packages: Mapping[str, str] = field(default_factory=dict)
+    folder: str = ""
+    """From which names of files are found, where some are relative."""
     function: Policy | None = None
     """Decides in place of the scenario's policy. Such a flight flies in the process that asks."""
     name: str = ""
@@ -82,9 +86,8 @@ class Task:
     @property
     def key(self) -> str:
         """32 hex digits of SHA-256 over all that decides what is flown, but for what the files hold."""
-        what = [self.code, self.scenario, self.seed, self.replication, self.seen_by, self.group, self.name]
-        more = [sorted(self.files), sorted(self.packages.items())]
-        return hashlib.sha256(json.dumps([*what, *more]).encode()).hexdigest()[:32]
+        what = [self.code, self.scenario, self.seed, self.replication, self.seen_by, self.group, self.name, self.folder]
+        return hashlib.sha256(json.dumps([*what, sorted(self.packages.items())]).encode()).hexdigest()[:32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +130,8 @@ def task_of(
     """
     sections = scenario.model_dump(mode="json", exclude_none=True)
     text, seed = json.dumps(sections, sort_keys=True), scenario.seed if seed is None else seed
-    models, files = named_models(sections), [found_file(name) for name in named_files(sections)]
+    models, names = named_models(sections), named_files(sections)
+    files, folder = [found_file(name) for name in names], "" if all(map(os.path.isabs, names)) else str(Path.cwd())
     code = codes_here()[1] if seen_by.startswith("torch") else flight_code(sections)
     digests = file_digests(files)
     name = ""
@@ -135,7 +139,7 @@ def task_of(
         name, more = _known_by(function)
         digests |= more
     task = Task(text, seed, replication, figures, code, seen_by, digests, packages(models, files))
-    return replace(task, function=function, name=name, group=group)
+    return replace(task, function=function, name=name, group=group, folder=folder)
 
 
 def _known_by(policy: Policy) -> tuple[str, dict[str, str]]:
@@ -152,7 +156,8 @@ def _known_by(policy: Policy) -> tuple[str, dict[str, str]]:
             "functools.partial of one with numbers and texts; name the file (mine.py:mine), or leave out kept"
         )
     files = imported_files(Path(function.__code__.co_filename))
-    return name_of(policy), {str(file.resolve()): file_digest(file) for file in files}
+    known = f"{name_of(policy)} {function.__code__.co_qualname} {function.__defaults__} {function.__kwdefaults__}"
+    return known, {str(file.resolve()): file_digest(file) for file in files}
 
 
 def found_file(name: str, folder: Path | None = None) -> str:
@@ -211,7 +216,6 @@ def fly(
     Raises:
         ScenarioError, PolicyError, ...: whatever a sortie raises.
     """
-    files_read.watch()
     begin_s = time.process_time()
     make, draws = maker(task.seen_by)
     record = (fly_here if in_worker else run_sortie)(
@@ -222,6 +226,8 @@ def fly(
         progress=progress,
         detector_of=make,
     )
+    for path, digest in task.files.items():
+        _check_file(path, digest)
     keep(record)
     result = outcome(record)
     values: dict[str, Any] = {}

@@ -15,8 +15,9 @@ import sqlite3
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -24,11 +25,12 @@ import numpy as np
 from sortie.perception.metrics.ap import Matched
 from sortie.sim.experiment.flight import MATCHED, Flight, Task
 from sortie.sim.experiment.pools import Here, Pool
-from sortie.sim.folders import RunError, ensure_place
-from sortie.sim.identity import codes_here, file_digest
+from sortie.sim.folders import RunError, ensure_files
+from sortie.sim.identity import codes_here, content_digest
 from sortie.sim.results.accuracy import FULL_SCENE, MISSION, Both
 from sortie.sim.results.record import SortieRecord
 
+Result = TypeVar("Result")
 _LOG = logging.getLogger("sortie")
 PLACE = "SORTIE_FLIGHTS"
 """The environment's variable that names another file than the one in the user's cache folder; empty keeps nothing."""
@@ -49,10 +51,10 @@ def users_file() -> Path | None:
     named = os.environ.get(PLACE)
     if named is not None:
         return Path(named) if named else None
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sortie"
     try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sortie"
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # RuntimeError: nobody knows a home folder
         return None
     return folder / "flights.sqlite" if os.access(folder, os.W_OK) else None
 
@@ -68,7 +70,7 @@ class FlightFile:
         """Args: `own` are tables that may stand beside that of the flights."""
         self.path, self._own = path, own
         self._db: sqlite3.Connection | None = None
-        ensure_place(path)
+        ensure_files(path)
         if path.exists():
             self.db  # noqa: B018 - opens it, so that what is wrong comes before the flights
 
@@ -160,14 +162,7 @@ def flight_of(row: Sequence[Any]) -> Flight:
 
 def changed(files: Mapping[str, str]) -> list[str]:
     """The files that no longer hold what they held."""
-    return [path for path, digest in files.items() if _digest(path) != digest]
-
-
-def _digest(path: str) -> str:
-    try:
-        return file_digest(Path(path))
-    except OSError:
-        return ""
+    return [path for path, digest in files.items() if content_digest(path) != digest]
 
 
 @contextmanager
@@ -189,7 +184,9 @@ def errors(path: Path) -> Iterator[None]:
 
 def broken(path: Path, what: object) -> RunError:
     """The error of a file that holds something else than it should."""
-    return RunError(f"{path}: is broken ({' '.join(str(what).split())[:200]}); remove it to fly again")
+    return RunError(
+        f"{path}: is broken ({' '.join(str(what).split())[:200]}); remove it to fly again, if it is Sortie's"
+    )
 
 
 def _refused(path: Path, reason: str) -> RunError:
@@ -277,19 +274,52 @@ def fly_all(
     return [found[k] for k in range(len(tasks))]
 
 
+class Forgiving:
+    """A file of flights that nobody asked for: what is wrong with it is said once, and all flies without it."""
+
+    def __init__(self, path: Path) -> None:
+        self._file: FlightFile | None = None
+        self._try(lambda: self._open(path))
+
+    def _open(self, path: Path) -> None:
+        self._file = FlightFile(path)
+        self._file.forget_other_code()
+
+    def find(self, task: Task) -> Flight | None:
+        """As `FlightFile`."""
+        return None if self._file is None else self._try(partial(self._file.find, task))
+
+    def add(self, tasks_and_rows: Iterable[tuple[Task, Flight]]) -> None:
+        """As `FlightFile`."""
+        if self._file is not None:
+            self._try(partial(self._file.add, tasks_and_rows))
+
+    def close(self) -> None:
+        """As `FlightFile`."""
+        if self._file is not None:
+            self._file.close()
+
+    def _try(self, use: Callable[[], Result]) -> Result | None:
+        try:
+            return use()
+        except RunError as error:
+            _LOG.warning("%s; flights are not kept", error)
+            self.close()
+            self._file = None
+            return None
+
+
 @contextmanager
-def _opened(kept: Path | None) -> Iterator[FlightFile | None]:
-    """A file of flights, without those of other versions; none where nothing is kept."""
+def _opened(kept: Path | None) -> Iterator[FlightFile | Forgiving | None]:
+    """A file of flights; none where nothing is kept."""
     if kept is None:
         yield None
         return
-    with closing(FlightFile(kept)) as file:
-        if kept == users_file():
-            file.forget_other_code()
+    with closing(Forgiving(kept) if kept == users_file() else FlightFile(kept)) as file:
         yield file
 
 
-def _landing(pool: Pool, tasks: Sequence[Task], file: FlightFile | None) -> Iterator[tuple[Task, Flight]]:
+def _landing(pool: Pool, tasks: Sequence[Task], file: FlightFile | Forgiving | None) -> Iterator[tuple[Task, Flight]]:
     """Tasks and their rows as they come; each is on disk before."""
     for landed in pool.rows(iter(tasks)):
         if file is not None:

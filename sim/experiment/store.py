@@ -231,10 +231,13 @@ class CampaignStore(CampaignTable):
     def _forget_changed(self) -> None:
         """Flights whose files have changed since are flown again."""
         for (files,) in self._db.execute("SELECT DISTINCT files FROM flights").fetchall():
-            if not (others := changed(json.loads(files))):
+            digests: dict[str, str] = json.loads(files)
+            if not (others := changed(digests)):
                 continue
-            gone = "SELECT key FROM flights WHERE files = ?"
-            self._db.execute(f"DELETE FROM runs WHERE key IN ({gone})", (files,))  # noqa: S608
+            if gone := [path for path in others if digests[path] and not Path(path).is_file()]:
+                raise RunError(f"{gone[0]}: is gone, and flights in {self.folder} have read it; put it back first")
+            keys = "SELECT key FROM flights WHERE files = ?"
+            self._db.execute(f"DELETE FROM runs WHERE key IN ({keys})", (files,))  # noqa: S608
             count = self._db.execute("DELETE FROM flights WHERE files = ?", (files,)).rowcount
             self.said.append(f"{self.folder}: {others[0]} has changed since; {count} flights with it are flown again")
 

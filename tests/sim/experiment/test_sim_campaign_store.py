@@ -278,9 +278,13 @@ def test_a_data_file_that_changes_means_new_flights(tmp_path: Path) -> None:
     run_campaign(p, folder, rest, notice=lines.append)
     assert rest.flown == list(range(0, 48, 4))
     assert lines == [f"{folder}: {data} has changed since; 12 flights with it are flown again"]
+    data.rename(tmp_path / "away")
+    with pytest.raises(RunError, match=r"gains\.csv: is gone, and flights in .*a have read it; put it back first"):
+        run_campaign(p, folder, Pretended())
+    (tmp_path / "away").rename(data)
     again = Pretended()
     run_campaign(p, folder, again)
-    assert again.flown == []
+    assert again.flown == [], "nothing was lost"
 
 
 def test_a_folder_of_0_2_can_be_read(tmp_path: Path) -> None:

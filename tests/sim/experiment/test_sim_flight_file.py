@@ -7,6 +7,7 @@ import multiprocessing
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -158,6 +159,19 @@ def test_several_who_use_one_file_wait_for_each_other(tmp_path: Path) -> None:
         assert one.exitcode == 0
     with closing(FlightFile(path)) as file:
         assert all(file.find(task(seed=first + k)) is not None for first in (0, 100, 200) for k in range(20))
+
+
+def test_the_users_file_stops_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
+    """Nobody asked for it; a file that was named must be usable."""
+    path = tmp_path / "a"
+    path.write_text("no database at all, but long enough to be read as one" * 20)
+    with pytest.raises(RunError, match=r"a: is broken .*; remove it to fly again, if it is Sortie's"):
+        fly_all([task()], Counts(), path)  # type: ignore[arg-type]
+    monkeypatch.setenv("SORTIE_FLIGHTS", str(path))
+    assert fly_all([task()], Counts(), path)[0].error == ""  # type: ignore[arg-type]
+    assert caplog.messages[-1].endswith("; flights are not kept")
+    with pytest.raises(RunError, match="is a folder, must be a file"):
+        FlightFile(tmp_path)
 
 
 def test_what_is_damaged_is_one_line(tmp_path: Path) -> None:

@@ -153,6 +153,33 @@ def test_a_flight_is_flown_again_after_a_change_of_a_file_that_its_policy_opened
     assert len(here) == 8
 
 
+def test_a_file_is_another_one_from_another_folder_and_once_it_is_there(
+    here: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A policy by its whole path reads a file by its name alone, which may be missing."""
+    kept = tmp_path / "out.sqlite"
+    reads = MINE.replace(
+        "    boxes = ", "    try:\n        open('r.txt').close()\n    except OSError:\n        pass\n    boxes = "
+    )
+    (tmp_path / "reads.py").write_text(reads)
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "small.yaml").write_text(SMALL)
+    for folder, text, flown in (
+        ("a", None, 2),
+        ("a", None, 2),
+        ("a", "1", 4),
+        ("b", "2", 6),
+        ("b", "2", 6),
+        ("a", "1", 8),
+    ):
+        monkeypatch.chdir(tmp_path / folder)
+        if text is not None:
+            Path("r.txt").write_text(text)
+        fly(small(), {f"{tmp_path}/reads.py:boxes": None}, kept=kept)
+        assert len(here) == flown, (folder, text)
+
+
 def test_a_callable_gets_the_budget_and_flies_as_its_name_does(here: list[int]) -> None:
     budgets = set()
 
