@@ -261,7 +261,7 @@ def compare(
         workers: the number of processes that fly policies given by name; with `half_width` one process flies.
         kept: flights are kept, so that after an interruption the same call goes on, and what was flown once is not flown
             again by this version of Sortie. None keeps the flights of policies given by name in the user's cache folder
-            (`docs/guide/README.md`), False keeps nothing, and a path names another file. With True or a path, flights of
+            (`sim/experiment/README.md`), False keeps nothing, and a path names another file. With True or a path, flights of
             callables are kept too; each must be a function at the top of a file, or a `functools.partial` of one with
             numbers and texts, so that another one is not taken for it.
 

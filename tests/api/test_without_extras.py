@@ -29,7 +29,7 @@ for words in COMMANDS:
         code = end.code or 0
     print(f"exit {code}", file=sys.stderr, flush=True)
 """
-SURROGATE = ("--set", "perception.detector=surrogate", "--set", "duration_s=2")
+SURROGATE = ("--set", "perception.detector=surrogate", "--set", "duration_s=2", "--set", "mission.phases=[{}]")
 VIEW = "error: rerun is missing: pip install 'sortie-sim[view]'\n"
 ROS = "error: rosbags is missing: pip install 'sortie-sim[ros2]'\n"
 MAVLINK = "error: pymavlink is missing: pip install 'sortie-sim[mavlink]'\n"
