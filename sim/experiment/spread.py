@@ -69,9 +69,9 @@ def design(sample: SampledField, fields: int, seed: int) -> Floats:
     return np.asarray(qmc.LatinHypercube(fields, rng=rng).random(sample.count))
 
 
-def unit_problem(fields: int, names: Sequence[str] = ()) -> dict[str, Any]:
+def unit_problem(fields: int) -> dict[str, Any]:
     """SALib's description of the unit cube: distributions are ours, so that every method has them all."""
-    return {"num_vars": fields, "names": list(names) or [f"x{i}" for i in range(fields)], "bounds": [[0, 1]] * fields}
+    return {"num_vars": fields, "names": [f"x{i}" for i in range(fields)], "bounds": [[0, 1]] * fields}
 
 
 def quantiles(spread: Spread, u: Floats, *, tail: float = 0.0) -> Sequence[Any]:
