@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.fleet.peers import FEWEST_COLUMNS
+from sortie.fleet.plane import DroneStatus
 from sortie.scenarios.schema import Clocks
 from sortie.scenarios.streams import stream
 
@@ -66,6 +67,60 @@ def oscillators(config: Clocks, drones: int, seed: int, replication: int) -> lis
     draws = [stream(seed, replication, i, "clock").standard_normal(3).tolist() for i in range(drones)]
     sigmas = config.offset_s, config.drift_ppm, config.drift_growth_ppm_per_min
     return [Oscillator(*(sigma * z for sigma, z in zip(sigmas, each, strict=True))) for each in draws]
+
+
+class DroneClock:
+    """A drone's clock in flight, with what events do to it. It keeps `DroneStatus.clock_skew_s`."""
+
+    def __init__(self, status: DroneStatus, oscillator: Oscillator, *, gnss: bool, zero_s: float = 0.0) -> None:
+        """Args:
+        gnss: whether it follows GNSS, wherever there is any.
+        zero_s: what a perfect clock shows at time 0.
+        """
+        self._status, self._oscillator, self._zero_s = status, oscillator, zero_s
+        self._clock = oscillator.at_start(gnss)
+        self.follows_gnss = gnss
+        """Whether it follows GNSS, wherever there is any."""
+        self._losses: set[int] = set()
+        self.read(0.0)
+
+    @property
+    def has_gnss(self) -> bool:
+        """Whether no loss of GNSS lasts."""
+        return not self._losses
+
+    def read(self, now_s: float) -> None:
+        """Bring the drone's clock to the present."""
+        self._status.clock_skew_s = self._zero_s + self._clock.error_s(now_s)
+
+    def jump(self, now_s: float, offset_s: float) -> None:
+        """It is off by so much now."""
+        self._set(now_s, offset_s=offset_s)
+
+    def drift(self, now_s: float, rate_ppm: float) -> None:
+        """It drifts at a rate from now on, and follows GNSS no more."""
+        self.follows_gnss = False
+        self._set(now_s, rate_ppm=rate_ppm, growth_ppm_per_min=0.0)
+
+    def lose_gnss(self, now_s: float, cause: int) -> float | None:
+        """A loss of GNSS begins; returns the rate at which the clock drifts now, ppm, or None where it runs on as before."""
+        followed = self.follows_gnss and self.has_gnss
+        self._losses.add(cause)
+        if not followed:
+            return None
+        own = self._oscillator
+        self._set(now_s, rate_ppm=own.rate_ppm, growth_ppm_per_min=own.growth_ppm_per_min)
+        return own.rate_ppm
+
+    def regain_gnss(self, now_s: float, cause: int) -> None:
+        """A loss of GNSS is over; after the last one the clock follows it again, if it did."""
+        self._losses.remove(cause)
+        if self.has_gnss and self.follows_gnss:
+            self._set(now_s, offset_s=self._oscillator.offset_s, rate_ppm=0.0, growth_ppm_per_min=0.0)
+
+    def _set(self, now_s: float, **changes: float) -> None:
+        self._clock = self._clock.at(now_s)._replace(**changes)
+        self.read(now_s)
 
 
 class PeerClocks:

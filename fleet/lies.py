@@ -5,13 +5,9 @@ The drone's own policy reads the truth; only what goes on the air is false, and 
 
 from __future__ import annotations
 
-from typing import Literal
-
 from sortie.fleet.coverage import NOVEL_FLAG
 from sortie.policies.contract import Coverage, Descriptor
-
-About = Literal["coverage", "goodput", "battery"]
-Claim = Literal["much", "little"]
+from sortie.scenarios.schema.events.base import About, Claim
 
 _ALL = {
     claim: bytes([state * 0b01010101]) * 64 for claim, state in (("much", Coverage.NOVEL), ("little", Coverage.UNSEEN))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 from sortie.fleet.computer import Work
 from sortie.fleet.coverage import cameras_of
+from sortie.fleet.lies import falsified
 from sortie.fleet.messages.compact import FULL, Form
 from sortie.perception.budget import CODE_BYTES
 from sortie.perception.files import codebook_digest
@@ -17,6 +19,7 @@ from sortie.policies.contract import Descriptor
 from sortie.policies.plane_rules import PlaneRules
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.events.base import About, Claim
 from sortie.scenarios.shipped import located
 
 
@@ -123,6 +126,16 @@ class DroneStatus:
     def slowed_s(self) -> float:
         """What `slower_s` adds up to."""
         return plain_sum(self.slower_s.values())
+
+    def lie(self, cause: int, about: About, claim: Claim) -> None:
+        """From now on the drone's descriptors say something false, until `lift`."""
+        self.lies[cause] = partial(falsified, about=about, claim=claim)
+
+    def lift(self, cause: int) -> None:
+        """Take back what a scenario event did."""
+        self.blocked.discard(cause)
+        self.slower_s.pop(cause, None)
+        self.lies.pop(cause, None)
 
     def leave(self) -> None:
         """The drone leaves the plane."""

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.scenarios import scratch
+from sortie.scenarios.frames import frame_from
 from sortie.scenarios.plugins.reference import checked_array, resolve
-from sortie.scenarios.schema import GnssLoss, HeadingFault, PositionFault, Scenario
+from sortie.scenarios.schema import PoseFault, Scenario
 from sortie.scenarios.streams import stream
 
 Array = NDArray[np.float64]
@@ -59,33 +60,18 @@ def sensor_errors(scenario: Scenario, positions_m: Array, seed: int, replication
             rng = stream(seed, replication, drone, "own sensor")
             errors[drone] = own_errors(model, times_s, positions_m[:, drone], rng)
     for index, event in enumerate(scenario.events):
-        if isinstance(event, PositionFault | HeadingFault | GnssLoss):
-            for drone in [event.drone] if event.drone is not None else flying:
-                found = _of_event(event, times_s, stream(seed, replication, (drone, index), "sensor fault"))
+        if isinstance(event, PoseFault):
+            begin = frame_from(event.at_s, scenario.frame_s)
+            end = frames if event.until_s is None else min(frames, frame_from(event.until_s, scenario.frame_s))
+            since_s = times_s[begin:end] - event.at_s
+            for drone in flying if event.who is None else [event.who]:
+                found = event.pose_error(
+                    since_s, scenario.frame_s, stream(seed, replication, (drone, index), "sensor fault")
+                )
                 if found is not None:
-                    errors[drone] = errors[drone] + found if drone in errors else found
+                    error = errors.setdefault(drone, np.zeros((frames, COLUMNS)))
+                    error[begin:end] += found
     return errors
-
-
-def _of_event(event: PositionFault | HeadingFault | GnssLoss, times_s: Array, rng: np.random.Generator) -> Array | None:
-    """[T, 4] of one fault of one drone; None where it does not touch the pose."""
-    until_s = np.inf if event.until_s is None else event.until_s
-    within = (times_s >= event.at_s - 1e-9) & (times_s < until_s - 1e-9)
-    since_s = np.where(within, times_s - event.at_s, 0.0)[:, None]
-    error = np.zeros((len(times_s), COLUMNS))
-    match event:
-        case PositionFault():
-            error[:, :3] = np.array(event.offset_m) + since_s * np.array(event.drift_mps)
-        case HeadingFault():
-            error[:, 3:] = np.deg2rad(event.offset_deg + since_s * event.drift_degps)
-        case GnssLoss():
-            if event.position_walk_m == 0.0:
-                return None
-            frame_s = times_s[1] - times_s[0] if len(times_s) > 1 else 0.0
-            steps = rng.normal(scale=event.position_walk_m * np.sqrt(frame_s), size=(int(within.sum()), 2))
-            error[within, :2] = np.cumsum(steps, axis=0)
-    error[~within] = 0.0
-    return error
 
 
 def own_errors(model: OwnSensor, times_s: Array, positions_m: Array, rng: np.random.Generator) -> Array:

@@ -32,7 +32,7 @@ from sortie.perception.metrics.ap import average_precision
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.observation import CHOICES, LIMIT, ROW, Obs, directives, observe
 from sortie.scenarios.plain_sum import plain_sum
-from sortie.scenarios.schema import DroneJoins, Scenario
+from sortie.scenarios.schema import MemberEvent, Scenario
 from sortie.scenarios.whole import whole
 from sortie.sim.engine.sortie import fly_here
 from sortie.sim.folders import RunError
@@ -216,7 +216,7 @@ class _Flight:
         self.views: dict[int, FleetView] = {}
         self.done = self._flown = False
         self._scenario, self._t_s = scenario, 0.0
-        joins = [e for e in scenario.events if isinstance(e, DroneJoins)]
+        joins = [e for e in scenario.events if isinstance(e, MemberEvent) and e.presence == "in"]
         self._joins_s = {e.drone: e.at_s for e in sorted(joins, key=lambda e: e.at_s)}  # the last time
         self._waiting = {drone for group in scenario.mission.groups for drone in group.reserve}
         self._error: BaseException | None = None

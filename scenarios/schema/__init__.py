@@ -6,27 +6,8 @@ Frames: world is ENU (x east, y north, z up, metres), bodies are FLU (x forward,
 
 from sortie.scenarios.schema.base import DroneId, PhaseName, PointM, Section, Soc
 from sortie.scenarios.schema.context import Context, DescriptorForm
-from sortie.scenarios.schema.events import (
-    BaseEvent,
-    BatteryFault,
-    CameraBlocked,
-    CellFailure,
-    ClockDrift,
-    ClockSkew,
-    DroneJoins,
-    DroneLeaves,
-    DroneLost,
-    Event,
-    GnssLoss,
-    HeadingFault,
-    Jam,
-    Lie,
-    LinkDrop,
-    Own,
-    PositionFault,
-    SlowPerception,
-    Spoof,
-)
+from sortie.scenarios.schema.events import KINDS, AnyEvent
+from sortie.scenarios.schema.events.base import Event, Jammer, Lasting, MemberEvent, PoseFault
 from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
 from sortie.scenarios.schema.fleet import (
     Airframe,

@@ -12,7 +12,8 @@ from pydantic import Field, model_validator
 from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.schema.base import Section, inconsistent
 from sortie.scenarios.schema.context import Context
-from sortie.scenarios.schema.events import BaseEvent, BatteryFault, CellFailure, DroneLeaves, Event, LinkDrop
+from sortie.scenarios.schema.events import AnyEvent
+from sortie.scenarios.schema.events.base import Event
 from sortie.scenarios.schema.expect import DecisionExpectation, Expectation
 from sortie.scenarios.schema.fleet import Camera, Fleet, Make, Network
 from sortie.scenarios.schema.limits import Limits
@@ -25,8 +26,6 @@ from sortie.scenarios.schema.record import RecordSection
 
 LEARNED = ("torch", "surrogate")
 """Detectors with weights, which makes may name."""
-OF_A_DRONE = DroneLeaves, BatteryFault, CellFailure
-"""Events that a ground station on mains power cannot have."""
 NO_NETWORK = "none"
 """The feature space of drones without a network: makes without a detector, ground stations without cameras."""
 GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
@@ -47,7 +46,7 @@ class Scenario(Section):
     policy: PolicySection = PolicySection()
     record: RecordSection = RecordSection()
     limits: Limits = Limits()
-    events: tuple[Event, ...] = Field((), max_length=1000, description="What goes wrong, and when.")
+    events: tuple[AnyEvent, ...] = Field((), max_length=1000, description="What goes wrong, and when.")
     metrics: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")], Metric] = Field(
         {}, description="Figures of one's own, by name; in the outcome as metrics.NAME (docs/guide/metric.md)."
     )
@@ -73,17 +72,17 @@ class Scenario(Section):
             if who >= n:
                 raise inconsistent(where, f"{who}", f"below fleet.drones = {n}")
         for i, event in enumerate(self.events):
-            if isinstance(event, LinkDrop) and event.peer == event.drone:
-                raise inconsistent(("events", i, "peer"), f"{event.peer}", "another drone than drone")
-            until_s = getattr(event, "until_s", None)
-            if until_s is not None and until_s <= event.at_s:
-                raise inconsistent(("events", i, "until_s"), f"{until_s:g}", f"above at_s = {event.at_s:g}")
+            drone = getattr(event, "drone", None)
+            misfit = event.misfit(None if drone is None else self.fleet.station(drone))
+            if misfit is not None:
+                field, value, bound = misfit
+                raise inconsistent(("events", i, field), value, bound)
         self._maps_can_bring_boxes()
         self._stations_stay()
         # What is done at an instant must have its instant. Phases and expected decisions may lie beyond the end: missions
         # are flown shortened, and an expectation of a time that was not flown fails.
         policy = self.policy
-        instants: dict[tuple[str, ...], Sequence[BaseEvent | PolicyChange | PolicyCommand | ViewReplay]] = {
+        instants: dict[tuple[str, ...], Sequence[Event | PolicyChange | PolicyCommand | ViewReplay]] = {
             ("events",): self.events,
             ("policy", "changes"): policy.changes,
             ("policy", "commands"): policy.commands,
@@ -116,12 +115,7 @@ class Scenario(Section):
                 raise inconsistent(("perception", option), "true", f"false where {refused[0]}")
 
     def _stations_stay(self) -> None:
-        """Check that no ground station is sent home, and that what fails of one is there."""
-        for i, event in enumerate(self.events):
-            station = self.fleet.station(event.drone) if isinstance(event, OF_A_DRONE) else None
-            if station is not None and (isinstance(event, DroneLeaves) or station.mains):
-                bound = "a drone that flies, it is a ground station" + " on mains power" * station.mains
-                raise inconsistent(("events", i, "drone"), f"{station.drone}", bound)
+        """Check that no ground station is in a group with a reserve, which may send it home."""
         for k, group in enumerate(self.mission.groups):
             for i, drone in enumerate(group.drones):
                 if group.reserve and self.fleet.station(drone) is not None:
@@ -210,7 +204,7 @@ class Scenario(Section):
 
     def _drones_named(self) -> Iterator[tuple[tuple[str | int, ...], int]]:
         """Every drone that a section outside of `fleet` names, and where."""
-        ends: dict[str, Sequence[BaseEvent | DecisionExpectation]] = {
+        ends: dict[str, Sequence[Event | DecisionExpectation]] = {
             "events": self.events,
             "expect_decisions": self.expect_decisions,
         }

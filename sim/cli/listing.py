@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import typer
 from pydantic import BaseModel
@@ -18,7 +18,8 @@ from sortie.policies.verification.invariants.words import CONSTANTS, LINK_FUNCTI
 from sortie.scenarios.plugins.reference import PluginError, installed, parameters, resolve
 from sortie.scenarios.reading.files import MODELS, builtin
 from sortie.scenarios.reading.load import campaigns, library, load
-from sortie.scenarios.schema import Event, Scenario
+from sortie.scenarios.schema import KINDS as EVENTS
+from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.campaign import Campaign
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.cli.console import err, out
@@ -70,9 +71,8 @@ def _mobility() -> Lines:
 
 
 def _events() -> Lines:
-    for event in get_args(get_args(Event)[0]):
+    for name, event in EVENTS.items():
         given = {key: "…" if field.is_required() else field.default for key, field in event.model_fields.items()}
-        name = get_args(event.model_fields["kind"].annotation)[0]
         del given["kind"]
         yield _line(name, given, "")
 

@@ -11,7 +11,8 @@ import numpy as np
 from sortie.fleet.flight.displaced import displaced
 from sortie.fleet.flight.viewpoints import Move, Plan, bounds_of, course_of, grant
 from sortie.policies.contract import Reposition
-from sortie.scenarios.schema import DroneJoins, Scenario
+from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.events.base import joining
 from sortie.sim.engine.world import World
 
 RETRY_S = 1.0
@@ -39,9 +40,7 @@ class Choreography:
         """Why no drone may move; empty where they may."""
         self._outside = set(range(scenario.fleet.drones)).difference(scenario.fleet.in_formation)
         self._frame = 0
-        self._comes = {e.drone for e in scenario.events if isinstance(e, DroneJoins)}.union(
-            *(group.reserve for group in scenario.mission.groups)
-        )
+        self._comes = joining(scenario.events).union(*(group.reserve for group in scenario.mission.groups))
         """Drones whose slots stay free while they are on the ground: they may yet appear there."""
         self._requests: dict[int, tuple[float, float, str]] = {}
         self._reported: dict[int, str] = {}

@@ -1,61 +1,34 @@
-"""Puts scenario events (link drops, jammers, losses, faults, attacks, lies) on the clock."""
+"""Scenario events in flight: when each begins, acts and ends, and what it may do to the fleet.
+
+What kinds there are, and what each does, stands in `sortie.scenarios.schema.events`.
+"""
 
 from __future__ import annotations
 
 import hashlib
-import math
 import struct
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 import simpy
+from numpy.typing import ArrayLike, NDArray
 
+from sortie.fleet.clock import DroneClock
 from sortie.fleet.messages.auth import TRAILER_BYTES, Sealer
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
-from sortie.scenarios.schema import (
-    BatteryFault,
-    CameraBlocked,
-    CellFailure,
-    ClockDrift,
-    ClockSkew,
-    DroneJoins,
-    DroneLeaves,
-    DroneLost,
-    Event,
-    GnssLoss,
-    HeadingFault,
-    Jam,
-    Lie,
-    LinkDrop,
-    Own,
-    PositionFault,
-    Scenario,
-    SlowPerception,
-    Spoof,
-)
+from sortie.policies.contract import Descriptor
+from sortie.scenarios.frames import frame_at, with_frame
+from sortie.scenarios.plugins.reference import PluginError, real_array
+from sortie.scenarios.schema import Event, Lasting, Scenario
+from sortie.scenarios.schema.events.base import About, Claim
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.membership import Membership
-from sortie.sim.engine.own_events import OwnEvents
-from sortie.sim.engine.own_state import whom
 from sortie.sim.engine.transport import Transport
-from sortie.sim.engine.world import World, at, with_frame
-
-OVERSIZED_BYTES = 2000
-LASTING = (
-    LinkDrop,
-    Jam,
-    Lie,
-    GnssLoss,
-    Own,
-    PositionFault,
-    HeadingFault,
-    CameraBlocked,
-    SlowPerception,
-)
-"""Events that have an end."""
-FleetEvent = DroneJoins | DroneLeaves | DroneLost | BatteryFault | CellFailure
-"""Events that change nothing where the drone is on the ground, or flies already."""
+from sortie.sim.engine.world import World, at
 
 
 def group_key(seed: int) -> bytes:
@@ -63,214 +36,228 @@ def group_key(seed: int) -> bytes:
     return hashlib.sha256(b"sortie group key" + struct.pack("<Q", seed)).digest()
 
 
-def schedule(
-    scenario: Scenario,
-    world: World,
-    transport: Transport,
-    membership: Membership,
-    own: OwnEvents,
-    *,
-    seed: int,
-    replication: int,
-) -> None:
-    """Put every event of the scenario on the clock; call once, before anything else is scheduled.
+class Going:
+    """Events with their fleets: it begins and ends them, and knows which of them last."""
 
-    Events and their ends come before the frame that begins at the same instant.
-    """
-    going: dict[int, Event] = {}
-    begins = [
-        _Begin(scenario, world, transport, membership, own, e, index, seed, replication, going)
-        for index, e in enumerate(scenario.events)
-    ]
-    for begin in begins:
-        at(world.env, with_frame(begin.event.at_s, scenario.frame_s), begin)
-    for begin in begins:
-        event = begin.event
-        if isinstance(event, LASTING) and event.until_s is not None:
-            at(world.env, with_frame(event.until_s, scenario.frame_s), begin.end)
+    def __init__(self) -> None:
+        self._going: dict[int, Event] = {}
+
+    def begin(self, event: Event, fleet: Any) -> None:
+        """An event's time has come; `fleet` is what it acts on (`sortie.scenarios.schema.events.base.Fleet`)."""
+        self._going[fleet.index] = event
+        event.begin(fleet)
+
+    def end(self, event: Lasting, fleet: Any) -> None:
+        """It is over."""
+        del self._going[fleet.index]
+        event.end(fleet, any(event.overlaps(other) for other in self._going.values()))
+
+    def __contains__(self, index: object) -> bool:
+        return index in self._going
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(tuple(self._going))
 
 
-class _Begin:
-    """An event's begin; a callable, so that each keeps its own event."""
+@dataclass(frozen=True)
+class Acted:
+    """What events act on, and the draws that they have."""
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        world: World,
-        transport: Transport,
-        membership: Membership,
-        own: OwnEvents,
-        event: Event,
-        index: int,
-        seed: int,
-        replication: int,
-        going: dict[int, Event],
-    ) -> None:
-        self.scenario, self.world, self.transport, self.event = scenario, world, transport, event
-        self.membership, self.own = membership, own
-        self.index, self.seed, self.replication = index, seed, replication
-        self.going = going
-        """The events of all that have begun and not ended, by their place among the scenario's."""
-
-    def __call__(self) -> None:
-        world, event = self.world, self.event
-        env = world.env
-        if isinstance(event, FleetEvent):
-            world.drain()  # what the drones have spent up to now
-            if why := self._no_effect(event):
-                world.note(event.drone, "no_effect", f"{event.kind}: {why}")
-                return
-        self.going[self.index] = event
-        match event:
-            case LinkDrop():
-                world.note(event.drone, "link_drop", f"links of {_ends(event)} lose {event.loss_db:g} dB")
-                world.add_loss(event.drone, event.peer, event.loss_db)
-            case Jam():
-                world.note(-1, "jam", f"a jammer of {event.power_dbm:g} dBm at {event.position_m}")
-                world.jammers[self.index] = (event.position_m, event.power_dbm)
-            case DroneLost():
-                world.remove(event.drone, "drone_lost", "fell silent")
-            case DroneJoins():
-                self.membership.join(event.drone)
-            case DroneLeaves():
-                self.membership.go_home(event.drone)
-            case BatteryFault():
-                lost = f"{event.lost_fraction:.0%} of the remaining energy is gone"
-                world.note(event.drone, "battery_fault", lost)
-                world.batteries.fault(event.drone, event.lost_fraction)
-                world.ground_landed()
-            case CellFailure():
-                left = world.batteries.cells[event.drone] - 1
-                world.batteries.drop_cell(event.drone)
-                text = {0: "no cell is left", 1: "1 cell is left"}.get(left, f"{left} cells are left")
-                world.note(event.drone, "cell_failure", text)
-                world.ground_landed()
-            case ClockSkew() | ClockDrift() | GnssLoss() | Lie():
-                for drone in whom(event, self.scenario.fleet.drones):
-                    world.note(drone, *world.own[drone].begin(event, self.index, env.now))
-                if not isinstance(event, Lie):
-                    world.read_clocks()
-            case Own():
-                self.own.begin(self.index, event.model)
-            case PositionFault() | HeadingFault():
-                world.note(event.drone, event.kind, _fault(event))
-            case CameraBlocked():
-                world.drones[event.drone].blocked.add(self.index)
-                world.note(event.drone, "camera_blocked", "its cameras see nothing")
-            case SlowPerception():
-                world.drones[event.drone].slower_s[self.index] = event.extra_s
-                world.note(event.drone, "slow_perception", f"its perception takes {event.extra_s:g} s longer")
-            case Spoof():
-                world.note(event.drone, "spoof", f"{event.attack} descriptors at {event.rate_hz:g} Hz")
-                env.process(self._spoof(env, event))
-
-    def _no_effect(self, event: FleetEvent) -> str:
-        """Why an event of a drone that joins, leaves or loses energy changes nothing; empty where it does."""
-        flies, descends = self.world.drones[event.drone].airborne, event.drone in self.world.homebound
-        if not isinstance(event, DroneJoins | DroneLeaves):
-            return "" if flies else "it is not in the fleet"
-        if descends:
-            return "it still descends" if isinstance(event, DroneJoins) else "it already descends"
-        if flies == isinstance(event, DroneJoins):
-            return "it is already in the fleet" if flies else "it is not in the fleet"
-        return ""
-
-    def end(self) -> None:
-        """End an event that lasts."""
-        world, event = self.world, self.event
-        env = world.env
-        del self.going[self.index]
-        match event:
-            case LinkDrop():
-                world.add_loss(event.drone, event.peer, -event.loss_db)
-                links = f"links of {_ends(event)}"
-                self._note_end("link_back", f"{links} are back", f"{links} are back only where no other drop lasts")
-            case Jam():
-                del world.jammers[self.index]
-                self._note_end("jam_over", "the jammer is off", "this jammer is off, another one is still on")
-            case Own():
-                self.own.end(self.index, event.model)
-            case PositionFault() | HeadingFault():
-                usual = "its believed pose has its usual errors again"
-                self._note_end(f"{event.kind}_over", usual, "its believed pose is still wrong: another fault lasts")
-            case CameraBlocked():
-                world.drones[event.drone].blocked.discard(self.index)
-                still = "its cameras still see nothing: another block lasts"
-                self._note_end("camera_clear", "its cameras see again", still)
-            case SlowPerception():
-                del world.drones[event.drone].slower_s[self.index]
-                usual = "its perception takes its usual time again"
-                still_s = sum(world.drones[event.drone].slower_s.values())
-                self._note_end("slow_perception_over", usual, f"its perception still takes {still_s:g} s longer")
-            case GnssLoss() | Lie():
-                for drone in whom(event, self.scenario.fleet.drones):
-                    world.note(drone, *world.own[drone].end(event, self.index, env.now))
-                if not isinstance(event, Lie):
-                    world.read_clocks()
-
-    def _note_end(self, kind: str, text: str, still: str) -> None:
-        """Write down that the event is over; `still` where another one does the same and lasts."""
-        lasts = any(_alike(self.event, other) for other in self.going.values())
-        drone = getattr(self.event, "drone", -1)
-        self.world.note(drone, *((self.event.kind, still) if lasts else (kind, text)))
-
-    def _spoof(self, env: simpy.Environment, event: Spoof) -> Generator[simpy.Event, Any, None]:
-        """Imitate the drone's descriptors; the attacker lacks the fleet's key but hears every broadcast."""
-        rng = stream(self.seed, self.replication, (event.drone, self.index), "spoof")
-        sealer = Sealer(rng.bytes(32), key_id=1)
-        captured = b""
-        end_s = self.scenario.duration_s if event.until_s is None else event.until_s
-        listeners = [i for i in range(self.scenario.fleet.drones) if i != event.drone]
-        while env.now < end_s:
-            genuine = self.transport.last_datagram.get(event.drone, b"")
-            captured = captured or genuine
-            if genuine:
-                self.transport.inject(self._datagram(event, genuine, captured, sealer, rng), listeners)
-            yield env.timeout(1.0 / event.rate_hz)
-
-    def _datagram(
-        self, event: Spoof, genuine: bytes, captured: bytes, sealer: Sealer, rng: np.random.Generator
-    ) -> bytes:
-        authentic = self.scenario.context.authentication
-        match event.attack:
-            case "forged":
-                # A false descriptor: the drone claims an empty battery and no links.
-                body = genuine[:-TRAILER_BYTES] if authentic else genuine
-                lie = _empty_handed(body)
-                return sealer.seal(lie) if authentic else lie
-            case "replayed":
-                return captured
-            case "malformed":
-                return rng.bytes(len(genuine))
-            case "oversized":
-                return genuine + bytes(OVERSIZED_BYTES)
+    scenario: Scenario
+    world: World
+    transport: Transport
+    membership: Membership
+    clocks: Sequence[DroneClock]
+    seed: int
+    replication: int
 
 
-def _fault(event: PositionFault | HeadingFault) -> str:
-    if isinstance(event, HeadingFault):
-        return f"believes its heading {event.offset_deg:g}° off, drifting by {event.drift_degps:g}° a second"
-    offset_m, drift_mps = (math.hypot(*vector) for vector in (event.offset_m, event.drift_mps))
-    return f"believes to be {offset_m:.3g} m away, drifting at {drift_mps:.3g} m/s"
+class Events:
+    """The events of one sortie, on its clock."""
+
+    def __init__(self, acted: Acted) -> None:
+        """Put them on the clock; before anything else is, so that they come before a frame of the same instant.
+
+        Raises:
+            PluginError: an event of the user's own that is not there, does not load, or has no such parameter.
+        """
+        self._going, events = Going(), acted.scenario.events
+        self._of = [(event, FleetHandle(acted, event, index)) for index, event in enumerate(events)]
+        env, frame_s = acted.world.env, acted.scenario.frame_s
+        for event, fleet in self._of:
+            fleet.prepared = event.prepare(fleet)
+            at(env, with_frame(event.at_s, frame_s), partial(self._going.begin, event, fleet))
+        for event, fleet in self._of:
+            if isinstance(event, Lasting) and event.until_s is not None:
+                at(env, with_frame(event.until_s, frame_s), partial(self._going.end, event, fleet))
+
+    def step(self, frame: int) -> None:
+        """A frame begins."""
+        for index in self._going:
+            event, fleet = self._of[index]
+            event.step(fleet)
 
 
-def _alike(ended: Event, other: Event) -> bool:
-    """Whether an event that lasts keeps up what one that ended did."""
-    match ended, other:
-        case LinkDrop(), LinkDrop():
-            a, b = ({drop.drone, drop.peer} - {None} for drop in (ended, other))
-            return a <= b or b <= a or len(a) == len(b) == 1  # two drones with weak links share one
-        case PositionFault() | HeadingFault(), PositionFault() | HeadingFault():
-            return ended.drone == other.drone
-        case PositionFault() | HeadingFault(), GnssLoss():
-            return other.position_walk_m > 0 and other.drone in (None, ended.drone)
-    return ended.kind == other.kind and getattr(ended, "drone", -1) == getattr(other, "drone", -1)
+class FleetHandle:
+    """What an event sees of the fleet, and what it may do to it (`sortie.scenarios.schema.events.base.Fleet`)."""
+
+    __slots__ = ("_acted", "_event", "_world", "frame_s", "index", "members", "prepared")
+
+    def __init__(self, acted: Acted, event: Event, index: int) -> None:
+        self._acted, self._world, self._event, self.index = acted, acted.world, event, index
+        self.frame_s = acted.scenario.frame_s
+        self.members: Sequence[int] = range(acted.scenario.fleet.drones)
+        self.prepared: Any = None
+
+    @property
+    def t_s(self) -> float:
+        return float(self._world.env.now)
+
+    @property
+    def positions_m(self) -> NDArray[np.float64]:
+        motion = self._world.motion.position_m
+        frame = min(frame_at(self.t_s, self.frame_s), len(motion) - 1)
+        return _read_only(np.array(motion[frame], dtype=float))
+
+    @property
+    def airborne(self) -> NDArray[np.bool_]:
+        return _read_only(np.array([drone.airborne for drone in self._world.drones]))
+
+    def note(self, text: str, drone: int = -1, kind: str | None = None) -> None:
+        self._check(drone, first=-1)
+        self._check_text(text)
+        self._world.note(drone, self._event.kind if kind is None else kind, text)
+
+    def lift(self) -> None:
+        self._world.lift(self.index)
+
+    def rng(self, entity: int | tuple[int, ...], purpose: str) -> np.random.Generator:
+        return stream(self._acted.seed, self._acted.replication, entity, purpose)
+
+    def run(self, waits_s: Iterator[float]) -> None:
+        env = self._world.env
+
+        def process() -> Generator[simpy.Event, Any, None]:
+            for wait_s in waits_s:
+                yield env.timeout(wait_s)
+
+        env.process(process())
+
+    def weaken(self, drone: int, peer: int | None, loss_db: float) -> None:
+        self._world.weaken(self.index, drone, peer, loss_db)
+
+    def set_loss_db(self, loss_db: ArrayLike) -> None:
+        n = len(self.members)
+        asked = self._numbers(loss_db, f"of shape ({n}, {n}), or one number")
+        if asked.shape not in ((), (n, n)):
+            raise self._error(f"a loss of shape {asked.shape}, must be of shape ({n}, {n}), or one number")
+        given = np.broadcast_to(asked, (n, n)).copy()
+        np.fill_diagonal(given, 0.0)
+        wrong = ~(np.isfinite(given) & (given >= 0.0))
+        if wrong.any():
+            raise self._error(f"a loss of {given[wrong][0]:g} dB, must be finite and ≥ 0")
+        self._world.set_loss(self.index, given)
+
+    def jam(self, position_m: tuple[float, float, float] | None, power_dbm: float = 20.0) -> None:
+        if position_m is None:
+            self._world.set_jammer(self.index, None)
+            return
+        at_m, power = self._numbers(position_m, "three, ENU"), self._numbers(power_dbm, "one")
+        if at_m.shape != (3,) or power.shape:
+            asked = f"a jammer of {power_dbm!r:.60} dBm at {position_m!r:.60}"
+            raise self._error(f"{asked}, must be one number at three")
+        if not np.isfinite([*at_m, power]).all():
+            raise self._error(f"a jammer of {power_dbm} dBm at {position_m}, must be finite")
+        x_m, y_m, z_m = at_m.tolist()
+        self._world.set_jammer(self.index, ((x_m, y_m, z_m), float(power)))
+
+    def settle(self) -> None:
+        self._world.drain()
+
+    def descends(self, drone: int) -> bool:
+        return drone in self._world.homebound
+
+    def join(self, drone: int) -> None:
+        self._acted.membership.join(drone)
+
+    def send_home(self, drone: int) -> None:
+        self._acted.membership.go_home(drone)
+
+    def lose(self, drone: int, text: str = "fell silent") -> None:
+        self._check(drone)
+        self._check_text(text)
+        self._world.drain()
+        if self._world.drones[drone].airborne:
+            self._world.remove(drone, "drone_lost", text)
+
+    def drain(self, drone: int, lost_fraction: float) -> None:
+        self._check(drone)
+        if not 0.0 < lost_fraction <= 1.0:
+            raise self._error(f"lost_fraction is {lost_fraction}, must be > 0 and ≤ 1")
+        self._world.drain()
+        if self._world.drones[drone].airborne:
+            self._world.batteries.fault(drone, lost_fraction)
+            self._world.ground_landed()
+
+    def cells(self, drone: int) -> int:
+        return int(self._world.batteries.cells[drone])
+
+    def drop_cell(self, drone: int) -> None:
+        self._world.batteries.drop_cell(drone)
+        self._world.ground_landed()
+
+    def clock(self, drone: int) -> DroneClock:
+        return self._acted.clocks[drone]
+
+    def read_clocks(self) -> None:
+        self._world.read_clocks()
+
+    def lie(self, drone: int, about: About, claim: Claim) -> None:
+        self._world.drones[drone].lie(self.index, about, claim)
+
+    def block_cameras(self, drone: int) -> None:
+        self._world.drones[drone].blocked.add(self.index)
+
+    def slow(self, drone: int, extra_s: float) -> None:
+        self._world.drones[drone].slower_s[self.index] = extra_s
+
+    def slowed_s(self, drone: int) -> float:
+        return self._world.drones[drone].slowed_s
+
+    def last_datagram(self, drone: int) -> bytes:
+        return self._acted.transport.last_datagram.get(drone, b"")
+
+    def forger(self, key: bytes) -> Callable[[bytes, Callable[[Descriptor], Descriptor]], bytes]:
+        sealer, authentic = Sealer(key, key_id=1), self._acted.scenario.context.authentication
+
+        def forge(genuine: bytes, change: Callable[[Descriptor], Descriptor]) -> bytes:
+            body = genuine[:-TRAILER_BYTES] if authentic else genuine
+            false = encode_descriptor(change(decode_descriptor(body)))
+            return sealer.seal(false) if authentic else false
+
+        return forge
+
+    def inject(self, datagram: bytes, victim: int) -> None:
+        self._acted.transport.inject(datagram, [i for i in self.members if i != victim])
+
+    def _numbers(self, given: object, must: str) -> NDArray[np.float64]:
+        if (found := real_array(given)) is None:
+            raise self._error(f"{given!r:.60}, must be numbers, {must}")
+        return found
+
+    def _check(self, drone: int, first: int = 0) -> None:
+        n = len(self.members)
+        if not (isinstance(drone, Integral) and first <= drone < n):
+            raise self._error(f"drone {drone!r:.60}, must be a whole number, {first} … {n - 1}")
+
+    def _check_text(self, text: object) -> None:
+        if not isinstance(text, str):
+            raise self._error(f"text {text!r:.60}, must be a str")
+
+    def _error(self, what: str) -> PluginError:
+        return PluginError(f"event {getattr(self._event, 'model', self._event.kind)}: {what}")
 
 
-def _ends(drop: LinkDrop) -> str:
-    return f"{drop.drone}" if drop.peer is None else f"{drop.drone}–{drop.peer}"
-
-
-def _empty_handed(descriptor_bytes: bytes) -> bytes:
-    descriptor = decode_descriptor(descriptor_bytes)
-    goodput = tuple(0.0 for _ in descriptor.peer_goodput_mbps)
-    return encode_descriptor(descriptor._replace(battery_soc=0.0, peer_goodput_mbps=goodput))
+def _read_only(values: NDArray[Any]) -> NDArray[Any]:
+    values.flags.writeable = False
+    return values

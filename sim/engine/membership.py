@@ -8,8 +8,9 @@ from functools import partial
 
 from sortie.fleet.flight.descent import descending, level_again
 from sortie.fleet.flight.steps import landing_s
-from sortie.scenarios.schema import DroneJoins, DroneLeaves, DroneLost, Scenario
-from sortie.sim.engine.world import World, at, with_frame
+from sortie.scenarios.frames import with_frame
+from sortie.scenarios.schema import MemberEvent, Scenario
+from sortie.sim.engine.world import World, at
 
 
 class Membership:
@@ -28,11 +29,11 @@ class Membership:
         """Called with each drone that joins."""
         self._replaced: set[int] = set()
         self._reserves = [list(group.reserve) for group in self._mission.groups]
-        first: dict[int, object] = {}
+        first: dict[int, str] = {}
         for event in sorted(scenario.events, key=lambda e: e.at_s):
-            if isinstance(event, DroneJoins | DroneLeaves | DroneLost):
-                first.setdefault(event.drone, event)
-        self._awaited = {drone for drone, event in first.items() if isinstance(event, DroneJoins)}
+            if isinstance(event, MemberEvent) and event.presence:
+                first.setdefault(event.drone, event.presence)
+        self._awaited = {drone for drone, presence in first.items() if presence == "in"}
         """Drones that are yet to join for the first time; nobody takes over from them."""
         for drone in sorted(self._awaited.union(*self._reserves)):
             world.ground(drone)

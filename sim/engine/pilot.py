@@ -41,10 +41,11 @@ from sortie.policies.verification.kit.age_rule import raised_part
 from sortie.policies.verification.kit.views import ViewError, from_json
 from sortie.policies.verification.shield import MARK, check_shieldable
 from sortie.scenarios.errors import SortieError
+from sortie.scenarios.frames import with_frame
 from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.scenarios.schema import PolicyChange, PolicySection, Scenario
 from sortie.sim.engine.audit import Audit
-from sortie.sim.engine.world import at, with_frame
+from sortie.sim.engine.world import at
 
 
 class NamedPolicy(NamedTuple):

@@ -14,7 +14,7 @@ import pyarrow as pa
 import simpy
 
 from sortie.fleet.agent import Agent
-from sortie.fleet.clock import oscillators
+from sortie.fleet.clock import DroneClock, oscillators
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.gate import Gate
 from sortie.fleet.memory import PeerMemory
@@ -37,16 +37,14 @@ from sortie.scenarios.streams import stream
 from sortie.sim.apart import Said, call_within
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.choreography import Choreography
-from sortie.sim.engine.events import group_key, schedule
+from sortie.sim.engine.events import Acted, Events, group_key
 from sortie.sim.engine.fusing import FindingEachFrame, Fusing
 from sortie.sim.engine.garbage import LEFTOVERS, cycles_searched_rarely
 from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
 from sortie.sim.engine.own_boxes import OwnBoxes
-from sortie.sim.engine.own_events import OwnEvents
 from sortie.sim.engine.own_metrics import loaded, own_metrics
-from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer, taking_turns
@@ -188,7 +186,7 @@ class Parts:
     world: World
     transport: Transport
     membership: Membership
-    own_events: OwnEvents
+    events: Events
     choreography: Choreography | None
     """None where no policy chooses viewpoints."""
     steering: Steering
@@ -247,11 +245,13 @@ def build(
     )
     plan = MissionPlan(mission, len(drones))
     gnss, drawn = scenario.fleet.clock.gnss, oscillators(scenario.fleet.clock, len(drones), seed, replication)
-    own = [OwnState(status, each, gnss=gnss) for status, each in zip(statuses, drawn, strict=True)]
+    clocks = [DroneClock(status, each, gnss=gnss) for status, each in zip(statuses, drawn, strict=True)]
     people = People(scenario, scene, recorder, (seed, replication))
     errors = sensor_errors(scenario, motion.position_m, seed, replication)
     link_log = LinkLog(len(drones), recorder)
-    world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, own, people, errors, link_log)
+    world = World(
+        env, scenario, statuses, motion, batteries, air, scene, plan, recorder, clocks, people, errors, link_log
+    )
     key = group_key(seed) if scenario.context.authentication else None
     transport = Transport(
         env,
@@ -311,8 +311,7 @@ def build(
     if detector is not None:
         turns = taking_turns(scenario, seed, replication)
         scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, fusing, people, turns)
-    own_events = OwnEvents(scenario, world, seed, replication)
-    schedule(scenario, world, transport, membership, own_events, seed=seed, replication=replication)
+    events = Events(Acted(scenario, world, transport, membership, clocks, seed, replication))
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(
         scenario,
@@ -324,7 +323,7 @@ def build(
         world,
         transport,
         membership,
-        own_events,
+        events,
         choreography,
         steering,
         pilots,
@@ -358,7 +357,7 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
         moves.append(parts.steering.renew)
     separation = Separation(parts.scenario, world)
     watch = [separation.check] if separation.anyone else []
-    world.start(each_second, [parts.membership.renew, *moves, parts.own_events.step, *watch])
+    world.start(each_second, [parts.membership.renew, *moves, parts.events.step, *watch])
     for agent in parts.agents:
         agent.start()
     if scorer is not None:

@@ -33,7 +33,8 @@ from sortie.fleet.flight.steering import (
 from sortie.fleet.flight.ways import starts_m
 from sortie.policies.contract import FleetView
 from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call
-from sortie.scenarios.schema import DroneJoins, Fleet, FlightGroup, Scenario
+from sortie.scenarios.schema import Fleet, FlightGroup, Scenario
+from sortie.scenarios.schema.events.base import joining
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.world import World
@@ -85,9 +86,7 @@ class Steering:
         self._ways = {drone: self._resting(drone) for drone in self._planners}
         self._wishes: dict[int, Command] = {}
         self._reported: dict[int, str] = {}
-        self._comes = {e.drone for e in scenario.events if isinstance(e, DroneJoins)}.union(
-            *(group.reserve for group in scenario.mission.groups)
-        )
+        self._comes = joining(scenario.events).union(*(group.reserve for group in scenario.mission.groups))
         self._frame = 0
         membership.on_join = self._begin_anew
 

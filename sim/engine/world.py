@@ -5,7 +5,6 @@ Scenario events act on the physics here: extra loss, jammers, battery faults, lo
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from itertools import chain
@@ -15,6 +14,7 @@ import numpy as np
 import simpy
 
 from sortie.fleet.agent import Platform, Task
+from sortie.fleet.clock import DroneClock
 from sortie.fleet.computer import Work, headrooms
 from sortie.fleet.coverage import RANGE_M, cameras_of
 from sortie.fleet.energy.battery import FleetBatteries
@@ -31,41 +31,33 @@ from sortie.radio import Air
 from sortie.radio.counters import CAUSES as LOSS_CAUSES
 from sortie.radio.settings import AirSettings
 from sortie.radio.topology import connectivity, usable_graph
+from sortie.scenarios.frames import frame_at, frame_from
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.own_models import of_radio
-from sortie.sim.engine.own_state import OwnState
 from sortie.sim.engine.people import People
 from sortie.sim.engine.tracking import FleetTracking
 from sortie.sim.results.links import LinkLog
 from sortie.sim.results.record import Recorder
 
+Jammer = tuple[tuple[float, float, float], float]
 NAN = float("nan")
 _NO_DISC, _NOWHERE = (NAN, NAN, NAN), (NAN, NAN)
 SECOND_S = 1.0
 USABLE_SNR_DB = 0.0
 """Below this even MCS 0 loses most of its frames (FACTS §3: half of them at −0.94 dB)."""
 
+LEAST_S = 1e-9
+"""Batteries are not drained for less."""
+
 LEAST_MBPS = 1e-6
 """A link that carries anything at all."""
-
-INSTANT_S = 1e-9
-"""Times closer together than this are equal but for rounding."""
 
 
 def at(env: simpy.Environment, t_s: float, act: Callable[[], None]) -> None:
     """Call `act` at simulated time `t_s`."""
     event = env.timeout(max(0.0, t_s - env.now))
     event.callbacks.append(lambda _event: act())
-
-
-def with_frame(t_s: float, frame_s: float) -> float:
-    """Round `t_s` to the begin of a frame if it differs from it by rounding alone.
-
-    So an event is no later than a frame of the same instant: at 7.5 Hz the frame of 14.8 s begins a last digit earlier.
-    """
-    frame_at_s = round(t_s / frame_s) * frame_s
-    return frame_at_s if t_s - INSTANT_S < frame_at_s < t_s else t_s
 
 
 def strongest_dbm(scenario: Scenario) -> float:
@@ -119,7 +111,7 @@ class World:
         scene: SceneModel,
         plan: MissionPlan,
         recorder: Recorder,
-        own: Sequence[OwnState],
+        clocks: Sequence[DroneClock],
         people: People,
         errors: Mapping[int, np.ndarray],
         links: LinkLog,
@@ -134,12 +126,11 @@ class World:
         )
         self.drones = drones
         n = len(drones)
-        self.extra_loss_db: np.ndarray | None = weaker_senders_db(scenario)
-        """[N, N], sender by receiver: what weaker senders and scenario events add to the path loss; None for nothing."""
-        self.own_losses_db: dict[int, np.ndarray] = {}
-        """The same of events from outside, by their place in the scenario."""
-        self.own, self.people = own, people
-        self.jammers: dict[int, tuple[tuple[float, float, float], float]] = {}
+        self._weaker_db = weaker_senders_db(scenario)
+        self._drops: dict[int, tuple[int, int | None, float]] = {}  # by cause, here and below
+        self._losses_db: dict[int, np.ndarray] = {}
+        self._jammers: dict[int, Jammer] = {}
+        self._clocks, self.people = clocks, people
         self._scenario, self._recorder = scenario, recorder
         self._computers = scenario.fleet.computers
         # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
@@ -193,7 +184,7 @@ class World:
             self.now = self.plan.at(env.now)
             for prepare in before_frame:
                 prepare(frame)
-            self.air.advance(self._loss_db(), list(self.jammers.values()))
+            self.air.advance(self.extra_loss_db, self.jammers)
             self._write(frame)
             if frame % frames_a_second == 0:
                 self._write_medium()
@@ -213,8 +204,8 @@ class World:
 
     def read_clocks(self) -> None:
         """Bring every drone's clock to the present."""
-        for each in self.own:
-            each.read(self.env.now)
+        for clock in self._clocks:
+            clock.read(self.env.now)
 
     def reroute(self, motion: Trajectories) -> None:
         """Replace the motion from the present frame on; earlier frames must be equal."""
@@ -230,7 +221,7 @@ class World:
     def drain(self) -> None:
         """Drain the batteries for the time since the last call, and land the drones that are empty."""
         dt_s = self.env.now - self._stepped_to_s
-        if dt_s <= INSTANT_S:  # too short for shares of it
+        if dt_s <= LEAST_S:  # too short for shares of it
             return
         self._stepped_to_s = self.env.now
         airtime_s = list(self.air.airtime_s)
@@ -254,7 +245,7 @@ class World:
     @property
     def next_frame(self) -> int:
         """The frame that begins now, or else the next one."""
-        return math.ceil(self.env.now / self._scenario.frame_s - 1e-6)
+        return frame_from(self.env.now, self._scenario.frame_s)
 
     def remove(self, drone: int, kind: str, text: str) -> None:
         """A drone leaves the fleet: it is silent from now on, draws nothing, and stays where it is."""
@@ -265,7 +256,7 @@ class World:
         """As `remove`, without an event: before take-off."""
         status = self.drones[drone]
         if status.airborne:
-            since = int(self.env.now / self._scenario.frame_s + 1e-6)
+            since = frame_at(self.env.now, self._scenario.frame_s)
             self._down.setdefault(drone, []).append((since, self._scenario.frames))
         status.leave()
         self.homebound.discard(drone)
@@ -284,17 +275,47 @@ class World:
         self.air.wake(drone)
         self.note(drone, "drone_joins", text)
 
-    def add_loss(self, drone: int, peer: int | None, loss_db: float) -> None:
-        """Add loss to both directions of a link, or of every link of a drone."""
-        n = len(self.drones)
-        loss = np.zeros((n, n)) if self.extra_loss_db is None else self.extra_loss_db.copy()
-        others = slice(None) if peer is None else peer
-        loss[drone, others] += loss_db
-        loss[others, drone] += loss_db
-        self.extra_loss_db = loss if loss.any() else None
+    def weaken(self, cause: int, drone: int, peer: int | None, loss_db: float) -> None:
+        """Add loss to both directions of a link, or of every link of a drone, until `lift`.
 
-    def _loss_db(self) -> np.ndarray | None:
-        given = [loss for loss in (self.extra_loss_db, *self.own_losses_db.values()) if loss is not None]
+        Args: `cause` is the event's place in the scenario, as below.
+        """
+        self._drops[cause] = drone, peer, loss_db
+
+    def set_loss(self, cause: int, loss_db: np.ndarray) -> None:
+        """Add loss to links, [N, N] dB, sender by receiver, until the next call or `lift`."""
+        self._losses_db[cause] = loss_db
+
+    def set_jammer(self, cause: int, jammer: Jammer | None) -> None:
+        """Put a jammer somewhere until the next call or `lift`: position (ENU, m) and power (dBm); None turns it off."""
+        self._jammers.pop(cause, None)
+        if jammer is not None:
+            self._jammers[cause] = jammer
+
+    def lift(self, cause: int) -> None:
+        """Take back all that an event did to links, jammers and drones."""
+        for kept in (self._drops, self._losses_db, self._jammers):
+            kept.pop(cause, None)
+        for drone in self.drones:
+            drone.lift(cause)
+
+    @property
+    def jammers(self) -> list[Jammer]:
+        """Those that are on."""
+        return list(self._jammers.values())
+
+    @property
+    def extra_loss_db(self) -> np.ndarray | None:
+        """[N, N], sender by receiver: what weaker senders and events add to the path loss; None for nothing."""
+        given = [] if self._weaker_db is None else [self._weaker_db]
+        if self._drops:
+            dropped = np.zeros((len(self.drones), len(self.drones)))
+            for drone, peer, loss_db in self._drops.values():
+                others = slice(None) if peer is None else peer
+                dropped[drone, others] += loss_db
+                dropped[others, drone] += loss_db
+            given.append(dropped)
+        given.extend(self._losses_db.values())
         return np.sum(given, axis=0) if len(given) > 1 else given[0] if given else None
 
     def note(self, drone: int, kind: str, text: str) -> None:

@@ -25,7 +25,7 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import Cars
 from sortie.perception.types import Boxes
 from sortie.scenarios.disc import LISTED_IDS
-from sortie.scenarios.schema.events import Jam
+from sortie.scenarios.schema import Jammer
 from sortie.sim.results import palette as c
 from sortie.sim.results.flown_scene import BOX_HEIGHT_M, CIRCLE, cars_near, houses, jamming, scene_of, vehicles
 from sortie.sim.results.link_traffic import LinkTraffic
@@ -99,7 +99,7 @@ class SceneMarkers:
         mission, targets = self._record.scenario.mission, self._scene.targets
         regions = Regions(self._record.tables["mission"], mission)
         groups = {mission.group_of(drone): drone for drone in range(self._n)}  # one drone of each
-        jams = [event for event in self._record.scenario.events if isinstance(event, Jam)]
+        jams = [event for event in self._record.scenario.events if isinstance(event, Jammer)]
         for k in self._drawn:
             t_s, markers = float(self._t_s[k]), []
             for x, y, radius in regions.at(np.full(len(groups), t_s), list(groups.values())).tolist():

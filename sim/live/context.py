@@ -3,7 +3,7 @@
 The paper's publishers replay context traces; here the trace is a flown scenario. Poses, charge, headrooms and goodput are
 those of the simulated flight, under the same policies, since on loopback there is neither a pack to drain nor a radio to
 measure. So are joins, departures and losses: `sortie.sim.engine.membership` decided them there. Lies and faults of clocks
-are no part of a trace, because a live drone has them itself (`sortie.sim.live.own_events`).
+are no part of a trace, because a live drone has them itself (`sortie.sim.live.events`).
 """
 
 from __future__ import annotations
@@ -28,29 +28,17 @@ from sortie.perception.scene.height_field import HeightField
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture
 from sortie.policies.contract import PERSON_FLAG, PHASE_NAMES, Disc, TaskPhase, goodput_in
-from sortie.scenarios.schema import Lie, Limits, Scenario
+from sortie.scenarios.frames import frames_at
+from sortie.scenarios.schema import KINDS, Limits, Scenario
 from sortie.sim.apart import Said, call_within
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build, fly
 from sortie.sim.engine.steering import area_m
 from sortie.sim.engine.tracking import FleetTracking, TargetSeen
-from sortie.sim.engine.world import INSTANT_S, cars_in_reach
+from sortie.sim.engine.world import cars_in_reach
 
-_REPLAYED_EVENTS = frozenset(
-    {
-        "drone_joins",
-        "drone_leaves",
-        "drone_lost",
-        "landed",
-        "power_lost",
-        "stays_down",
-        "battery_fault",
-        "cell_failure",
-        "link_drop",
-        "link_back",
-    }
-)
+_REPLAYED_EVENTS = frozenset({"landed", "power_lost"}).union(*(kind.told_live for kind in KINDS.values()))
 _RESTED = Platform(1.0, 1.0, 1.0)
 Bounds = tuple[float, float, float, float]
 
@@ -85,7 +73,7 @@ class Trace:
 
     def at(self, t_s: float) -> Published:
         """The latest that it published by `t_s`; the first one before there is any."""
-        return self.published[max(0, bisect_right(self.t_s, t_s + INSTANT_S) - 1)]
+        return self.published[max(0, bisect_right(self.t_s, t_s) - 1)]
 
 
 def unflown(scenario: Scenario, drone: int) -> Trace:
@@ -113,7 +101,7 @@ def _flown(scenario: Scenario, progress: Callable[[float], None] | None) -> list
     """`traces`, in this process."""
     alone = {"detector": "none", "maps_bring_boxes": False, "match_poses": False}
     perception = scenario.perception.model_copy(update=alone)
-    honest = tuple(event for event in scenario.events if not isinstance(event, Lie))
+    honest = tuple(event for event in scenario.events if event.in_trace)
     # a roster would shorten the goodputs to those of its members; the live drone makes its own
     context = scenario.context.model_copy(update={"roster": False})
     flown = scenario.model_copy(update={"perception": perception, "context": context, "events": honest})
@@ -144,7 +132,7 @@ def _trace(
         )
         for row in own["descriptors"].to_pylist()
     ]
-    frames = np.floor(np.array(own["descriptors"]["t_s"]) / frame_s + INSTANT_S)  # it publishes within its frame
+    frames = frames_at(own["descriptors"]["t_s"], frame_s)  # it publishes within its frame
     never = Published(goodput_mbps=(0.0,) * (scenario.fleet.drones - 1))
     return Trace(
         motion,

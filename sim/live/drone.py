@@ -20,8 +20,8 @@ from sortie.sim.folders import RunError
 from sortie.sim.live.bus import Bus
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.context import ReplaySenses, Trace
+from sortie.sim.live.events import LiveEvents, status_of
 from sortie.sim.live.node import LiveNode
-from sortie.sim.live.own_events import OwnEvents, status_of
 from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
 from sortie.sim.live.policy_process import Begin, PolicyOrders, take_notices
 from sortie.sim.live.reports import Failed, Go, Home, Ready
@@ -161,7 +161,7 @@ def _fly(
         guard=guard_of(scenario, drone, clock, recorder),
     )
     node.fly(clock, memory, rules, senses.goodput_mbps)
-    events = OwnEvents(scenario, drone, clock, memory.status, node.note)
+    events = LiveEvents(scenario, drone, clock, memory.status, node.note)
     if isinstance(senses, MavlinkSenses):  # its vehicle says where it is, and whether it flies
         senses.begin(orders.begin_s - go.monotonic_s, rules)
         node.is_muted = lambda: senses.muted

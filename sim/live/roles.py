@@ -34,8 +34,8 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import phase_of
 from sortie.sim.live.clock import WallClock
 from sortie.sim.live.context import ReplaySenses, traces, unflown
+from sortie.sim.live.events import LiveEvents, status_of
 from sortie.sim.live.node import LiveNode, Role
-from sortie.sim.live.own_events import OwnEvents, status_of
 from sortie.sim.live.platform import MavlinkLink, MavlinkSenses
 from sortie.sim.live.policy_process import Begin, PolicyOrders, take_notices
 from sortie.sim.live.reports import Report
@@ -116,7 +116,7 @@ class RoleNode:
             guard=guard_of(scenario, drone, clock, self._recorder) if role == Role.POLICY else None,
         )
         node.fly(clock, memory, rules, senses.goodput_mbps)
-        self._events = OwnEvents(
+        self._events = LiveEvents(
             scenario, drone, clock, memory.status, node.note if role == Role.PUBLISHER else _silent
         )
         if role == Role.PUBLISHER and orders.mavlink is None:

@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 
 from pydantic import BaseModel
 
-from sortie.scenarios.schema import (
-    BatteryFault,
-    CameraBlocked,
-    CellFailure,
-    DroneJoins,
-    DroneLeaves,
-    DroneLost,
-    Event,
-    HeadingFault,
-    Jam,
-    LinkDrop,
-    Own,
-    PositionFault,
-    Scenario,
-    SlowPerception,
-    Spoof,
-)
+from sortie.scenarios.schema import Scenario
 
 UNUSED = (
     "context.form",  # descriptors have the paper's form
@@ -69,7 +53,11 @@ def left_out(scenario: Scenario, vehicles: Collection[int] = ()) -> str:
     """
     fields = [path for path in UNUSED if _is_set(scenario, path)]
     fields += [f"fleet.makes.{k}.weights" for k, make in enumerate(scenario.fleet.makes) if make.weights is not None]
-    events = [f"events.{k} ({why})" for k, event in enumerate(scenario.events) for why in _why_not(event, vehicles)]
+    events = [
+        f"events.{k} ({event.kind}: {why})"
+        for k, event in enumerate(scenario.events)
+        if (why := event.why_not_live(getattr(event, "drone", None) in vehicles))
+    ]
     return f"a live flight does not use {', '.join([*fields, *events])}" if fields or events else ""
 
 
@@ -81,17 +69,3 @@ def _is_set(scenario: Scenario, path: str) -> bool:
         section = getattr(section, each)
     value = getattr(section, name)
     return bool(value != ("none" if path == "perception.detector" else type(section).model_fields[name].get_default()))
-
-
-def _why_not(event: Event, vehicles: Collection[int]) -> Iterator[str]:
-    match event:
-        case Spoof():
-            yield "spoof: no attacker joins the bus"
-        case LinkDrop() | Jam():
-            yield f"{event.kind}: it changes the replayed goodput alone, the bus loses nothing"
-        case PositionFault() | HeadingFault() | CameraBlocked() | SlowPerception():
-            yield f"{event.kind}: live drones believe their own poses"
-        case Own():
-            yield "own: it acts on the simulated flight that is replayed, not on the bus"
-        case DroneJoins() | DroneLeaves() | DroneLost() | BatteryFault() | CellFailure() if event.drone in vehicles:
-            yield f"{event.kind}: drone {event.drone} does as its vehicle does"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import signal
@@ -17,8 +16,8 @@ from multiprocessing.process import BaseProcess
 
 from sortie.fleet import chart, peers
 from sortie.fleet.logs.geodesy import Origin
+from sortie.scenarios.frames import frame_at
 from sortie.scenarios.schema import Scenario
-from sortie.sim.engine.world import INSTANT_S
 from sortie.sim.export.endpoint import parse_address
 from sortie.sim.folders import RunError
 from sortie.sim.live.bench import Bench, FleetReports
@@ -197,7 +196,7 @@ def fly_live(
 
 def _frame_of(t_s: float, scenario: Scenario) -> float:
     """When the frame of this moment begins: a process replays whole frames, and its clock begins with the first."""
-    return math.floor(t_s / scenario.frame_s + INSTANT_S) * scenario.frame_s
+    return frame_at(t_s, scenario.frame_s) * scenario.frame_s
 
 
 def _check(

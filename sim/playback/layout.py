@@ -12,8 +12,7 @@ from sortie.fleet.coverage import cameras_of, footprint_radius_m
 from sortie.perception.scene.scene_model import MARGIN_M
 from sortie.scenarios.disc import LISTED_IDS
 from sortie.scenarios.formation import slots
-from sortie.scenarios.schema import Scenario
-from sortie.scenarios.schema.events import Jam
+from sortie.scenarios.schema import Jammer, Scenario
 from sortie.sim.playback.canvas import SIM_TIME, SPAN_M
 from sortie.sim.playback.charts import phase_lane
 
@@ -234,7 +233,7 @@ def legend(scenario: Scenario) -> rr.TextDocument:
     phases = [phase for several in scenario.mission.phases_of for phase in several]
     occurs = {
         "regions": OF_REGIONS if any(phase.region for phase in phases) else "",
-        "jammers": OF_JAMMERS if any(isinstance(event, Jam) for event in scenario.events) else "",
+        "jammers": OF_JAMMERS if any(isinstance(event, Jammer) for event in scenario.events) else "",
         "phases": OF_PHASES if any(0 < phase.at_s < scenario.duration_s for phase in phases) else "",
         "links": OF_LINKS if scenario.fleet.drones > 1 else "",
     }

@@ -24,8 +24,7 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import KERB_M, LANE_M, PAVEMENT_M
 from sortie.perception.scene.traffic import Cars
 from sortie.perception.types import Boxes
-from sortie.scenarios.schema import Scenario
-from sortie.scenarios.schema.events import Jam
+from sortie.scenarios.schema import Jammer, Scenario
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import SPAN_M, Canvas
 from sortie.sim.playback.ground_map import GroundMap
@@ -63,8 +62,8 @@ class Drawing:
         self._resting: dict[int, Floats] = {}
         self._discs_shown = dict.fromkeys(self._groups, False)
         self._map = GroundMap(canvas, scenario, scene)
-        self._jams = [event for event in scenario.events if isinstance(event, Jam)]
-        self._jamming: list[Jam] = []
+        self._jams = [event for event in scenario.events if isinstance(event, Jammer)]
+        self._jamming: list[Jammer] = []
         self._roofs_m = 0.0
 
     # --- what holds at all times -----------------------------------------------------------------

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.traffic import Cars
-from sortie.scenarios.schema import Fleet
-from sortie.scenarios.schema.events import Jam
+from sortie.scenarios.schema import Fleet, Jammer
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.spool import batches
 
@@ -62,6 +61,6 @@ def cars_near(scene: SceneModel, t_s: float, x_m: float, y_m: float) -> Cars:
     return cars.where((cars.x_m - x_m) ** 2 + (cars.y_m - y_m) ** 2 <= CARS_WITHIN_M**2)
 
 
-def jamming(jams: Iterable[Jam], t_s: float) -> list[Jam]:
+def jamming(jams: Iterable[Jammer], t_s: float) -> list[Jammer]:
     """The jammers that are on."""
     return [jam for jam in jams if jam.at_s <= t_s < (np.inf if jam.until_s is None else jam.until_s)]

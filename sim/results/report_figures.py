@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sortie.perception.metrics.ap import average_precision
 from sortie.perception.scene.traffic import TargetPath
 from sortie.scenarios.representation import REPRESENTATION_OF
-from sortie.scenarios.schema.events import Jam
+from sortie.scenarios.schema import Jammer
 from sortie.sim.folders import RunError
 from sortie.sim.results import links
 from sortie.sim.results.accuracy import matched
@@ -446,7 +446,7 @@ def _map(axes: Axes, record: SortieRecord) -> None:
         axes.plot(*way.T, ":", color=MISSION, linewidth=2.5, zorder=4, label="target" if k == 0 else "")
     for rows in (mission.filter(pc.equal(mission["group"], g)) for g in pc.unique(mission["group"]).to_pylist()):
         _discs(axes, rows)
-    jammers = [event for event in record.scenario.events if isinstance(event, Jam)]
+    jammers = [event for event in record.scenario.events if isinstance(event, Jammer)]
     for k, jam in enumerate(jammers):
         x_m, y_m, _ = jam.position_m
         axes.plot([x_m], [y_m], "X", color=JAMMER, markersize=11, label="jammer" if k == 0 else "")

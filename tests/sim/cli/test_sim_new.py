@@ -68,7 +68,7 @@ def test_everything_that_is_wrong_is_said_at_once(here: Path) -> None:
         'broken.yaml:3: fleet.drones: "many", must be a whole number',
         "broken.yaml:3: fleet.formatoin: unknown key, did you mean formation?",
     ]
-    assert lines[3].startswith("broken.yaml:5: events.0.kind: missing, must be link_drop, jam, ")
+    assert lines[3].startswith("broken.yaml:5: events.0.kind: missing, must be battery_fault, camera_blocked, ")
     assert lines[4].startswith("gone.yaml: no such file")
     assert lines[5] == "5 things are wrong"
 

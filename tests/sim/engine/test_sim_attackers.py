@@ -11,7 +11,7 @@ from recorded import recorded
 from sim_examples import example
 
 from sortie.fleet.messages.wire import decode_descriptor, encode_descriptor
-from sortie.sim.engine.events import _Begin
+from sortie.sim.engine.events import Acted, Events
 from sortie.sim.engine.sortie import run_sortie
 
 OPEN = "context.authentication=false"
@@ -27,7 +27,7 @@ def _spoofed(attack: str, *sets: str) -> list[tuple[float, bytes, list[int]]]:
         last_datagram={}, inject=lambda data, to: put.append((round(env.now, 3), data, list(to)))
     )
     world = SimpleNamespace(env=env, note=lambda *_: None)
-    _Begin(scenario, world, transport, None, None, scenario.events[0], 0, 1, 0, {})()  # type: ignore[arg-type]
+    Events(Acted(scenario, world, transport, None, (), 1, 0))  # type: ignore[arg-type]
 
     def publish() -> Any:
         yield env.timeout(0.3)

@@ -9,11 +9,14 @@ import pytest
 from recorded import recorded
 from sim_examples import example
 
-from sortie.fleet.clock import Oscillator
+from sortie.fleet.clock import DroneClock, Oscillator
 from sortie.fleet.plane import DroneStatus
-from sortie.scenarios.schema import ClockDrift, ClockSkew, GnssLoss
-from sortie.sim.engine.own_state import OwnState
+from sortie.scenarios.schema import Event, Lasting
+from sortie.scenarios.schema.events.clock_drift import ClockDrift
+from sortie.scenarios.schema.events.clock_skew import ClockSkew
+from sortie.scenarios.schema.events.gnss_loss import GnssLoss
 from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.live.events import LiveFleet
 from sortie.sim.results.record import SortieRecord
 
 LOSS = GnssLoss(kind="gnss_loss", at_s=0.0)
@@ -26,11 +29,19 @@ class Clock:
 
     def __init__(self, oscillator: Oscillator, *, gnss: bool = True) -> None:
         self.status = DroneStatus()
-        self.own = OwnState(self.status, oscillator, gnss=gnss)
+        self.own = DroneClock(self.status, oscillator, gnss=gnss)
+        self.told: list[str] = []
 
     def error_s(self, now_s: float) -> float:
         self.own.read(now_s)
         return self.status.clock_skew_s
+
+    def begin(self, event: Event, index: int, now_s: float) -> None:
+        event.begin(LiveFleet(now_s, index, 0, self.own, self.status, self.told.append))  # type: ignore[arg-type]
+
+    def end(self, event: Lasting, index: int, now_s: float) -> str:
+        event.end(LiveFleet(now_s, index, 0, self.own, self.status, self.told.append), lasts=False)  # type: ignore[arg-type]
+        return self.told[-1]
 
 
 # --- one clock, by hand --------------------------------------------------------------------------
@@ -42,25 +53,25 @@ def test_a_clock_drifts_at_the_rate_of_its_event_and_jumps_to_the_offset_of_its_
     clock = Clock(Oscillator(0.3, 50.0, 900.0), gnss=gnss)
     of_itself = clock.error_s(60.0)
     assert of_itself == pytest.approx(0.3 if gnss else 0.3 + (50.0 + 450.0) * 60e-6)
-    clock.own.begin(DRIFT.model_copy(update={"drift_ppm": -200.0}), 0, 60.0)
+    clock.begin(DRIFT.model_copy(update={"drift_ppm": -200.0}), 0, 60.0)
     for later_s in (0.0, 10.0, 400.0):
         assert clock.error_s(60.0 + later_s) == pytest.approx(of_itself - 200e-6 * later_s)
-    clock.own.begin(SKEW.model_copy(update={"skew_s": 2.0}), 1, 500.0)
+    clock.begin(SKEW.model_copy(update={"skew_s": 2.0}), 1, 500.0)
     for later_s in (0.0, 100.0):  # the rate stays
         assert clock.error_s(500.0 + later_s) == pytest.approx(2.0 - 200e-6 * later_s)
     before = clock.error_s(700.0)
-    clock.own.begin(LOSS, 2, 700.0)
+    clock.begin(LOSS, 2, 700.0)
     assert clock.error_s(760.0) == pytest.approx(before - 200e-6 * 60.0)
-    clock.own.end(LOSS, 2, 760.0)
+    clock.end(LOSS, 2, 760.0)
     assert clock.error_s(900.0) == pytest.approx(before - 200e-6 * 200.0)
 
 
 def test_a_clock_without_gnss_drifts_by_a_rate_that_grows() -> None:
     """From the moment of the loss on, by its own oscillator; one that an event sets going does not grow."""
     clock = Clock(Oscillator(0.5, 20.0, 60.0))
-    clock.own.begin(LOSS, 0, 100.0)
+    clock.begin(LOSS, 0, 100.0)
     assert clock.error_s(220.0) == pytest.approx(0.5 + (20.0 + 60.0 * 2.0 / 2) * 1e-6 * 120.0)
-    clock.own.begin(DRIFT, 1, 220.0)
+    clock.begin(DRIFT, 1, 220.0)
     since = clock.error_s(220.0)
     assert clock.error_s(820.0) == pytest.approx(since + 300e-6 * 600.0)
 
@@ -70,13 +81,13 @@ def test_a_clock_that_follows_gnss_again_has_its_constant_error_alone() -> None:
     for first, second in product((LOSS, SKEW), repeat=2):
         clock = Clock(Oscillator(0.03, 20.0, 600.0))
         for index, (event, at_s) in enumerate(((first, 10.0), (second, 40.0), (LOSS, 70.0))):
-            clock.own.begin(event, index, at_s)
+            clock.begin(event, index, at_s)
         losses = [index for index, event in enumerate((first, second, LOSS)) if isinstance(event, GnssLoss)]
-        kinds = []
+        told = []
         for index in losses:
             assert clock.error_s(100.0 + index) != pytest.approx(0.03, abs=1e-4)
-            kinds.append(clock.own.end(LOSS, index, 100.0 + index).kind)
-        assert kinds == ["gnss_loss"] * (len(losses) - 1) + ["gnss_back"]
+            told.append(clock.end(LOSS, index, 100.0 + index))
+        assert told == ["still no GNSS: another loss lasts"] * (len(losses) - 1) + ["the clock follows GNSS again"]
         for t_s in (130.0, 200.0, 4000.0):
             assert clock.error_s(t_s) == pytest.approx(0.03, abs=1e-12)
 
@@ -89,11 +100,11 @@ def test_the_end_of_a_loss_leaves_a_clock_alone_that_does_not_follow_gnss() -> N
             clock = Clock(Oscillator(0.03, 20.0, 600.0), gnss=gnss)
             for t_s in (10.0, 40.0, 70.0):
                 if t_s == drifts_at_s:
-                    clock.own.begin(DRIFT, 0, t_s)
+                    clock.begin(DRIFT, 0, t_s)
                 if t_s == 40.0:
-                    clock.own.begin(LOSS, 1, t_s)
+                    clock.begin(LOSS, 1, t_s)
             if ends:
-                assert clock.own.end(LOSS, 1, 100.0) == ("gnss_back", "GNSS is back: the clock does not follow it")
+                assert clock.end(LOSS, 1, 100.0) == "GNSS is back: the clock does not follow it"
             errors_s.append(clock.error_s(400.0))
         assert errors_s[0] == pytest.approx(errors_s[1])
 

@@ -28,8 +28,8 @@ def drawn(seed: int, replication: int) -> dict[str, np.ndarray]:
     built = parts(seed, replication, "duration_s=2", DRIFTING, WALKING)
     world, n = built.world, len(built.world.drones)
     offset_s = [d.clock_skew_s for d in world.drones]
-    for own in world.own:
-        own.read(1000.0)
+    for clock in world._clocks:
+        clock.read(1000.0)
     drift_s = [d.clock_skew_s - at_first_s for d, at_first_s in zip(world.drones, offset_s, strict=True)]
     built.air.advance()
     motion, believed_m = world.motion, world.believed()[1]
@@ -81,10 +81,9 @@ def test_every_part_draws_by_the_seed_and_the_replication_that_fly_and_not_by_th
         monkeypatch.setattr(engine, name, lambda *a, **k: (got.__setitem__(name, place(a, k)), made(*a, **k))[1])
 
     noted("People", lambda a, k: a[-1])
-    for name in ("Air", "schedule"):
-        noted(name, lambda a, k: (k["seed"], k["replication"]))
-    for name in ("OwnEvents", "Steering", "oscillators", "sensor_errors", "flown_motion", "mixed"):
+    noted("Air", lambda a, k: (k["seed"], k["replication"]))
+    for name in ("Acted", "Steering", "oscillators", "sensor_errors", "flown_motion", "mixed"):
         noted(name, lambda a, k: a[-2:])
     parts(9, 4, "seed=1", "duration_s=0.2", "fleet.drones=2")
     assert got == dict.fromkeys(got, (9, 4))
-    assert len(got) == 9
+    assert len(got) == 8

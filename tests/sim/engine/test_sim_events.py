@@ -181,7 +181,7 @@ def test_jammers_and_lies_end_one_by_one() -> None:
     for at_s in (0.5, 1.5, 2.5, 3.5, 4.5):
         flight.env.run(until=at_s)
         lies = [len(status.lies) for status in flight.world.drones]
-        seen.append((sorted(power for _, power in flight.world.jammers.values()), lies))
+        seen.append((sorted(power for _, power in flight.world.jammers), lies))
     assert [jammed for jammed, _ in seen] == [[], [1], [1, 2], [2], []]
     assert [lies[1] for _, lies in seen] == [0, 1, 2, 1, 0]
     assert [lies[2] for _, lies in seen] == [0, 0, 1, 1, 0]

@@ -13,10 +13,10 @@ from sim_examples import example
 from sortie.perception.types import Boxes
 from sortie.policies.contract import Disc
 from sortie.scenarios.plugins.reference import PluginError
-from sortie.sim.engine.own_events import FleetHandle
+from sortie.sim.engine.events import Acted, FleetHandle
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build
-from sortie.sim.engine.world import OwnSenses
+from sortie.sim.engine.world import OwnSenses, World
 
 
 def _world(*sets: str) -> Any:
@@ -49,15 +49,26 @@ def test_a_drone_stays_where_it_was_in_the_frame_in_which_it_left_the_air() -> N
         assert world._down == {1: [(frame, 10)]}
 
 
-def test_losses_of_events_and_of_a_user_s_events_add_up() -> None:
+def test_losses_of_events_and_of_a_user_s_events_add_up_and_each_is_taken_back_as_a_whole() -> None:
     world = _world()
-    assert world._loss_db() is None
-    world.add_loss(0, 1, 10.0)
-    world.own_losses_db[0] = np.full((3, 3), 5.0)
-    world.own_losses_db[4] = np.full((3, 3), 2.0)
-    assert world._loss_db()[[0, 1, 0, 2], [1, 0, 2, 1]].tolist() == [17.0, 17.0, 7.0, 7.0]
-    world.add_loss(0, 1, -10.0)
     assert world.extra_loss_db is None
+    world.weaken(1, 0, 1, 10.1)
+    world.weaken(2, 0, 1, 0.2)
+    world.set_loss(0, np.full((3, 3), 5.0))
+    world.set_loss(4, np.full((3, 3), 2.0))
+    world.set_jammer(4, ((0.0, 0.0, 1.0), 3.0))
+    assert world.extra_loss_db[[0, 1, 0, 2], [1, 0, 2, 1]].tolist() == [10.1 + 0.2 + 7.0, 10.1 + 0.2 + 7.0, 7.0, 7.0]
+    for cause in (4, 1, 0):
+        world.lift(cause)
+    assert world.jammers == []
+    assert world.extra_loss_db.tolist() == [[0.0, 0.2, 0.0], [0.2, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    world.lift(2)
+    assert world.extra_loss_db is None
+
+
+def _handle(world: World) -> FleetHandle:
+    acted = Acted(world._scenario, world, None, None, (), 0, 0)  # type: ignore[arg-type]
+    return FleetHandle(acted, SimpleNamespace(model="mine", kind="own"), 3)  # type: ignore[arg-type]
 
 
 def test_people_that_are_sent_are_those_within_the_region() -> None:
@@ -71,7 +82,7 @@ def test_people_that_are_sent_are_those_within_the_region() -> None:
 
 def test_a_custom_event_sees_the_drones_of_the_frame_and_weakens_a_link_one_way() -> None:
     world = _world()
-    its = FleetHandle(world, world._scenario, SimpleNamespace(model="mine"), 3)  # type: ignore[arg-type]
+    its = _handle(world)
     for t_s, frame in ((0.27, 2), (0.3, 3)):
         world.env.run(until=t_s)
         np.testing.assert_array_equal(its.positions_m, world.motion.position_m[frame])
@@ -79,15 +90,15 @@ def test_a_custom_event_sees_the_drones_of_the_frame_and_weakens_a_link_one_way(
     one_way[0, 2] = 9.0
     its.set_loss_db(one_way)
     one_way[0, 2] = 1.0  # it keeps a copy
-    assert world._loss_db()[0, 2] == 9.0
-    assert world._loss_db().sum() == 9.0
+    assert world.extra_loss_db[0, 2] == 9.0
+    assert world.extra_loss_db.sum() == 9.0
     its.set_loss_db(4.0)
-    assert world._loss_db().tolist() == [[0.0, 4.0, 4.0], [4.0, 0.0, 4.0], [4.0, 4.0, 0.0]]
+    assert world.extra_loss_db.tolist() == [[0.0, 4.0, 4.0], [4.0, 0.0, 4.0], [4.0, 4.0, 0.0]]
 
 
 def test_a_custom_event_writes_no_note_that_the_record_cannot_hold() -> None:
     world = _world()
-    its = FleetHandle(world, world._scenario, SimpleNamespace(model="mine"), 3)  # type: ignore[arg-type]
+    its = _handle(world)
     for text in (5, None, b"storm"):
         for act in (lambda text=text: its.note(text), lambda text=text: its.lose(0, text)):
             with pytest.raises(PluginError, match=r"^event mine: text .+, must be a str$"):

@@ -31,8 +31,8 @@ from sortie.sim.engine.sortie import build, run_sortie
 from sortie.sim.export.topics import CONTEXT
 from sortie.sim.live import session
 from sortie.sim.live.context import ReplaySenses, Trace, traces
+from sortie.sim.live.events import LiveEvents, status_of
 from sortie.sim.live.node import LiveNode
-from sortie.sim.live.own_events import OwnEvents, status_of
 from sortie.sim.live.policy_process import Begin, PolicyOrders
 from sortie.sim.live.rules import rules_of
 from sortie.sim.live.scope import UNUSED, left_out
@@ -47,7 +47,7 @@ OTHER = f"fleet.makes=[{{name: other, drones: [1], {ALL_4}, feature_space: other
 def frames_in_the_fleet(trace: Trace, scenario: Scenario) -> list[bool]:
     """Whether a drone of a live flight is in the fleet, by frame."""
     env, status = simpy.Environment(), status_of(scenario, 1, 0.0)
-    OwnEvents(scenario, 1, env, status, lambda _: None).follow(trace)  # type: ignore[arg-type]
+    LiveEvents(scenario, 1, env, status, lambda _: None).follow(trace)  # type: ignore[arg-type]
     found = []
     for frame in range(scenario.frames):
         env.run(until=frame * scenario.frame_s + 0.001)
@@ -217,7 +217,7 @@ def test_a_live_clock_is_off_as_the_simulated_one() -> None:
         parts.world.start(lambda _: None)
         zero_s = 1000.0
         env, status, told = simpy.Environment(begin_s), status_of(scenario, 1, zero_s), []
-        events = OwnEvents(scenario, 1, env, status, told.append)  # type: ignore[arg-type]
+        events = LiveEvents(scenario, 1, env, status, told.append)  # type: ignore[arg-type]
         off_s = []
         for frame in range(round(begin_s * 10), 60):
             t_s = frame * scenario.frame_s + 0.001
@@ -239,7 +239,7 @@ def test_a_live_drone_lies_itself_and_its_own_senses_are_true() -> None:
     scenario = example("fleet.drones=2", lie)
     senses = ReplaySenses(scenario, 1, traces(scenario)[1], 0.0)
     env, status = simpy.Environment(), status_of(scenario, 1, 0.0)
-    OwnEvents(scenario, 1, env, status, str)  # type: ignore[arg-type]
+    LiveEvents(scenario, 1, env, status, str)  # type: ignore[arg-type]
     lies = []
     for frame in (5, 15, 35):
         env.run(until=frame * 0.1)

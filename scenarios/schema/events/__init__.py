@@ -1,0 +1,29 @@
+"""`events`: what goes wrong, and when. Each file of this folder has one kind; a file that is added is a kind more."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from typing import TYPE_CHECKING, Annotated, Union, get_args
+
+from pydantic import Field
+
+from sortie.scenarios.schema.events.base import Event
+
+
+def _kinds() -> dict[str, type[Event]]:
+    """Every kind of event by its name, in the order of the files."""
+    found: dict[str, type[Event]] = {}
+    for file in sorted(pkgutil.iter_modules(__path__), key=lambda each: each.name):
+        for each in vars(importlib.import_module(f"{__name__}.{file.name}")).values():
+            if isinstance(each, type) and issubclass(each, Event) and get_args(each.model_fields["kind"].annotation):
+                (kind,) = get_args(each.model_fields["kind"].annotation)
+                found[kind] = each
+    return found
+
+
+KINDS = _kinds()
+if TYPE_CHECKING:
+    AnyEvent = Event
+else:
+    AnyEvent = Annotated[Union[tuple(KINDS.values())], Field(discriminator="kind")]  # noqa: UP007 (of a tuple)
