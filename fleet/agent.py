@@ -48,6 +48,7 @@ from sortie.policies.damping import apply_hysteresis
 from sortie.policies.decision_loop import Change, DecisionLoop, Guard, OutgoingLink
 from sortie.policies.geometry import rank_loop
 from sortie.policies.staleness import LinkHealth
+from sortie.scenarios.frames import instant
 
 
 class Platform(NamedTuple):
@@ -311,7 +312,7 @@ class Agent:
     def _covered(self, now_s: float, here: View, told: bool) -> tuple[bytes, bool]:
         """The coverage grid, by the latest look, and whether it shows what the fleet had not seen; nothing without a look."""
         look = self._look
-        if look is None or now_s - look.capture.t_s > LOOK_STANDS_S + 1e-9:
+        if look is None or instant(now_s - look.capture.t_s) > instant(LOOK_STANDS_S):
             return NOTHING_SEEN, False
         grid = placed(look.view, here.row, here.column)
         return self._chart.mark(grid, here.row, here.column, partial(self._seen_near, here), told)

@@ -45,6 +45,16 @@ def frames_from(t_s: ArrayLike, frame_s: float) -> NDArray[np.int64]:
     return np.ceil(np.round(np.asarray(t_s, dtype=np.float64) / frame_s, DIGITS)).astype(np.int64)
 
 
+def instant(t_s: float) -> int:
+    """A moment or a span as a whole number of nanoseconds, so that two that differ by rounding alone are equal.
+
+    Example:
+        >>> 0.1 + 0.2 <= 0.3, instant(0.1 + 0.2) <= instant(0.3)
+        (False, True)
+    """
+    return round(t_s * 1e9)
+
+
 def with_frame(t_s: float, frame_s: float) -> float:
     """A moment, or the begin of the frame that it is but for rounding.
 

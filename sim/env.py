@@ -31,6 +31,7 @@ from pettingzoo import ParallelEnv
 from sortie.perception.metrics.ap import average_precision
 from sortie.policies.contract import Directive, FleetView
 from sortie.policies.observation import CHOICES, LIMIT, ROW, Obs, directives, observe
+from sortie.scenarios.frames import instant
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.schema import MemberEvent, Scenario
 from sortie.scenarios.whole import whole
@@ -286,7 +287,7 @@ class _Flight:
         self._new, self._t_s = new, t_s
         mission = new["mission"]
         self._mission = mission if self._mission is None else pa.concat_tables([self._mission, mission])
-        if t_s >= self._scenario.duration_s - 1e-9:
+        if instant(t_s) >= instant(self._scenario.duration_s):
             self._flown = True
             return  # the last one: the end hands over
         self._mine.release()

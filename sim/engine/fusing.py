@@ -17,11 +17,9 @@ from sortie.perception.detectors import Detector
 from sortie.perception.motion import Tracks
 from sortie.perception.types import Boxes, Capture, Found, Share
 from sortie.scenarios.disc import Disc
+from sortie.scenarios.frames import instant
 from sortie.scenarios.representation import DETECTED_NAMES, NAME_OF
 from sortie.scenarios.schema import Scenario
-
-INSTANT_S = 1e-9
-"""Ages closer together than this are equal but for rounding."""
 
 
 def as_share(received: Received, trust: float = 1.0, age_s: float = 0.0) -> Share:
@@ -79,7 +77,7 @@ class Fusing:
     def __init__(self, scenario: Scenario, own_tracks: Callable[[int], Tracks]) -> None:
         """Args: `own_tracks` gives what a drone's own tracker follows."""
         config = scenario.perception
-        self._limit_s, self._fusion_delay_s = config.max_age_s + INSTANT_S, config.fusion_delay_s
+        self._limit_s, self._fusion_delay_s = config.max_age_s, config.fusion_delay_s
         self._own_tracks, self._delays_s = own_tracks, scenario.compute_delays_s
 
     def maps(self, agent: Agent, now_s: float) -> list[Share]:
@@ -91,7 +89,7 @@ class Fusing:
         shares = []
         for received, share in self._held(agent, now_s):
             shares.append(share)
-            if (boxes := found_in(received, share)) is not None and boxes.age_s <= self._limit_s:
+            if (boxes := found_in(received, share)) is not None and instant(boxes.age_s) <= instant(self._limit_s):
                 shares.append(boxes)
         if any(s.representation in DETECTED_NAMES for s in shares):
             own = self._own_tracks(agent.drone)
@@ -102,7 +100,7 @@ class Fusing:
         memory = agent.memory
         for peer, received in sorted(memory.held.items()):
             age_s = memory.payload_age_s(received, now_s)
-            if age_s <= self._limit_s:
+            if instant(age_s) <= instant(self._limit_s):
                 yield received, as_share(received, memory.trust_in(peer), age_s)
 
     def job(self, agent: Agent, here: Capture, shares: list[Share], now_s: float) -> Job | None:
@@ -113,7 +111,7 @@ class Fusing:
         """
         look = agent.latest
         delay_s = self._delays_s[here.drone] + agent.status.slowed_s + self._fusion_delay_s  # of any capture
-        if look is None or now_s - look.t_s > self._limit_s + delay_s:
+        if look is None or instant(now_s - look.t_s) > instant(self._limit_s + delay_s):
             if not shares:
                 return None
             look = here._replace(looked=False)
@@ -137,7 +135,7 @@ class FindingEachFrame:
         """Args: `count_boxes` gives the number of boxes in a region where no detector flies."""
         self._env, self._scenario, self._detector, self._fusing = env, scenario, detector, fusing
         self._count_boxes = count_boxes
-        self._limit_s = scenario.perception.max_age_s + INSTANT_S
+        self._limit_s = scenario.perception.max_age_s
         self._jobs: list[Job] = []
         self._found: dict[int, tuple[Capture, Boxes | None]] | None = None  # of these jobs
 
@@ -172,7 +170,7 @@ class FindingEachFrame:
         if drone not in self._found:
             return None
         look, each = self._found[drone]
-        if self._env.now - look.t_s > self._limit_s:
+        if instant(self._env.now - look.t_s) > instant(self._limit_s):
             return None
         if each is None:
             return Found(look, self._count_boxes(look, roi), None)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from sortie.fleet.agent import Task
 from sortie.perception.scene.traffic import TargetPath
 from sortie.policies.contract import PHASE_OF, Disc
+from sortie.scenarios.frames import instant
 from sortie.scenarios.schema import Mission
 
 
@@ -39,7 +40,7 @@ class MissionPlan:
 
     def __init__(self, mission: Mission, drones: int) -> None:
         self._phases = mission.phases_of
-        self._begins_s = [[p.at_s for p in phases] for phases in self._phases]
+        self._begins = [[instant(p.at_s) for p in phases] for phases in self._phases]
         self._targets = [TargetPath.of(target) for target in mission.targets]
         self.group_of = [mission.group_of(drone) for drone in range(drones)]
         """The number of each drone's group."""
@@ -55,7 +56,7 @@ class MissionPlan:
         return self._of(self.group_of[drone], t_s).region
 
     def _of(self, group: int, t_s: float) -> MissionNow:
-        phase = self._phases[group][bisect_right(self._begins_s[group], t_s + 1e-9) - 1]
+        phase = self._phases[group][bisect_right(self._begins[group], instant(t_s)) - 1]
         number, target = -1, None
         if self._targets:
             number, target = phase.target, self._targets[phase.target].pose(t_s)[:2]

@@ -219,8 +219,8 @@ class Forecast:
             return
         now_s, (since_t_s, since_s) = self._clock(), self._since
         if not since_t_s:
-            self._since = (t_s if t_s >= START_S - 1e-6 else 0.0), now_s
-        elif t_s - since_t_s >= MEASURED_S - 1e-6 and now_s - since_s >= MEASURED_WALL_S:
+            self._since = (t_s if round(t_s) >= START_S else 0.0), now_s
+        elif round(t_s - since_t_s) >= MEASURED_S and now_s - since_s >= MEASURED_WALL_S:
             left_s = self._flights * self._scenario.duration_s - t_s
             takes_s = now_s - self._begun_s + left_s * (now_s - since_s) / (t_s - since_t_s)
             self.takes_s, self.measured_s = takes_s, t_s

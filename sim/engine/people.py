@@ -17,17 +17,18 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.thermal import Sighting, boxes_of, look, looked_at, people_boxes
 from sortie.perception.types import Boxes, Capture, Share
 from sortie.policies.contract import Disc
+from sortie.scenarios.frames import frame_at, instant
 from sortie.scenarios.schema import Scenario, Thermal
 from sortie.sim.results.record import Recorder
 
 KEPT_S = 5.0
 """So long looks are kept: longer than a tracker makes up for (`sortie.sim.engine.tracking.WARM_UP_S`)."""
-_INSTANT_S = 1e-9
 
 
 class Look(NamedTuple):
     """What a drone's thermal camera found in a frame."""
 
+    frame: int
     capture: Capture
     boxes: Boxes | None
     """None where it was covered, so that its frame says nothing."""
@@ -66,9 +67,9 @@ class People:
         self._rows["sightings"].extend((s.t_s, capture.drone, s.x_m, s.y_m, s.score, s.person) for s in found)
         lately, looks = self._lately[capture.drone], self._looks[capture.drone]
         lately.extend(found)
-        while lately and lately[0].t_s < capture.t_s - camera.remembers_s - _INSTANT_S:
+        while lately and instant(lately[0].t_s) < instant(capture.t_s - camera.remembers_s):
             lately.popleft()
-        looks.append(Look(capture, None if is_blocked else boxes_of(found)))
+        looks.append(Look(frame, capture, None if is_blocked else boxes_of(found)))
         while looks[0].capture.t_s < capture.t_s - KEPT_S:
             looks.popleft()
 
@@ -82,18 +83,16 @@ class People:
         if region is None:
             return False
         return any(
-            s.t_s + self._delays_s[drone] <= now_s + _INSTANT_S
+            instant(s.t_s + self._delays_s[drone]) <= instant(now_s)
             and math.hypot(s.x_m - region.x_m, s.y_m - region.y_m) <= region.radius_m
             for s in self._lately[drone]
         )
 
     def found(self, capture: Capture) -> Boxes:
         """What the drone's thermal camera found at the moment of a capture."""
-        for its in reversed(self._looks[capture.drone]):
-            if its.capture.t_s <= capture.t_s + _INSTANT_S:
-                is_same = its.capture.t_s >= capture.t_s - _INSTANT_S
-                return its.boxes if is_same and its.boxes is not None else Boxes.empty()
-        return Boxes.empty()
+        frame = frame_at(capture.t_s, self._frame_s)
+        its = next((its for its in self._looks[capture.drone] if its.frame == frame), None)
+        return Boxes.empty() if its is None or its.boxes is None else its.boxes
 
     def with_people(
         self, own_boxes: Callable[[Sequence[Capture]], Sequence[Boxes]]
@@ -119,7 +118,7 @@ class People:
         known = (
             its
             for its in reversed(self._looks[here.drone])
-            if its.capture.t_s + self._delays_s[here.drone] <= now_s + _INSTANT_S
+            if instant(its.capture.t_s + self._delays_s[here.drone]) <= instant(now_s)
         )
         sources = []
         if (last := next(known, None)) is not None and last.boxes is not None:

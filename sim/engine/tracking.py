@@ -22,6 +22,7 @@ from sortie.perception.scene.traffic import TARGET_SIZE_M
 from sortie.perception.tracking.following import agree_loop, followed
 from sortie.perception.tracking.tracker import step
 from sortie.perception.types import Boxes, Capture
+from sortie.scenarios.frames import frame_at, instant
 from sortie.scenarios.schema import Scenario
 from sortie.sim.results.mission_outcome import sees_ground
 
@@ -33,7 +34,6 @@ CUE_MOST_S = 2.5
 """... of this time at most, where cues come more rarely."""
 AHEAD = 100
 """Captures that are expected next and computed together."""
-_INSTANT_S = 1e-6
 
 OwnBoxesOf = Callable[[Sequence[Capture]], Sequence[Boxes]]
 
@@ -54,7 +54,7 @@ class FleetTracking:
     def __init__(self, scenario: Scenario, own_boxes: OwnBoxesOf) -> None:
         """Args: `own_boxes` gives each capture's detections by its drone alone."""
         n = scenario.fleet.drones
-        self._looks_s = [frame * scenario.frame_s for frame in scenario.tracked_frames]
+        self._looks, self._frame_s = scenario.tracked_frames, scenario.frame_s
         self._own_boxes = own_boxes
         self._taken = [0] * n
         self._waiting: deque[Capture] = deque()
@@ -66,12 +66,12 @@ class FleetTracking:
 
     def perceived(self, capture: Capture) -> None:
         """A drone's perception has worked on a capture; its tracker takes it in if a look is due."""
-        drone, t_s = capture.drone, capture.t_s
+        drone, frame = capture.drone, frame_at(capture.t_s, self._frame_s)
         due = self._taken[drone]
-        if due < len(self._looks_s) and t_s >= self._looks_s[due] - _INSTANT_S:
-            self._taken[drone] = bisect_right(self._looks_s, t_s + _INSTANT_S)
+        if due < len(self._looks) and frame >= self._looks[due]:
+            self._taken[drone] = bisect_right(self._looks, frame)
             self._waiting.append(capture)
-            while self._waiting[0].t_s < t_s - WARM_UP_S - _INSTANT_S:
+            while instant(self._waiting[0].t_s) < instant(capture.t_s - WARM_UP_S):
                 self._waiting.popleft()
 
     def tracks(self, drone: int) -> Tracks:
@@ -88,16 +88,17 @@ class FleetTracking:
         It is judged anew after a look of the drone's tracker, and `CUE_S` after the last time.
         """
         cues = self._cues.setdefault(target, deque())
-        if not cues or cues[-1][0] < now_s - _INSTANT_S:
+        if not cues or cues[-1][0] < now_s:
             cues.append((now_s, cue_m))
-        while len(cues) > 2 and cues[1][0] <= now_s - CUE_S + _INSTANT_S:
+        while len(cues) > 2 and instant(cues[1][0]) <= instant(now_s - CUE_S):
             cues.popleft()
         since_s, (x_m, y_m) = cues[0]
         lasts_s = now_s - since_s
-        if not CUE_S - _INSTANT_S <= lasts_s <= CUE_MOST_S:
+        if not instant(CUE_S) <= instant(lasts_s) <= instant(CUE_MOST_S):
             return False
         tracks, before = self.tracks(drone), self._followed[drone]
-        if tracks is not before.judged_by or target != before.target or now_s >= before.at_s + CUE_S - _INSTANT_S:
+        is_due = math.isinf(before.at_s) or instant(now_s - before.at_s) >= instant(CUE_S)
+        if tracks is not before.judged_by or target != before.target or is_due:
             cue = (*cue_m, (cue_m[0] - x_m) / lasts_s, (cue_m[1] - y_m) / lasts_s)
             following = followed(tracks, {target: cue}, before.tracks, now_s)
             before = self._followed[drone] = _Followed(target, following, tracks, now_s)
@@ -132,10 +133,9 @@ def captures_ahead(
         capture_of: a drone's capture in a frame.
     """
     frames, n = scenario.tracked_frames, scenario.fleet.drones
-    starts_s = [frame * scenario.frame_s for frame in frames]
 
     def coming(after_s: float) -> Iterable[Capture]:
-        first = bisect_right(starts_s, after_s + _INSTANT_S)
+        first = bisect_right(frames, frame_at(after_s, scenario.frame_s))
         return (capture_of(drone, frame) for frame in frames[first : first + max(1, AHEAD // n)] for drone in range(n))
 
     return coming

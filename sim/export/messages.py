@@ -9,6 +9,7 @@ from sortie.fleet.coverage import TARGET_FLAG, cameras_of, footprint_radius_m
 from sortie.fleet.plane import codebooks
 from sortie.policies.contract import PHASE_OF, Descriptor, Directive, Disc
 from sortie.scenarios.disc import LISTED_IDS
+from sortie.scenarios.frames import frame_at
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.sim.results import rosters
 from sortie.sim.results.record import SortieRecord
@@ -20,17 +21,17 @@ def descriptors(record: SortieRecord) -> Iterator[tuple[float, Descriptor]]:
     n, states = record.scenario.fleet.drones, record.tables["states"]
     names = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "vx_mps", "vy_mps", "vz_mps")
     x, y, z, qx, qy, qz, qw, vx, vy, vz = (states[name].to_numpy() for name in names)
-    rate_hz, spaces = record.scenario.context.rate_hz, record.scenario.feature_spaces
+    frame_s, spaces = record.scenario.frame_s, record.scenario.feature_spaces
     books = codebooks(record.scenario)
     cameras, blind = cameras_of(record.scenario.fleet), record.scenario.fleet.without_camera
     mission, group_of = record.tables["mission"], record.scenario.mission.group_of
     targets = {
-        (int(t_s * rate_hz + 1e-6), group): target
+        (frame_at(t_s, frame_s), group): target
         for t_s, group, target in zip(*(mission[name].to_pylist() for name in ("t_s", "group", "target")), strict=True)
     }
     roster_at = rosters.of(record.tables)
     for row in rows:
-        frame = min(int(row["t_s"] * rate_hz + 1e-6), record.scenario.frames - 1)
+        frame = min(frame_at(row["t_s"], frame_s), record.scenario.frames - 1)
         k = frame * n + row["drone"]
         region = (
             None

@@ -19,6 +19,7 @@ from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.logs.ground_station import answers, parameter_values, status_texts
 from sortie.fleet.logs.mavlink import STATUS, Listener, Transmitter, messages, write_tlog
 from sortie.perception.scene.scene_model import SceneModel
+from sortie.scenarios.frames import frame_at
 from sortie.scenarios.schema import Scenario
 from sortie.sim.export.endpoint import open_address
 from sortie.sim.export.origin import origin_of
@@ -79,7 +80,7 @@ class Stream:
 
     def _states(self, new: Mapping[str, pa.Table]) -> Iterator[tuple[float, int, Any]]:
         for drone, state in self._telemeter.add(new):
-            second = int(state.time_s + 1e-6)
+            second = frame_at(state.time_s, 1.0)
             status, first = second != self._second[drone], self._second[drone] < 0
             self._second[drone] = second
             told = messages(state, self._origin)

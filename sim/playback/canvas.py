@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from sortie.scenarios.frames import frames_at
 from sortie.sim.results.palette import Floats, Rgba
 
 SIM_TIME, FRAME = "sim_time", "frame"
@@ -47,7 +48,7 @@ class Canvas:
             return
         indexes = [
             rr.TimeColumn(SIM_TIME, duration=np.round(np.asarray(t_s) * 1e9).astype("timedelta64[ns]")),
-            rr.TimeColumn(FRAME, sequence=np.floor(np.asarray(t_s) * self._rate_hz + 1e-6).astype(np.int64)),
+            rr.TimeColumn(FRAME, sequence=frames_at(t_s, 1.0 / self._rate_hz)),
         ]
         self._recording.send_columns(self._at(path), indexes, [c for group in columns for c in group], strict=True)
 

@@ -5,7 +5,6 @@ As in `sortie.sim.playback.scene`, tables come whole or by whole seconds; sums o
 
 from __future__ import annotations
 
-import math
 import re
 from collections import defaultdict, deque
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,6 +15,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from sortie.perception.metrics.ap import Matched, average_precision
+from sortie.scenarios.frames import frame_at, frame_from, frames_at, frames_from, instant
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback.canvas import Canvas, line
@@ -38,8 +38,6 @@ OVER_COLOUR: palette.Rgba = (0, 0, 0, 255)
 RUNGS = ("nothing", *list(REPRESENTATION_OF)[1:])
 FATES: dict[str, palette.Rgba] = {"expired": (225, 222, 240, 255), "lost": (255, 50, 70, 255)}
 """Colours of traffic that did not arrive; what arrived has its representation's colour."""
-_INSTANT_S = 1e-6
-"""A frame begins a few digits beside its second."""
 
 
 def phase_lane(group: int) -> str:
@@ -121,8 +119,8 @@ class Charts:
         """The seconds (begin, end) that are whole by now; the last one of a sortie may be short."""
         begin_s, seconds = self._known_s, []
         while begin_s < known_s:
-            end_s = min(math.floor(begin_s + 1e-9) + 1.0, self._scenario.duration_s)
-            if end_s > known_s + 1e-9:
+            end_s = min(frame_at(begin_s, 1.0) + 1.0, self._scenario.duration_s)
+            if instant(end_s) > instant(known_s):
                 break
             seconds.append((begin_s, end_s))
             begin_s = end_s
@@ -187,14 +185,20 @@ class Charts:
         self._received = np.concatenate([self._received, rows])
         points = []
         for begin_s, end_s in seconds:
-            first, last = np.searchsorted(self._received[:, 0], (begin_s - _INSTANT_S, end_s - _INSTANT_S))
+            first, last = np.searchsorted(
+                frames_at(self._received[:, 0], self._scenario.frame_s),
+                frames_from((begin_s, end_s), self._scenario.frame_s),
+            )
             heard, *lost = self._received[first:last, 1:].sum(axis=0).tolist()
             if heard + sum(lost) > 0:
                 points.append((end_s, 100.0 * sum(lost) / (heard + sum(lost))))
         if points:
             self._canvas.scalars("plots/lost/percent", *np.array(points).T)
         if seconds:
-            self._received = self._received[self._received[:, 0] >= seconds[-1][1] - _INSTANT_S]
+            self._received = self._received[
+                frames_at(self._received[:, 0], self._scenario.frame_s)
+                >= frame_from(seconds[-1][1], self._scenario.frame_s)
+            ]
 
     def _accuracy(self, seconds: Sequence[tuple[float, float]], seen: Iterable[Sighting]) -> None:
         """AP@0.5 over the last seconds, all egos pooled, and of each ego in the full scene."""

@@ -12,6 +12,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from sortie.perception.scene.scene_model import MARGIN_M, SceneModel
+from sortie.scenarios.frames import frame_at, frames_at
 from sortie.scenarios.schema import Scenario
 from sortie.sim.playback.canvas import Canvas, packed
 from sortie.sim.results import palette
@@ -93,7 +94,7 @@ class GroundMap:
 
     def _trails(self, t_s: Floats, flat: Floats, airborne: NDArray[np.bool_]) -> None:
         """A trail begins anew where a drone takes off."""
-        for k in np.flatnonzero(np.floor(t_s + 1e-6) > np.floor(t_s - 1.0 / self._rate_hz + 1e-6)).tolist():
+        for k in np.flatnonzero(frames_at(t_s, 1.0) > frames_at(t_s - 1.0 / self._rate_hz, 1.0)).tolist():
             self._trail = np.concatenate([self._trail, flat[k][None]])[-TRAIL_S:]
             took_off = airborne[k] & ~self._flew
             self._trail[:, took_off] = flat[k, took_off]
@@ -104,8 +105,10 @@ class GroundMap:
     def _regions(self, drawn: Floats, mission: pa.Table) -> None:
         """The rings of all groups; none where there is no region."""
         rows = {name: mission[name].to_numpy() for name in ("t_s", "region_x_m", "region_y_m", "region_radius_m")}
+        frame_s = 1.0 / self._rate_hz
+        frames = frames_at(rows["t_s"], frame_s)
         for t_s in drawn.tolist():
-            now = np.flatnonzero((np.abs(rows["t_s"] - t_s) < 1e-6) & ~np.isnan(rows["region_radius_m"]))
+            now = np.flatnonzero((frames == frame_at(t_s, frame_s)) & ~np.isnan(rows["region_radius_m"]))
             rings = [
                 self._flat((rows["region_x_m"][k], rows["region_y_m"][k]) + rows["region_radius_m"][k] * CIRCLE)
                 for k in now.tolist()

@@ -22,6 +22,7 @@ from sortie.fleet.flight.frames import yaw_rad
 from sortie.perception.budget import CELL_M, roi_mask
 from sortie.perception.geometry import CELLS
 from sortie.scenarios.disc import Disc
+from sortie.scenarios.frames import instant
 from sortie.scenarios.representation import CELL_NAMES
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import Canvas
@@ -95,7 +96,7 @@ class ReceivedCells:
         self._note_regions(new["directives"])
         self._note_arrivals(new["transmissions"])
         steps = []
-        while self._next_s <= known_s + 1e-9:
+        while instant(self._next_s) <= instant(known_s):
             steps.append(self._next_s)
             self._next_s += STEP_S
         for ego, peer in self._links():
@@ -120,7 +121,7 @@ class ReceivedCells:
     def _region(self, sender: int, receiver: int, t_s: float) -> Disc | None:
         """The region of the directive in force when a payload was handed to the radio."""
         known = self._regions[sender, receiver]
-        k = bisect_right(known, t_s + 1e-9, key=lambda row: row[0])
+        k = bisect_right(known, instant(t_s), key=lambda row: instant(row[0]))
         return known[k - 1][1] if k else None
 
     def _draw(self, ego: int, peer: int, steps: list[float]) -> None:
@@ -168,7 +169,7 @@ class ReceivedCells:
         return np.array(t_s), np.concatenate(told or [np.zeros((0, 5))]), counts
 
     def _pose(self, drone: int, t_s: float) -> Pose:
-        k = int(np.searchsorted(self._pose_t_s, t_s + 1e-9, side="right")) - 1
+        k = bisect_right(self._pose_t_s, instant(t_s), key=instant) - 1
         x, y, yaw = self._poses[max(k, 0), drone].tolist()
         return x, y, yaw
 

@@ -24,6 +24,7 @@ from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.scene.town import KERB_M, LANE_M, PAVEMENT_M
 from sortie.perception.scene.traffic import Cars
 from sortie.perception.types import Boxes
+from sortie.scenarios.frames import frames_at
 from sortie.scenarios.schema import Jammer, Scenario
 from sortie.sim.playback import canvas as c
 from sortie.sim.playback.canvas import SPAN_M, Canvas
@@ -206,7 +207,7 @@ class Drawing:
         bead_frames = (frames // step)[:, None] * step - step * np.arange(beads)[None, :]
         kept = bead_frames >= 0
         lengths = kept.sum(axis=1)
-        second = np.flatnonzero(np.floor(t_s + 1e-6) > np.floor(t_s - 1.0 / self._rate_hz + 1e-6))
+        second = np.flatnonzero(frames_at(t_s, 1.0) > frames_at(t_s - 1.0 / self._rate_hz, 1.0))
         for i in range(self._n):
             moves = rr.Transform3D.columns(translation=position[:, i], quaternion=attitude[:, i])
             canvas.columns(f"world/drones/{i}", t_s, moves)

@@ -1,4 +1,4 @@
-"""`events`: what goes wrong, and when. Each file of this folder has one kind; a file that is added is a kind more."""
+"""`events`: what goes wrong, and when. Each class of this folder with a `kind` is one; a file that is added needs no other."""
 
 from __future__ import annotations
 

@@ -12,9 +12,7 @@ from sim_examples import example
 from sortie.fleet.clock import DroneClock, Oscillator
 from sortie.fleet.plane import DroneStatus
 from sortie.scenarios.schema import Event, Lasting
-from sortie.scenarios.schema.events.clock_drift import ClockDrift
-from sortie.scenarios.schema.events.clock_skew import ClockSkew
-from sortie.scenarios.schema.events.gnss_loss import GnssLoss
+from sortie.scenarios.schema.events.clocks import ClockDrift, ClockSkew, GnssLoss
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.live.events import LiveFleet
 from sortie.sim.results.record import SortieRecord

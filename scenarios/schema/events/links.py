@@ -1,4 +1,4 @@
-"""Links that fade."""
+"""Links that fade, and jammers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from sortie.scenarios.schema.base import DroneId
-from sortie.scenarios.schema.events.base import Event, Fleet, Lasting, Misfit
+from sortie.scenarios.schema.events.base import Event, Fleet, Jammer, Lasting, Misfit
 from sortie.scenarios.schema.movement import GroundStation
 
 
@@ -45,3 +45,19 @@ class LinkDrop(Lasting):
     @property
     def _links(self) -> str:
         return f"links of {self.drone}" if self.peer is None else f"links of {self.drone}–{self.peer}"
+
+
+class Jam(Jammer):
+    """A jammer stands somewhere."""
+
+    not_live: ClassVar[str] = "it changes the replayed goodput alone, the bus loses nothing"
+
+    kind: Literal["jam"]
+
+    def begin(self, fleet: Fleet) -> None:
+        fleet.note(f"a jammer of {self.power_dbm:g} dBm at {self.position_m}")
+        fleet.jam(self.position_m, self.power_dbm)
+
+    def end(self, fleet: Fleet, lasts: bool) -> None:
+        fleet.lift()
+        self.note_end(fleet, lasts, "jam_over", "the jammer is off", "this jammer is off, another one is still on")

@@ -1,4 +1,4 @@
-"""GNSS that is lost."""
+"""Clocks that are off or drift, and GNSS that is lost."""
 
 from __future__ import annotations
 
@@ -9,7 +9,39 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from sortie.scenarios.schema.base import DroneId
-from sortie.scenarios.schema.events.base import Fleet, PoseFault
+from sortie.scenarios.schema.events.base import Event, Fleet, PoseFault
+
+
+class ClockSkew(Event):
+    """A clock jumps."""
+
+    acts_live: ClassVar[bool] = True
+
+    kind: Literal["clock_skew"]
+    drone: DroneId = Field(description="Whose clock is off.")
+    skew_s: float = Field(
+        ge=-3600, le=3600, description="Added to its stamps; negative makes its descriptors look old."
+    )
+
+    def begin(self, fleet: Fleet) -> None:
+        fleet.clock(self.drone).jump(fleet.t_s, self.skew_s)
+        fleet.note(f"clock off by {self.skew_s:g} s", self.drone)
+        fleet.read_clocks()
+
+
+class ClockDrift(Event):
+    """A clock runs too fast or too slowly from now on."""
+
+    acts_live: ClassVar[bool] = True
+
+    kind: Literal["clock_drift"]
+    drone: DroneId = Field(description="Whose clock drifts, and follows GNSS no more.")
+    drift_ppm: float = Field(ge=-100000, le=100000, description="How much too fast it runs from then on.")
+
+    def begin(self, fleet: Fleet) -> None:
+        fleet.clock(self.drone).drift(fleet.t_s, self.drift_ppm)
+        fleet.note(f"clock drifts by {self.drift_ppm:g} ppm", self.drone)
+        fleet.read_clocks()
 
 
 class GnssLoss(PoseFault):

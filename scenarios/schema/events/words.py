@@ -1,4 +1,4 @@
-"""Attackers that imitate a drone."""
+"""False descriptors: an attacker's, and a drone's own."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from sortie.scenarios.schema.base import DroneId
-from sortie.scenarios.schema.events.base import Fleet, Lasting
+from sortie.scenarios.schema.events.base import About, Claim, Fleet, Lasting
 
 OVERSIZED_BYTES = 2000
 KEY_BYTES = 32
@@ -57,3 +57,26 @@ class Spoof(Lasting):
 def _empty_handed(descriptor: Any) -> Any:
     """A false descriptor: the drone claims an empty battery and no links."""
     return descriptor._replace(battery_soc=0.0, peer_goodput_mbps=(0.0,) * len(descriptor.peer_goodput_mbps))
+
+
+class Lie(Lasting):
+    """A drone says what is false, in its own descriptors."""
+
+    acts_live: ClassVar[bool] = True
+    in_trace: ClassVar[bool] = False
+
+    kind: Literal["lie"]
+    drone: DroneId = Field(description="Who lies, in its own descriptors.")
+    about: About = Field("coverage", description="What is false.")
+    claim: Claim = Field(
+        "much",
+        description="All cells new, 500 Mb/s to everyone, a full battery; or nothing seen, 0.1 Mb/s, an empty one.",
+    )
+
+    def begin(self, fleet: Fleet) -> None:
+        fleet.lie(self.drone, self.about, self.claim)
+        fleet.note(f"claims {self.claim} {self.about}", self.drone)
+
+    def end(self, fleet: Fleet, lasts: bool) -> None:
+        fleet.lift()
+        self.note_end(fleet, lasts, "lie_over", "tells the truth again", "still lies: another lie lasts")
