@@ -7,7 +7,8 @@ It holds no other drone and no world. Each drone is one SimPy process that wakes
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -29,7 +30,7 @@ from sortie.fleet.standings import Standing
 from sortie.fleet.trust import JUDGED_EVERY_S
 from sortie.perception.budget import loops as cell_loops
 from sortie.perception.motion import Tracks
-from sortie.perception.types import Boxes, Capture
+from sortie.perception.types import Boxes, Capture, Found
 from sortie.policies.checks import check_directives, differing
 from sortie.policies.contract import (
     COVERAGE_CELL_M,
@@ -90,6 +91,51 @@ class Modem(Protocol):
     def goodput_mbps(self, to: Sequence[int] | None = None, /) -> tuple[float, ...]: ...
 
 
+class Decides(Protocol):
+    """Who decides for a drone: its policy, and what stands about it."""
+
+    @property
+    def guard(self) -> Guard | None:
+        """Has the last word before the gates; None where there are no invariants."""
+
+    @property
+    def handshake_bytes(self) -> int:
+        """What its sharing method puts on every link and frame before payloads, at the moment."""
+
+    def read(self, heard: FleetView) -> FleetView:
+        """What the drone reads in place of what it heard."""
+
+    def __call__(self, view: FleetView) -> Sequence[Directive]:
+        """The directives, not yet checked."""
+
+    def check(self, directives: Sequence[Directive], view: FleetView) -> None:
+        """Refuse an answer that breaks the contract."""
+
+
+@dataclass(frozen=True)
+class Alone:
+    """A policy, and nothing about it."""
+
+    policy: Policy
+    handshake_bytes: int = 0
+    guard: Guard | None = None
+
+    def read(self, heard: FleetView) -> FleetView:
+        return heard
+
+    def __call__(self, view: FleetView) -> Sequence[Directive]:
+        return self.policy(view)
+
+    def check(self, directives: Sequence[Directive], view: FleetView) -> None:
+        check_directives(directives, view)
+
+
+class Finds(Protocol):
+    """What every drone found when it last fused."""
+
+    def last(self, drone: int, roi: Disc | None) -> Found | None: ...
+
+
 Ages = Sequence[float] | NDArray[np.float64]
 
 
@@ -113,18 +159,14 @@ class Agent:
         memory: PeerMemory,
         *,
         rules: FleetRules,
-        policy: Policy,
+        pilot: Decides,
         senses: Senses,
         modem: Modem,
         gate: Gate,
         log: AgentLog,
         sealer: Sealer | None,
         phase_s: float,
-        handshake_bytes: Callable[[], int],
-        guard: Guard | None = None,
-        reads: Callable[[FleetView], FleetView] | None = None,
-        check: Callable[[Sequence[Directive], FleetView], None] = check_directives,
-        found_last: FoundLast | None = None,
+        finding: Finds | None = None,
     ) -> None:
         """Put a drone together; `start` begins its process.
 
@@ -132,18 +174,14 @@ class Agent:
             env: the clock.
             memory: the drone's number, its shared status, and what it receives.
             rules: the plane's periods.
-            policy: decides on the links once a frame.
+            pilot: decides on the links once a frame.
             senses: the drone's own sensors.
             modem: the drone's end of the air.
             gate: enforces the directives.
             log: gets every act of the drone.
             sealer: signs descriptors; None publishes them unauthenticated.
             phase_s: when in each frame this drone acts.
-            handshake_bytes: what its sharing method puts on every link and frame before payloads, at the moment.
-            guard: has the last word before the gates; None where there are no invariants.
-            reads: gives what the drone reads in place of what it heard; None where that is the same.
-            check: refuses a policy's answer that breaks the contract.
-            found_last: gives what the drone found when it last fused; None does not send it.
+            finding: has what the drone found when it last fused; None does not send it.
         """
         self.drone, self.status, self.memory = memory.drone, memory.status, memory
         self.here: Capture | None = None
@@ -153,16 +191,15 @@ class Agent:
         self._env = env
         self._rules = rules
         self._compute_delay_s = rules.equipment(self.drone).compute_delay_s
-        self._policy = policy
+        self._pilot = pilot
         self._senses = senses
         self._modem = modem
         self._gate = gate
         self._log = log
         self._sealer = sealer
         self._phase_s = phase_s
-        self._handshake_bytes = handshake_bytes
-        self._loop = DecisionLoop(self.drone, rules, guard)
-        self._reads, self._check, self._found_last = reads, check, found_last
+        self._loop = DecisionLoop(self.drone, rules, pilot.guard)
+        self._found_last: FoundLast | None = None if finding is None else partial(finding.last, self.drone)
         self._period_s = rules.descriptor_period_s
         self._encode = encode_descriptor if rules.form == FULL else partial(encode_compact, form=rules.form)
         self._fresh_s = rules.fresh_s
@@ -339,14 +376,13 @@ class Agent:
     def _decide(self) -> None:
         now_s, me, memory = self._env.now, self.drone, self.memory
         ages = memory.ages(now_s)
-        heard = view = memory.view(now_s, ages)
-        if self._reads is not None:
-            view = self._reads(heard)
+        heard = memory.view(now_s, ages)
+        view = self._pilot.read(heard)
         if self._rules.people and view.human_in_region != self._alert:
             self._alert = not self._alert
             self._log.alert(now_s, me, self._alert)
         begin_ns = time.perf_counter_ns()
-        directives = self._policy(view)
+        directives = self._pilot(view)
         elapsed_ns = time.perf_counter_ns() - begin_ns
         is_heard = view is heard
         known, changed = self._ids, None
@@ -354,7 +390,7 @@ class Agent:
         if is_heard and known is not None:
             changed = differing(self._answer, directives, view, self._asked_of)
         if changed is None:
-            self._check(directives, view)
+            self._pilot.check(directives, view)
             self._asked_of = {d.destination: d for d in directives}
         else:
             due = {*self._overdue(ages, now_s), *[d.destination for d in changed]}
@@ -433,7 +469,7 @@ class Agent:
             return
         self.latest = capture
         self._senses.perceived(capture)
-        handshake_bytes = self._handshake_bytes()
+        handshake_bytes = self._pilot.handshake_bytes
         if handshake_bytes:
             self._shake_hands(handshake_bytes, capture)
         pose, count_boxes = capture.est_pose, partial(self._senses.count_boxes, capture)

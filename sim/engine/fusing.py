@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from itertools import count
 from typing import Any
 
@@ -14,12 +14,13 @@ from sortie.fleet.memory import Received
 from sortie.perception.budget import MAX_TRACKS
 from sortie.perception.classes import PERSON
 from sortie.perception.detectors import Detector
-from sortie.perception.motion import Tracks
+from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.types import Boxes, Capture, Found, Share
 from sortie.scenarios.disc import Disc
 from sortie.scenarios.frames import instant
 from sortie.scenarios.representation import DETECTED_NAMES, NAME_OF
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.tracking import FleetTracking, cars_in_reach
 
 
 def as_share(received: Received, trust: float = 1.0, age_s: float = 0.0) -> Share:
@@ -74,11 +75,11 @@ def ready(agent: Agent) -> Capture | None:
 class Fusing:
     """What drones fuse, of their own looks and of what they hold."""
 
-    def __init__(self, scenario: Scenario, own_tracks: Callable[[int], Tracks]) -> None:
-        """Args: `own_tracks` gives what a drone's own tracker follows."""
+    def __init__(self, scenario: Scenario, tracking: FleetTracking) -> None:
+        """Args: `tracking` has what each drone's own tracker follows."""
         config = scenario.perception
         self._limit_s, self._fusion_delay_s = config.max_age_s, config.fusion_delay_s
-        self._own_tracks, self._delays_s = own_tracks, scenario.compute_delays_s
+        self._tracking, self._delays_s = tracking, scenario.compute_delays_s
 
     def maps(self, agent: Agent, now_s: float) -> list[Share]:
         """The maps among what the agent received lately, by ascending peer."""
@@ -92,7 +93,7 @@ class Fusing:
             if (boxes := found_in(received, share)) is not None and instant(boxes.age_s) <= instant(self._limit_s):
                 shares.append(boxes)
         if any(s.representation in DETECTED_NAMES for s in shares):
-            own = self._own_tracks(agent.drone)
+            own = self._tracking.tracks(agent.drone)
             shares = [s._replace(tracks=own) if s.representation in DETECTED_NAMES else s for s in shares]
         return shares
 
@@ -130,11 +131,11 @@ class FindingEachFrame:
         scenario: Scenario,
         detector: Detector | None,
         fusing: Fusing,
-        count_boxes: Callable[[Capture, Disc | None], int],
+        scene: SceneModel,
     ) -> None:
-        """Args: `count_boxes` gives the number of boxes in a region where no detector flies."""
+        """Args: `scene`: drones find its cars in reach where no detector flies."""
         self._env, self._scenario, self._detector, self._fusing = env, scenario, detector, fusing
-        self._count_boxes = count_boxes
+        self._scene = scene
         self._limit_s = scenario.perception.max_age_s
         self._jobs: list[Job] = []
         self._found: dict[int, tuple[Capture, Boxes | None]] | None = None  # of these jobs
@@ -173,6 +174,6 @@ class FindingEachFrame:
         if instant(self._env.now - look.t_s) > instant(self._limit_s):
             return None
         if each is None:
-            return Found(look, self._count_boxes(look, roi), None)
+            return Found(look, cars_in_reach(self._scene, look, roi), None)
         inside = each.inside(roi)
         return Found(look, len(inside), inside)

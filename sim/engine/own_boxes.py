@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 
 from sortie.perception.detectors import Detector, DetectsAhead, DetectsMany
 from sortie.perception.types import Boxes, Capture
+from sortie.sim.engine.tracking import Ahead
 
 
 class OwnBoxes:
@@ -15,8 +16,8 @@ class OwnBoxes:
     it in flight at little more than what it costs at the end of a sortie.
     """
 
-    def __init__(self, detector: Detector, coming: Callable[[float], Iterable[Capture]]) -> None:
-        """Args: `coming` gives captures after a time that will probably be asked for; in flight they may turn out others."""
+    def __init__(self, detector: Detector, coming: Ahead) -> None:
+        """Args: `coming` has captures that will probably be asked for; in flight they may turn out others."""
         self._detector, self._coming = detector, coming
         self._many = detector if isinstance(detector, DetectsMany) else None
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
@@ -32,7 +33,7 @@ class OwnBoxes:
         if missing:
             now_s = max(c.t_s for c in captures)
             if now_s > self._until_s:
-                next_ones = list(self._coming(now_s))
+                next_ones = list(self._coming.after(now_s))
                 self._known = {c: self._known[c] for c in captures if c in self._known}
                 self._until_s = max((c.t_s for c in next_ones), default=self._until_s)
                 missing = list(dict.fromkeys([*missing, *next_ones]))

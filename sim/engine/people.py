@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -94,16 +94,9 @@ class People:
         its = next((its for its in self._looks[capture.drone] if its.frame == frame), None)
         return Boxes.empty() if its is None or its.boxes is None else its.boxes
 
-    def with_people(
-        self, own_boxes: Callable[[Sequence[Capture]], Sequence[Boxes]]
-    ) -> Callable[[Sequence[Capture]], Sequence[Boxes]]:
+    def joined(self, vehicles: Boxes, capture: Capture) -> Boxes:
         """A drone's own detections with the people that its thermal camera found, for its tracker."""
-        if self._camera is None:
-            return own_boxes
-        return lambda captures: [
-            Boxes.join([boxes, self.found(capture)])
-            for capture, boxes in zip(captures, own_boxes(captures), strict=True)
-        ]
+        return vehicles if self._camera is None else Boxes.join([vehicles, self.found(capture)])
 
     def known(self, here: Capture, shares: Sequence[Share], now_s: float) -> Boxes:
         """The people that a drone knows of at a fusion: those that its own camera found last, joined with received ones.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import simpy
 
@@ -46,6 +46,7 @@ from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.scenarios.schema import PolicyChange, PolicySection, Scenario
 from sortie.sim.engine.audit import Audit
 from sortie.sim.engine.world import at
+from sortie.sim.results.views import Journal
 
 
 class NamedPolicy(NamedTuple):
@@ -95,8 +96,14 @@ class PolicyPlan(NamedTuple):
         return any(viewpoint_of(policy.decide) is not None for policy in self.policies.values())
 
 
-Keep = Callable[[int, str, FleetView, Sequence[Directive], Reposition | None], None]
-"""Takes a decision: drone, policy, the view that it read, its directives, and the viewpoint that it asked for."""
+class Moves(Protocol):
+    """Where drones may be moved in flight."""
+
+    def request(self, drone: int, viewpoint: Reposition | None) -> None:
+        """Request a viewpoint for a drone; None requests its slot."""
+
+    def read(self, drone: int, view: FleetView) -> None:
+        """Show the view of a decision to the drone's planner, if it has one."""
 
 
 def plan_of(section: PolicySection, first: NamedPolicy | None = None) -> PolicyPlan:
@@ -187,9 +194,8 @@ class Pilot:
         drone: int,
         plan: PolicyPlan,
         audit: Audit,
-        request_viewpoint: Callable[[int, Reposition | None], None] | None = None,
-        keep: Keep | None = None,
-        steer: Callable[[int, FleetView], None] | None = None,
+        moves: Moves | None = None,
+        journal: Journal | None = None,
     ) -> None:
         """Put a pilot together.
 
@@ -197,11 +203,10 @@ class Pilot:
             drone: whose pilot it is.
             plan: the scenario's policies.
             audit: records what breaks invariants, and who decides.
-            request_viewpoint: takes the viewpoints that the policy chooses; None where no policy of the plan does.
-            keep: takes every decision; None keeps none.
-            steer: shows the view to the drone's planner; None where no drone has one.
+            moves: takes the viewpoints that the policy chooses, and shows views to planners; None where nobody moves so.
+            journal: keeps every decision; None keeps none.
         """
-        self.drone, self._request, self._keep, self._steer = drone, request_viewpoint, keep, steer
+        self.drone, self._moves, self._journal = drone, moves, journal
         self.policy = plan.of_makes.get(drone, plan.first)
         self._viewpoint = viewpoint_of(self.policy.decide)
         changes = enumerate(plan.changes)
@@ -220,9 +225,10 @@ class Pilot:
         if policy.name != self.policy.name:
             self._audit.took_over(self.drone, self.policy.name, policy.name, reason)
             self.policy, self._viewpoint = policy, viewpoint_of(policy.decide)
-            if self._viewpoint is None and self._request is not None:
-                self._request(self.drone, None)
+            if self._viewpoint is None and self._moves is not None:
+                self._moves.request(self.drone, None)
 
+    @property
     def handshake_bytes(self) -> int:
         """Size of the request or answer that the present policy's method sends on every link, before payloads."""
         return self.policy.handshake_bytes
@@ -231,12 +237,8 @@ class Pilot:
         """The next decision is made on this view."""
         self._shown = replay
 
-    @property
-    def reads(self) -> Callable[[FleetView], FleetView] | None:
-        """Gives what the drone reads in place of what it heard; None where the scenario shows it nothing."""
-        return self._read if self._is_shown else None
-
-    def _read(self, heard: FleetView) -> FleetView:
+    def read(self, heard: FleetView) -> FleetView:
+        """What the drone reads in place of what it heard: a view that the scenario shows it."""
         shown = self._shown
         if shown is None or not shown.to_drone:
             return heard
@@ -252,15 +254,15 @@ class Pilot:
         decisions[self.policy.name] = decisions.get(self.policy.name, 0) + 1
         shown, self._shown = self._shown, None
         read, asked = view if shown is None else shown.view, None
-        if self._viewpoint is not None and self._request is not None:
-            asked = ask_viewpoint(self.policy, self._viewpoint, read)
-            self._request(self.drone, asked)
-        if self._steer is not None:
-            self._steer(self.drone, read)
+        if self._moves is not None:
+            if self._viewpoint is not None:
+                asked = ask_viewpoint(self.policy, self._viewpoint, read)
+                self._moves.request(self.drone, asked)
+            self._moves.read(self.drone, read)
         directives = ask(self.policy, read)
-        if self._keep is not None:
+        if self._journal is not None:
             self.check(directives, read)  # before its parts are read
-            self._keep(self.drone, self.policy.name, read, directives, asked)
+            self._journal.decided(self.drone, self.policy.name, read, directives, asked)
         if self._keeper.rules or shown is not None:
             directives = self._within_rules(read, directives)
         if shown is not None:

@@ -21,6 +21,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.fusing import Fusing, Job, is_flying, of_vehicles, ready
 from sortie.sim.engine.people import People
+from sortie.sim.engine.tracking import Captures
 from sortie.sim.results.record import Recorder
 
 NOBODY = Boxes.empty()
@@ -79,13 +80,13 @@ class Scorer:
         detector: Detector,
         agents: Sequence[Agent],
         recorder: Recorder,
-        planned: Callable[[int, int], Capture],
+        captures: Captures,
         fusing: Fusing,
         people: People,
         turns: Iterable[Sequence[int]],
     ) -> None:
         """Args:
-        planned: where a drone is in a frame, or would be had it not left the air.
+        captures: where drones are, or would be had they not left the air.
         fusing: what a drone fuses.
         people: finds, joins and records people; the detector has vehicles alone.
         turns: which drones are scored at each scored moment, ascending.
@@ -94,7 +95,7 @@ class Scorer:
         # here and not in each call: a check against a protocol takes longer than a fusion
         self._many = detector if isinstance(detector, DetectsMany) else None
         self._ahead = detector if isinstance(detector, DetectsAhead) else None
-        self._agents, self._recorder, self._planned, self._fusing = agents, recorder, planned, fusing
+        self._agents, self._recorder, self._captures, self._fusing = agents, recorder, captures, fusing
         self._people, self._has_trucks = people, scenario.perception.scene.trucks > 0.0
         self._turns = turns
         self._waiting: list[Moment] = []
@@ -120,7 +121,7 @@ class Scorer:
         moment: Moment = now_s, []
         for agent in agents:
             if not is_flying(agent, frame, self._scenario.frame_s):
-                moment[1].append(Ego(self._planned(agent.drone, frame), None, flying=False))
+                moment[1].append(Ego(self._captures.capture(agent.drone, frame), None, flying=False))
             elif (here := ready(agent)) is not None:
                 shares = self._fusing.shares(agent, now_s)
                 job = self._fusing.job(agent, here, [of_vehicles(s) for s in shares], now_s)

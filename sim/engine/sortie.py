@@ -26,8 +26,7 @@ from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, LooksByAnother, make_detector
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.perception.types import Capture
-from sortie.policies.contract import Policy
+from sortie.policies.contract import FleetView, Policy, Reposition
 from sortie.radio import Air
 from sortie.radio.event_loop import EventLoop
 from sortie.radio.rates import STANDARDS
@@ -50,9 +49,9 @@ from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy
 from sortie.sim.engine.scoring import Scorer, taking_turns
 from sortie.sim.engine.separation import Separation
 from sortie.sim.engine.steering import Steering, area_m
-from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
+from sortie.sim.engine.tracking import Ahead, FleetTracking, OwnBoxesOf, TargetSeen
 from sortie.sim.engine.transport import Transport
-from sortie.sim.engine.world import OwnSenses, World, air_settings, cars_in_reach
+from sortie.sim.engine.world import OwnSenses, World, air_settings
 from sortie.sim.identity import code_version, name_of, own_files
 from sortie.sim.results import beliefs, disagreement, rosters
 from sortie.sim.results.links import LinkLog
@@ -80,6 +79,21 @@ class Observer(Protocol):
 
     def begin(self, scenario: Scenario, scene: SceneModel) -> None: ...
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None: ...
+
+
+class Moved:
+    """Who moves drones in flight."""
+
+    def __init__(self, choreography: Choreography | None, steering: Steering | None) -> None:
+        self._choreography, self._steering = choreography, steering
+
+    def request(self, drone: int, viewpoint: Reposition | None) -> None:
+        if self._choreography is not None:
+            self._choreography.request(drone, viewpoint)
+
+    def read(self, drone: int, view: FleetView) -> None:
+        if self._steering is not None:
+            self._steering.read(drone, view)
 
 
 DetectorMaker = Callable[[SceneModel, Perception, int, int], Detector | None]
@@ -270,47 +284,40 @@ def build(
     membership = Membership(scenario, world)
     steering = Steering(scenario, world, membership, seed, replication)
     journal = Journal(env) if scenario.record.views or scenario.record.disagreement else None
-    request = None if choreography is None else choreography.request
-    keep, steer = None if journal is None else journal.decided, steering.read if steering.anyone else None
-    pilots = [Pilot(i, policies, audit, request, keep, steer) for i in drones]
-    notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name, scenario.fleet.drones)
+    moves = (
+        Moved(choreography, steering if steering.anyone else None)
+        if choreography is not None or steering.anyone
+        else None
+    )
+    pilots = [Pilot(i, policies, audit, moves, journal) for i in drones]
+    notes = AgentNotes(recorder, pilots)
     detector = mixed(detector_of, scene, scenario, seed, replication)
-    count_boxes = None if detector is None else detector.count_boxes
-
-    def capture_of(drone: int, frame: int) -> Capture:
-        return world.sensed(drone, frame).capture
-
-    ahead = captures_ahead(scenario, capture_of)
     looking = detector.looks if isinstance(detector, LooksByAnother) else detector
-    own_boxes: OwnBoxesOf = TargetSeen(scene) if looking is None else OwnBoxes(looking, ahead)
-    tracking = FleetTracking(scenario, people.with_people(own_boxes))
-    fusing, finding = Fusing(scenario, tracking.tracks), None
+    own_boxes: OwnBoxesOf = TargetSeen(scene) if looking is None else OwnBoxes(looking, Ahead(scenario, world))
+    tracking = FleetTracking(scenario, own_boxes, people)
+    fusing, finding = Fusing(scenario, tracking), None
     if scenario.perception.maps_bring_boxes:
-        finding = FindingEachFrame(env, scenario, detector, fusing, partial(cars_in_reach, scene))
+        finding = FindingEachFrame(env, scenario, detector, fusing, scene)
     agents = [
         Agent(
             env,
             memories[i],
             rules=rules,
-            policy=pilots[i],
-            senses=OwnSenses(world, i, tracking, count_boxes),
+            pilot=pilots[i],
+            senses=OwnSenses(world, i, tracking, detector),
             modem=transport.modem(i),
             gate=Gate(),
             log=notes,
             sealer=None if key is None else Sealer(key, KEY_ID),
             phase_s=phase_of(scenario, seed, replication, i),
-            handshake_bytes=pilots[i].handshake_bytes,
-            guard=pilots[i].guard,
-            reads=pilots[i].reads,
-            check=pilots[i].check,
-            found_last=None if finding is None else partial(finding.last, i),
+            finding=finding,
         )
         for i in drones
     ]
     scorer = None
     if detector is not None:
         turns = taking_turns(scenario, seed, replication)
-        scorer = Scorer(env, scenario, detector, agents, recorder, capture_of, fusing, people, turns)
+        scorer = Scorer(env, scenario, detector, agents, recorder, world, fusing, people, turns)
     events = Events(Acted(scenario, world, transport, membership, clocks, seed, replication))
     schedule_policies(env, policies, pilots, scenario.frame_s)
     return Parts(

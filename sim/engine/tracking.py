@@ -11,10 +11,11 @@ import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from sortie.fleet.coverage import RANGE_M
 from sortie.perception.geometry import Lens
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
@@ -22,8 +23,10 @@ from sortie.perception.scene.traffic import TARGET_SIZE_M
 from sortie.perception.tracking.following import agree_loop, followed
 from sortie.perception.tracking.tracker import step
 from sortie.perception.types import Boxes, Capture
+from sortie.scenarios.disc import Disc
 from sortie.scenarios.frames import frame_at, instant
 from sortie.scenarios.schema import Scenario
+from sortie.sim.engine.people import People
 from sortie.sim.results.mission_outcome import sees_ground
 
 WARM_UP_S = 4.0
@@ -51,11 +54,14 @@ class _Followed(NamedTuple):
 class FleetTracking:
     """Every drone's tracker."""
 
-    def __init__(self, scenario: Scenario, own_boxes: OwnBoxesOf) -> None:
-        """Args: `own_boxes` gives each capture's detections by its drone alone."""
+    def __init__(self, scenario: Scenario, own_boxes: OwnBoxesOf, people: People | None = None) -> None:
+        """Args:
+        own_boxes: gives each capture's detections by its drone alone.
+        people: what thermal cameras found, which is tracked too.
+        """
         n = scenario.fleet.drones
         self._looks, self._frame_s = scenario.tracked_frames, scenario.frame_s
-        self._own_boxes = own_boxes
+        self._own_boxes, self._people = own_boxes, people
         self._taken = [0] * n
         self._waiting: deque[Capture] = deque()
         self._tracks, self._next_id = Tracks.empty(), np.zeros(n, np.int64)
@@ -110,7 +116,8 @@ class FleetTracking:
         self._of.clear()
         rounds: list[dict[int, tuple[Capture, Boxes]]] = []  # each holds one look of a drone at most, in order of time
         behind = dict.fromkeys(range(len(self._taken)), 0)
-        for capture, boxes in zip(waiting, self._own_boxes(waiting), strict=True):
+        for capture, vehicles in zip(waiting, self._own_boxes(waiting), strict=True):
+            boxes = vehicles if self._people is None else self._people.joined(vehicles, capture)
             k = behind[capture.drone]
             behind[capture.drone] += 1
             if k == len(rounds):
@@ -124,21 +131,25 @@ class FleetTracking:
             self._tracks, self._next_id, _ = step(self._tracks, Boxes.join(seen), owner, looks_s, self._next_id)
 
 
-def captures_ahead(
-    scenario: Scenario, capture_of: Callable[[int, int], Capture]
-) -> Callable[[float], Iterable[Capture]]:
-    """The next captures that trackers take in, if all drones fly on and perceive in every frame.
+class Captures(Protocol):
+    """Where drones are."""
 
-    Args:
-        capture_of: a drone's capture in a frame.
-    """
-    frames, n = scenario.tracked_frames, scenario.fleet.drones
+    def capture(self, drone: int, frame: int) -> Capture:
+        """A drone's capture in a frame."""
 
-    def coming(after_s: float) -> Iterable[Capture]:
-        first = bisect_right(frames, frame_at(after_s, scenario.frame_s))
-        return (capture_of(drone, frame) for frame in frames[first : first + max(1, AHEAD // n)] for drone in range(n))
 
-    return coming
+class Ahead:
+    """The next captures that trackers take in, if all drones fly on and perceive in every frame."""
+
+    def __init__(self, scenario: Scenario, captures: Captures) -> None:
+        self._frames, self._n, self._frame_s = scenario.tracked_frames, scenario.fleet.drones, scenario.frame_s
+        self._captures = captures
+
+    def after(self, t_s: float) -> Iterable[Capture]:
+        """Those after a moment."""
+        first = bisect_right(self._frames, frame_at(t_s, self._frame_s))
+        frames = self._frames[first : first + max(1, AHEAD // self._n)]
+        return (self._captures.capture(drone, frame) for frame in frames for drone in range(self._n))
 
 
 class TargetSeen:
@@ -167,3 +178,11 @@ class TargetSeen:
         size, score = np.tile(TARGET_SIZE_M[:2], (len(targets), 1)), np.ones(len(targets))
         found = [each[here] for each, here in zip(pose, seen, strict=True)]
         return [Boxes(each[:, :2], size[: len(each)], each[:, 2], score[: len(each)]) for each in found]
+
+
+def cars_in_reach(scene: SceneModel, capture: Capture, roi: Disc | None) -> int:
+    """How many cars a drone could report: within its range, or within a disc."""
+    x_m, y_m, radius_m = capture.position_m[0], capture.position_m[1], RANGE_M
+    if roi is not None:
+        x_m, y_m, radius_m = roi.x_m, roi.y_m, min(roi.radius_m, RANGE_M)
+    return scene.cars_near(capture.t_s, x_m, y_m, radius_m)

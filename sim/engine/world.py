@@ -16,12 +16,13 @@ import simpy
 from sortie.fleet.agent import Platform, Task
 from sortie.fleet.clock import DroneClock
 from sortie.fleet.computer import Work, headrooms
-from sortie.fleet.coverage import RANGE_M, cameras_of
+from sortie.fleet.coverage import cameras_of
 from sortie.fleet.energy.battery import FleetBatteries
 from sortie.fleet.flight.motion import Trajectories
 from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.plane import DroneStatus
 from sortie.fleet.senses import FlightSenses, Sensed, believed
+from sortie.perception.detectors import Detector
 from sortie.perception.motion import Tracks
 from sortie.perception.scene.scene_model import SceneModel
 from sortie.perception.tracking.wire import content
@@ -36,7 +37,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.own_models import of_radio
 from sortie.sim.engine.people import People
-from sortie.sim.engine.tracking import FleetTracking
+from sortie.sim.engine.tracking import FleetTracking, cars_in_reach
 from sortie.sim.results.links import LinkLog
 from sortie.sim.results.record import Recorder
 
@@ -393,6 +394,10 @@ class World:
 
     # --- what one drone senses of itself ---------------------------------------------------------
 
+    def capture(self, drone: int, frame: int) -> Capture:
+        """What the drone's cameras see from in a frame."""
+        return self.sensed(drone, frame).capture
+
     def sensed(self, drone: int, frame: int) -> Sensed:
         """The drone's pose, velocity and coverage in a frame."""
         return self._flight.at(frame)[drone]
@@ -415,10 +420,10 @@ class OwnSenses:
         world: World,
         drone: int,
         tracking: FleetTracking,
-        count_boxes: Callable[[Capture, Disc | None], int] | None = None,
+        detector: Detector | None = None,
     ) -> None:
-        """Args: `count_boxes` counts what the detector reports; None counts the cars in range, and there are no tracks."""
-        self._world, self._drone, self._tracking, self._count_boxes = world, drone, tracking, count_boxes
+        """Args: without a `detector` the cars in range are counted, and there are no tracks."""
+        self._world, self._drone, self._tracking, self._detector = world, drone, tracking, detector
         self._sensed = world.sensed(drone, 0)
 
     def sense(self, frame: int) -> Sensed:
@@ -440,25 +445,17 @@ class OwnSenses:
         return task._replace(person_in_region=True) if person else task
 
     def count_boxes(self, capture: Capture, roi: Disc | None) -> int:
-        if self._count_boxes is not None:
-            return self._count_boxes(capture, roi)
+        if self._detector is not None:
+            return self._detector.count_boxes(capture, roi)
         return cars_in_reach(self._world.scene, capture, roi)
 
     def perceived(self, capture: Capture) -> None:
         self._tracking.perceived(capture)
 
     def tracks_in(self, capture: Capture, roi: Disc | None) -> Tracks | None:
-        if self._count_boxes is None:
+        if self._detector is None:
             return None
         return content(self._tracking.tracks(self._drone), roi, capture.est_position_m, capture.t_s)
 
     def people_in(self, capture: Capture, roi: Disc | None) -> Boxes:
         return self._world.people.found(capture).inside(roi)
-
-
-def cars_in_reach(scene: SceneModel, capture: Capture, roi: Disc | None) -> int:
-    """How many cars a drone could report: within its range, or within a disc."""
-    x_m, y_m, radius_m = capture.position_m[0], capture.position_m[1], RANGE_M
-    if roi is not None:
-        x_m, y_m, radius_m = roi.x_m, roi.y_m, min(roi.radius_m, RANGE_M)
-    return scene.cars_near(capture.t_s, x_m, y_m, radius_m)

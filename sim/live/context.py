@@ -35,8 +35,7 @@ from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build, fly
 from sortie.sim.engine.steering import area_m
-from sortie.sim.engine.tracking import FleetTracking, TargetSeen
-from sortie.sim.engine.world import cars_in_reach
+from sortie.sim.engine.tracking import FleetTracking, TargetSeen, cars_in_reach
 
 _REPLAYED_EVENTS = frozenset({"landed", "power_lost"}).union(*(kind.told_live for kind in KINDS.values()))
 _RESTED = Platform(1.0, 1.0, 1.0)

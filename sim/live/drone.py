@@ -12,7 +12,9 @@ from sortie.fleet import chart, peers
 from sortie.fleet.agent import Agent
 from sortie.fleet.logs.geodesy import Origin
 from sortie.fleet.memory import PeerMemory
+from sortie.policies.checks import check_directives
 from sortie.policies.contract import Directive, FleetView
+from sortie.policies.decision_loop import Guard
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import phase_of
@@ -130,6 +132,27 @@ def _wait_for_start(drone: int, pipe: Connection) -> Go | None:
     return None
 
 
+class LivePilot:
+    """A watched policy, and what the node says of each view (`sortie.fleet.agent.Decides`)."""
+
+    def __init__(self, node: LiveNode, policy: Watchdog, guard: Guard | None) -> None:
+        self._node, self._policy, self.guard = node, policy, guard
+
+    @property
+    def handshake_bytes(self) -> int:
+        return self._policy.handshake_bytes
+
+    def read(self, heard: FleetView) -> FleetView:
+        return heard
+
+    def __call__(self, view: FleetView) -> Sequence[Directive]:
+        self._node.note_health(view)
+        return self._policy(view)
+
+    def check(self, directives: Sequence[Directive], view: FleetView) -> None:
+        check_directives(directives, view)
+
+
 def _fly(
     orders: Orders, node: LiveNode, policy: Watchdog, senses: ReplaySenses | MavlinkSenses, go: Go, pipe: Connection
 ) -> None:
@@ -142,23 +165,17 @@ def _fly(
     memory = PeerMemory(drone, rules, status_of(scenario, drone, go.unix_ns * 1e-9 - orders.begin_s))
     recorder = Recorder()
 
-    def decide(view: FleetView) -> Sequence[Directive]:
-        node.note_health(view)
-        return policy(view)
-
     agent = Agent(
         clock,
         memory,
         rules=rules,
-        policy=decide,
+        pilot=LivePilot(node, policy, guard_of(scenario, drone, clock, recorder)),
         senses=senses,
         modem=node,
         gate=node.gate,
         log=node,
         sealer=None,  # the node seals what it writes
         phase_s=orders.begin_s + phase_s,
-        handshake_bytes=lambda: policy.handshake_bytes,
-        guard=guard_of(scenario, drone, clock, recorder),
     )
     node.fly(clock, memory, rules, senses.goodput_mbps)
     events = LiveEvents(scenario, drone, clock, memory.status, node.note)

@@ -91,7 +91,7 @@ def serve(orders: PolicyOrders, pipe: Connection) -> None:
             pipe.send(
                 decision._replace(
                     cpu_s=time.process_time() - began_s,
-                    handshake_bytes=pilot.handshake_bytes(),
+                    handshake_bytes=pilot.handshake_bytes,
                     notices=take_notices(recorder),
                 )
             )

@@ -21,7 +21,7 @@ from typing import Any
 
 import simpy
 
-from sortie.fleet.agent import Agent
+from sortie.fleet.agent import Agent, Alone
 from sortie.fleet.coverage import View
 from sortie.fleet.flight.frames import yaw_rad
 from sortie.fleet.logs.geodesy import Origin
@@ -105,15 +105,16 @@ class RoleNode:
             clock,
             memory,
             rules=rules,
-            policy=self._decide,
+            pilot=Alone(
+                self._decide,
+                guard=guard_of(scenario, drone, clock, self._recorder) if role == Role.POLICY else None,
+            ),
             senses=senses,
             modem=node,
             gate=node.gate,
             log=node,
             sealer=None,  # the node seals what it writes
             phase_s=phase_s,
-            handshake_bytes=lambda: 0,
-            guard=guard_of(scenario, drone, clock, self._recorder) if role == Role.POLICY else None,
         )
         node.fly(clock, memory, rules, senses.goodput_mbps)
         self._events = LiveEvents(

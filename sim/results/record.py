@@ -11,10 +11,10 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -386,12 +386,24 @@ def _unfold_ages(rows: Sequence[tuple[Any, ...]]) -> Sequence[Any]:
     return [np.repeat(t_s, counts), np.repeat(drones, counts), np.concatenate(ages_s)]
 
 
+class HasName(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+class HasPolicy(Protocol):
+    """What decides for a drone now, and its name."""
+
+    @property
+    def policy(self) -> HasName: ...
+
+
 class AgentNotes:
     """Writes agents' acts into a recorder (sortie.fleet.agent.AgentLog)."""
 
-    def __init__(self, recorder: Recorder, deciding: Callable[[int], str], drones: int) -> None:
-        """Args: `deciding` names the policy that decides on a drone; `drones` are in the scenario's fleet."""
-        self._rows, self._deciding = recorder.rows, deciding
+    def __init__(self, recorder: Recorder, pilots: Sequence[HasPolicy]) -> None:
+        """Args: `pilots` decide, by drone."""
+        self._rows, self._pilots, drones = recorder.rows, pilots, len(pilots)
         recorder.unfold |= {"descriptors": partial(_unfold_descriptors, drones=drones), "ages": _unfold_ages}
         self.rosters = RosterLog()
         self._eval_steps: defaultdict[int, int] = defaultdict(int)  # decisions by their wall time
@@ -425,7 +437,7 @@ class AgentNotes:
                 asked.rate_hz,
                 _LINKS[link],
                 reason,
-                self._deciding(enforced.source),
+                self._pilots[enforced.source].policy.name,
             )
         )
 

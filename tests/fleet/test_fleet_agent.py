@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import pytest
 from agent_rig import Rig, capture, descriptor, memory
 
+from sortie.fleet.agent import Alone
 from sortie.fleet.coverage import NOTHING_SEEN, View, placed
 from sortie.fleet.lies import falsified
 from sortie.fleet.messages.wire import decode_descriptor
@@ -139,7 +141,7 @@ def test_thresholds_of_age_are_periods_of_a_descriptor() -> None:
     """A peer is heard once: its link is degraded, then detached after so many of its periods, and gets no handshake."""
     for every, degraded in product((1, 2, 3), (3.0, 5.0)):
         rig = Told(publish_every=every, degraded_after_periods=degraded, detached_after_periods=10.0)
-        rig.agent._handshake_bytes = lambda: 64
+        rig.agent._pilot = replace(rig.agent._pilot, handshake_bytes=64)  # type: ignore[type-var]
         rig.hear(1)
         rig.env.run(until=4.0)
         period_s, frame_s = 0.1 * every, 0.1 + 1e-9
@@ -166,7 +168,12 @@ def test_a_link_that_a_shown_view_began_rests_once_its_peer_is_heard() -> None:
         shown_memory.hold(descriptor(drone), 0.0)
     shown = shown_memory.view(0.0)
     rig = Rig(lambda view: [FEATURES] if view is shown else [], dwell_s=0.0)
-    rig.agent._reads = lambda heard: shown if rig.env.now < 0.1 else heard
+
+    class Shown(Alone):
+        def read(self, heard: FleetView) -> FleetView:
+            return shown if rig.env.now < 0.1 else heard
+
+    rig.agent._pilot = Shown(rig.agent._pilot)
     rig.env.run(until=0.35)
     rig.hear(1)
     rig.env.run(until=0.65)

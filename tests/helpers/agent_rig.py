@@ -8,7 +8,7 @@ from typing import Any
 import simpy
 from fleet_examples import DESCRIPTOR
 
-from sortie.fleet.agent import Agent, Platform, Task
+from sortie.fleet.agent import Agent, Alone, Platform, Task
 from sortie.fleet.coverage import View
 from sortie.fleet.gate import Gate, Payload
 from sortie.fleet.memory import PeerMemory
@@ -54,9 +54,17 @@ class Rig:
         self.published: list[tuple[float, bytes]] = []
         self.gate = Gate()
         self.agent = Agent(
-            self.env, self.memory, rules=self.memory._rules, policy=policy, senses=self, modem=self, gate=self.gate,
-            log=self, sealer=None, phase_s=0.01, handshake_bytes=lambda: handshake,
-        )  # fmt: skip
+            self.env,
+            self.memory,
+            rules=self.memory._rules,
+            pilot=Alone(policy, handshake),
+            senses=self,
+            modem=self,
+            gate=self.gate,
+            log=self,
+            sealer=None,
+            phase_s=0.01,
+        )
         self.agent.start()
 
     # senses

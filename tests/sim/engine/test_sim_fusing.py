@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from agent_rig import capture
 from fusing_rig import Mind, Seer, agent
 from sim_examples import example
 
+from sortie.fleet.coverage import RANGE_M
 from sortie.fleet.gate import HEADER_BYTES, make_payload
 from sortie.fleet.messages.wire import directive_bytes
 from sortie.perception.types import Boxes, Found, Share
@@ -92,7 +94,7 @@ def test_boxes_that_came_with_a_map_follow_it_and_are_as_old_as_their_look() -> 
     """Those of a look that is too old are left out: the second map came at an age of 0.25 s."""
     found = Found(capture(1, 0.7), 2, boxes(2))
     mind = Mind([(4, 0.9, 0.1, 1.0, {}), (1, 0.9, 0.2, 0.5, {"found": found, "roi": REGION})])
-    fusing = Fusing(example(CONFIG), lambda drone: None)  # type: ignore[arg-type, return-value]
+    fusing = Fusing(example(CONFIG), SimpleNamespace(tracks=lambda drone: None))  # type: ignore[arg-type]
     shares = fusing.shares(agent(0, 1.0, 1.0, mind), 1.0)
     assert [(s.capture.drone, s.representation, s.weight) for s in shares] == [
         (1, "features", 0.25),
@@ -126,8 +128,8 @@ class Places(Seer):
 
 def finding(detector: Seer | None, *agents: Any) -> tuple[simpy.Environment, FindingEachFrame]:
     env, scenario = simpy.Environment(), example(CONFIG)
-    counted = lambda look, roi: 7 if roi is None else 2  # noqa: E731
-    found = FindingEachFrame(env, scenario, detector, Fusing(scenario, None), counted)  # type: ignore[arg-type]
+    scene = SimpleNamespace(cars_near=lambda t_s, x_m, y_m, radius_m: 7 if radius_m == RANGE_M else 2)
+    found = FindingEachFrame(env, scenario, detector, Fusing(scenario, None), scene)  # type: ignore[arg-type]
     found.start(agents)
     return env, found
 
@@ -225,7 +227,7 @@ def test_in_flight_receivers_join_what_senders_found_before() -> None:
     assert sent.boxes.max() == 3, "of the own look and two maps"
 
 
-@pytest.mark.parametrize(("field", "room"), [("match_poses", "world"), ("maps_bring_boxes", "sortie")])
+@pytest.mark.parametrize(("field", "room"), [("match_poses", "world"), ("maps_bring_boxes", "fusing")])
 def test_without_a_detector_as_many_boxes_go_as_there_are_cars_in_reach(
     field: str, room: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -236,8 +236,7 @@ def test_planners_read_what_their_policies_read(monkeypatch: pytest.MonkeyPatch)
     parts = build(scenario, plan_for(scenario), 1)
     shown: list[tuple[int, Any]] = []
     read = parts.steering.read
-    for pilot in parts.pilots:
-        monkeypatch.setattr(pilot, "_steer", lambda drone, view: (shown.append((drone, view)), read(drone, view)))
+    monkeypatch.setattr(parts.steering, "read", lambda drone, view: (shown.append((drone, view)), read(drone, view)))
     fly(parts)
     assert len(shown) == 5 * 10
     assert all(view.ego == drone for drone, view in shown)

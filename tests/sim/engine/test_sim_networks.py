@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ def test_what_comes_next_is_detected_ahead_and_everything_once() -> None:
         return [capture(d, after_s + t) for t in (1.0, 2.0) for d in (0, 1)]
 
     many = Many()
-    own = OwnBoxes(many, coming)  # type: ignore[arg-type]
+    own = OwnBoxes(many, SimpleNamespace(after=coming))  # type: ignore[arg-type]
     assert _told(own([capture(1, 0.0), capture(0, 0.0)])) == [(1, 0.0), (0, 0.0)]
     assert many.asked == [[(1, 0.0), (0, 0.0), (0, 1.0), (1, 1.0), (0, 2.0), (1, 2.0)]]
     assert _told(own([capture(1, 1.0), capture(0, 2.0)])) == [(1, 1.0), (0, 2.0)]
@@ -79,8 +80,8 @@ def test_a_detector_of_single_moments_detects_when_it_is_asked() -> None:
             return lambda: [_box(c._replace(t_s=c.t_s + 100.0)) for c, _ in jobs]
 
     asked = [capture(1, 0.5), capture(0, 0.5)]
-    assert _told(OwnBoxes(Single(), lambda _: [])(asked)) == [(1, 0.5), (0, 0.5)]  # type: ignore[arg-type]
-    assert _told(OwnBoxes(Ahead(), lambda _: [])(asked)) == [(1, 100.5), (0, 100.5)]  # type: ignore[arg-type]
+    assert _told(OwnBoxes(Single(), SimpleNamespace(after=lambda _: []))(asked)) == [(1, 0.5), (0, 0.5)]  # type: ignore[arg-type]
+    assert _told(OwnBoxes(Ahead(), SimpleNamespace(after=lambda _: []))(asked)) == [(1, 100.5), (0, 100.5)]  # type: ignore[arg-type]
 
 
 # --- several networks ----------------------------------------------------------------------------

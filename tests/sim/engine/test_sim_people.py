@@ -213,7 +213,7 @@ def test_what_a_camera_found_is_of_its_own_moment() -> None:
     for drone, other_s in ((0, 12.7), (0, 12.9), (0, 13.1), (1, 13.0)):
         assert len(people.found(at(drone, other_s))) == 0
     ((box,),) = people.found(at(0, 13.0)).xy_m[None].tolist()
-    assert len(people.with_people(lambda captures: [Boxes.empty() for _ in captures])([at(0, 13.0)])[0]) == 1
+    assert len(people.joined(Boxes.empty(), at(0, 13.0))) == 1
     assert math.hypot(box[0] - 13.0, box[1]) < 30.0
     assert people.truth(13.0, at(0, 13.0)).car.tolist() == [0]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import simpy
@@ -48,9 +49,10 @@ def test_a_view_that_is_shown_is_read_by_all_that_read_the_drone_s_own() -> None
     steered, kept = list[float](), list[float]()
     pilot, _ = _pilot(
         PolicyPlan(NamedPolicy("p", policy)),
-        request_viewpoint=lambda drone, asked: None,
-        keep=lambda drone, name, view, directives, asked: kept.append(view.me.battery_soc),  # type: ignore[union-attr]
-        steer=lambda drone, view: steered.append(view.me.battery_soc),  # type: ignore[union-attr]
+        moves=SimpleNamespace(
+            request=lambda drone, asked: None, read=lambda drone, view: steered.append(view.me.battery_soc)
+        ),
+        journal=SimpleNamespace(decided=lambda drone, name, view, directives, asked: kept.append(view.me.battery_soc)),
     )
     pilot.show(Replay(0.0, 0, fleet_of(3, soc=0.25), to_drone=False))
     pilot(fleet_of(3, soc=0.75))
@@ -63,17 +65,18 @@ def test_who_takes_over_looks_from_its_own_viewpoint_or_from_its_slot() -> None:
     first, second, blind = Reads("first"), Reads("second"), Reads("blind", looks=False)
     asked: list[Reposition | None] = []
     pilot, audit = _pilot(
-        PolicyPlan(NamedPolicy("first", first)), request_viewpoint=lambda drone, wanted: asked.append(wanted)
+        PolicyPlan(NamedPolicy("first", first)),
+        moves=SimpleNamespace(request=lambda drone, wanted: asked.append(wanted), read=lambda drone, view: None),
     )
     pilot(fleet_of(2))
     pilot.take_over(NamedPolicy("second", second, 7), "command", 0)
     assert len(asked) == 1
     pilot(fleet_of(2))
-    assert (len(first.read), len(second.read), pilot.handshake_bytes()) == (2, 2, 7)
+    assert (len(first.read), len(second.read), pilot.handshake_bytes) == (2, 2, 7)
     pilot.take_over(NamedPolicy("blind", blind), "command", 1)
     assert asked[2:] == [None], "back to its slot"
     pilot(fleet_of(2))
-    assert (len(second.read), len(asked), pilot.handshake_bytes()) == (2, 3, 0)
+    assert (len(second.read), len(asked), pilot.handshake_bytes) == (2, 3, 0)
     assert audit.decisions == {"first": 1, "second": 1, "blind": 1}
 
 

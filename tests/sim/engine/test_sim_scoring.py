@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -42,8 +43,8 @@ def _scored(agents: Sequence[Any], *sets: str, own: Any = None) -> tuple[Seer, R
     scenario = example(perception, "fleet.drones=6", *sets)
     env, seer, recorder = simpy.Environment(), Seer(), Recorder()
     env.run(until=1.1)
-    planned = lambda drone, frame: capture(drone, 1000.0 + frame)  # noqa: E731
-    fusing: Any = Fusing(scenario, own)
+    planned = SimpleNamespace(capture=lambda drone, frame: capture(drone, 1000.0 + frame))
+    fusing: Any = Fusing(scenario, SimpleNamespace(tracks=own))  # type: ignore[arg-type]
     scorer = Scorer(env, scenario, seer, agents, recorder, planned, fusing, Nobody(), [])  # type: ignore[arg-type]
     scorer._score(10, agents)
     return seer, recorder

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scene, Target
 from sortie.sim.engine import tracking as tracking_module
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.engine.tracking import CUE_S, WARM_UP_S, FleetTracking, TargetSeen, captures_ahead
+from sortie.sim.engine.tracking import CUE_S, WARM_UP_S, Ahead, FleetTracking, TargetSeen
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
@@ -257,7 +258,7 @@ def test_trackers_look_where_accuracy_is_scored_if_that_is_often_enough() -> Non
 def test_what_trackers_take_in_next_is_of_all_drones_frame_by_frame() -> None:
     scenario = load("track_target", ["duration_s=10"])
     frame_s, n = scenario.frame_s, scenario.fleet.drones
-    coming = captures_ahead(scenario, lambda drone, frame: capture(drone, frame * frame_s))
+    coming = Ahead(scenario, SimpleNamespace(capture=lambda drone, frame: capture(drone, frame * frame_s))).after
     frames = scenario.tracked_frames
     first = [(c.drone, round(c.t_s / frame_s)) for c in list(coming(-1.0))[: 2 * n]]
     assert first == [(d, f) for f in frames[:2] for d in range(n)]

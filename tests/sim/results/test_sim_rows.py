@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -204,7 +205,7 @@ def test_a_roster_is_the_latest_from_its_instant_on_and_kept_where_it_changes() 
 
 def test_a_directive_is_kept_as_it_is_enforced_beside_what_was_asked() -> None:
     recorder = Recorder()
-    notes = AgentNotes(recorder, lambda drone: f"policy of {drone}", 3)
+    notes = AgentNotes(recorder, [SimpleNamespace(policy=SimpleNamespace(name=f"policy of {d}")) for d in range(3)])
     asked = Directive(2, 0, Representation.FEATURES, 0.5, None, 10.0, deadline_s=0.3, reason="asked")
     enforced = Directive(
         2, 1, Representation.DETECTIONS, 0.25, Disc(1.0, 2.0, 3.0), 4.0, deadline_s=0.2, fusion_weight=0.5
