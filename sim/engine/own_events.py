@@ -45,8 +45,9 @@ class FleetHandle:
     @property
     def positions_m(self) -> NDArray[np.float64]:
         """[N, 3], ENU: where the drones are. To be read; an event cannot move them."""
-        frame = min(int(self.t_s / self.frame_s + 1e-6), len(self._world.motion.position_m) - 1)
-        return _read_only(np.array(self._world.motion.position_m[frame], dtype=float))
+        motion = self._world.motion
+        frame = min(int(self.t_s / self.frame_s + 1e-6), motion.frames - 1)
+        return _read_only(motion[frame : frame + 1].position_m[0].copy())
 
     @property
     def airborne(self) -> NDArray[np.bool_]:

@@ -16,6 +16,8 @@ import simpy
 from sortie.fleet.agent import Agent
 from sortie.fleet.clock import oscillators
 from sortie.fleet.energy.battery import FleetBatteries
+from sortie.fleet.flight.manoeuvres import Motion
+from sortie.fleet.flight.steering import area_m
 from sortie.fleet.gate import Gate
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
@@ -36,10 +38,10 @@ from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.apart import Said, call_within
 from sortie.sim.engine.audit import Audit
-from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import group_key, schedule
 from sortie.sim.engine.fusing import FindingEachFrame, Fusing
 from sortie.sim.engine.garbage import LEFTOVERS, cycles_searched_rarely
+from sortie.sim.engine.manoeuvres import Manoeuvres, Planners, Viewpoints
 from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
@@ -51,7 +53,6 @@ from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer, taking_turns
 from sortie.sim.engine.separation import Separation
-from sortie.sim.engine.steering import Steering, area_m
 from sortie.sim.engine.tracking import FleetTracking, OwnBoxesOf, TargetSeen, captures_ahead
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, air_settings, cars_in_reach
@@ -189,9 +190,8 @@ class Parts:
     transport: Transport
     membership: Membership
     own_events: OwnEvents
-    choreography: Choreography | None
-    """None where no policy chooses viewpoints."""
-    steering: Steering
+    manoeuvres: Manoeuvres
+    planners: Planners
     pilots: Sequence[Pilot]
     agents: Sequence[Agent]
     detector: Detector | None
@@ -224,24 +224,24 @@ def build(
     table = PeerTable(len(drones), window_of(rules.detached_after_periods))
     memories = [PeerMemory(i, rules, statuses[i], table) for i in drones]
 
-    motion, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
+    nominal, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
     charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}
     mains = {station.drone for station in scenario.fleet.ground if station.mains}
     batteries = FleetBatteries(scenario.fleet.batteries, scenario.fleet.overrides, len(drones), charges, mains)
+    motion = Motion(nominal)
     air = Air(
         env,
         air_settings(scenario),
-        motion.position_m,
+        motion,
         seed=seed,
         replication=replication,
         frame_s=scenario.frame_s,
-        up=motion.up(),
     )
     mission = scenario.mission
     scene = SceneModel(
         scenario.perception.scene,
         mission.target,
-        area_m(scenario.fleet, motion.bounds_m()),
+        area_m(scenario.fleet, nominal.bounds_m()),
         mission.more_targets,
         scenario.perception.people,
     )
@@ -249,7 +249,7 @@ def build(
     gnss, drawn = scenario.fleet.clock.gnss, oscillators(scenario.fleet.clock, len(drones), seed, replication)
     own = [OwnState(status, each, gnss=gnss) for status, each in zip(statuses, drawn, strict=True)]
     people = People(scenario, scene, recorder, (seed, replication))
-    errors = sensor_errors(scenario, motion.position_m, seed, replication)
+    errors = sensor_errors(scenario, nominal.position_m, seed, replication)
     link_log = LinkLog(len(drones), recorder)
     world = World(env, scenario, statuses, motion, batteries, air, scene, plan, recorder, own, people, errors, link_log)
     key = group_key(seed) if scenario.context.authentication else None
@@ -263,15 +263,18 @@ def build(
         links=link_log,
     )
 
-    audit, choreography = Audit(env, recorder), None
+    audit, manoeuvres, request = Audit(env, recorder), Manoeuvres(scenario, world), None
     if policies.chooses_viewpoints:
         posed = any(trace.pose is not None for trace in traces.values())
-        choreography = Choreography(scenario, world, posed_by_trace=posed)
-    membership = Membership(scenario, world)
-    steering = Steering(scenario, world, membership, seed, replication)
+        viewpoints = Viewpoints(scenario, world, posed_by_trace=posed)
+        manoeuvres.serve(viewpoints)
+        request = viewpoints.request
+    membership = Membership(scenario, world, manoeuvres)
+    planners = Planners(scenario, world, membership.go_home, seed, replication)
+    if planners.anyone:
+        manoeuvres.serve(planners)
     journal = Journal(env) if scenario.record.views or scenario.record.disagreement else None
-    request = None if choreography is None else choreography.request
-    keep, steer = None if journal is None else journal.decided, steering.read if steering.anyone else None
+    keep, steer = None if journal is None else journal.decided, planners.read if planners.anyone else None
     pilots = [Pilot(i, policies, audit, request, keep, steer) for i in drones]
     notes = AgentNotes(recorder, lambda drone: pilots[drone].policy.name, scenario.fleet.drones)
     detector = mixed(detector_of, scene, scenario, seed, replication)
@@ -325,8 +328,8 @@ def build(
         transport,
         membership,
         own_events,
-        choreography,
-        steering,
+        manoeuvres,
+        planners,
         pilots,
         agents,
         detector,
@@ -353,12 +356,9 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
 
     if observer is not None:
         observer.begin(parts.scenario, parts.scene)
-    moves = [] if parts.choreography is None else [parts.choreography.renew]
-    if parts.steering.anyone:
-        moves.append(parts.steering.renew)
     separation = Separation(parts.scenario, world)
     watch = [separation.check] if separation.anyone else []
-    world.start(each_second, [parts.membership.renew, *moves, parts.own_events.step, *watch])
+    world.start(each_second, [parts.membership.renew, parts.manoeuvres.renew, parts.own_events.step, *watch])
     for agent in parts.agents:
         agent.start()
     if scorer is not None:
