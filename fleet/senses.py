@@ -1,4 +1,4 @@
-"""What each drone senses of itself in each frame, computed from a flown `Trajectories`.
+"""What each drone senses of itself in each frame, computed from the motion.
 
 It follows from the motion alone, so it is computed for many frames and all drones in one pass.
 """
@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sortie.fleet.coverage import Poses, View, footprint_radius_m, views
+from sortie.fleet.flight.frames import wrapped
+from sortie.fleet.flight.manoeuvres import Motion
 from sortie.fleet.flight.motion import Trajectories
 from sortie.fleet.sensor_faults import Array, turned
 from sortie.perception.geometry import Cameras
@@ -35,14 +37,15 @@ class Sensed(NamedTuple):
     """Its orientation as it publishes it: the true one, turned by what a fault of its heading adds."""
 
 
-def believed(motion: Trajectories, errors: Mapping[int, Array], frames: slice) -> tuple[Array, Array]:
+def believed(motion: Trajectories | Motion, errors: Mapping[int, Array], frames: slice) -> tuple[Array, Array]:
     """Where drones believe they are, [T, N, 3] ENU, and their heading, [T, N] rad: the motion's, and what faults add."""
-    position_m, yaw_rad = motion.est_position_m[frames], motion.est_yaw_rad[frames]
+    flown = motion[frames]
+    position_m, yaw_rad = flown.est_position_m, flown.est_yaw_rad
     if errors:
         position_m, yaw_rad = np.array(position_m), np.array(yaw_rad)
         for drone, error in errors.items():
             position_m[:, drone] += error[frames, :3]
-            yaw_rad[:, drone] = np.mod(yaw_rad[:, drone] + error[frames, 3] + np.pi, 2 * np.pi) - np.pi
+            yaw_rad[:, drone] = wrapped(yaw_rad[:, drone] + error[frames, 3])
     return position_m, yaw_rad
 
 
@@ -51,7 +54,7 @@ class FlightSenses:
 
     def __init__(
         self,
-        motion: Trajectories,
+        motion: Trajectories | Motion,
         frame_s: float,
         field: HeightField,
         cameras: Sequence[Cameras],
@@ -75,16 +78,20 @@ class FlightSenses:
             self._fill(frame)
         return self._block[frame - self._first]
 
+    def forget(self) -> None:
+        """The motion has changed: work out the next frame that is read anew."""
+        self._first = -_BLOCK
+
     def _fill(self, frame: int) -> None:
         self._first = frame // _BLOCK * _BLOCK
         frames = slice(self._first, self._first + _BLOCK)
-        m = self._motion
-        believed_m, believed_yaw = believed(m, self._errors, frames)
-        poses = Poses(m.position_m[frames], m.orientation_xyzw[frames], m.yaw_rad[frames], believed_m, believed_yaw)
+        flown, (believed_m, believed_yaw) = self._motion[frames], believed(self._motion, self._errors, frames)
+        poses = Poses(flown.position_m, flown.orientation_xyzw, flown.yaw_rad, believed_m, believed_yaw)
         seen = zip(*views(poses, self._field, self._cameras), strict=True)
-        self._block = list(zip(*(self._of(drone, frames, poses, view) for drone, view in enumerate(seen)), strict=True))
+        of_each = (self._of(i, frames, poses, flown.velocity_mps, view) for i, view in enumerate(seen))
+        self._block = list(zip(*of_each, strict=True))
 
-    def _of(self, drone: int, frames: slice, poses: Poses, views: Sequence[View]) -> list[Sensed]:
+    def _of(self, drone: int, frames: slice, poses: Poses, velocity_mps: Array, views: Sequence[View]) -> list[Sensed]:
         """One drone in some frames."""
         cameras = self._cameras[drone]
         position, orientation, velocity, believed = (
@@ -92,7 +99,7 @@ class FlightSenses:
             for states in (
                 poses.position_m,
                 poses.orientation_xyzw,
-                self._motion.velocity_mps[frames],
+                velocity_mps,
                 poses.est_position_m,
             )
         )

@@ -35,8 +35,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sortie.fleet.energy.cell import energy_fraction
 from sortie.fleet.energy.recorded import BatteryTrace
-from sortie.fleet.flight.frames import swap_attitude, tangent_plane_m, yaw_rad
-from sortie.fleet.flight.motion import Trajectories, body_rates, fly
+from sortie.fleet.flight.frames import swap_attitude, tangent_plane_m, wrapped, yaw_rad
+from sortie.fleet.flight.motion import OF_A_DRONE, Trajectories, body_rates, continuous, fly
 from sortie.scenarios import scratch
 from sortie.scenarios.schema import Fleet, Origin
 from sortie.scenarios.traces import DRONE, TIME_S, TraceError, check_drones, check_increasing, first_row, read_columns
@@ -166,17 +166,7 @@ def follow(motion: Trajectories, traces: Mapping[int, DroneTrace], frame_s: floa
     posed = {drone: trace.pose for drone, trace in traces.items() if trace.pose is not None}
     if not posed:
         return motion
-    names = (
-        "position_m",
-        "orientation_xyzw",
-        "velocity_mps",
-        "acceleration_mps2",
-        "body_rates_radps",
-        "yaw_rad",
-        "est_position_m",
-        "est_yaw_rad",
-    )
-    new: dict[str, Array] = {name: scratch.copied(getattr(motion, name)) for name in names}
+    new: dict[str, Array] = {name: scratch.copied(getattr(motion, name)) for name in OF_A_DRONE}
     for drone, pose in posed.items():
         t_s = np.clip(motion.time_s, pose.time_s[0], pose.time_s[-1])
         beyond = np.abs(motion.time_s - t_s) > ROUNDING_S
@@ -194,12 +184,10 @@ def follow(motion: Trajectories, traces: Mapping[int, DroneTrace], frame_s: floa
             orientation = Slerp(pose.time_s, Rotation.from_quat(pose.orientation_xyzw))(t_s).as_quat()
         acceleration = _slope(velocity, within, frame_s)  # a trace's begin and end are no manoeuvres
         velocity[beyond] = acceleration[beyond] = 0.0  # there it stands, headed as it will or did
-        flips = np.sign((orientation[1:] * orientation[:-1]).sum(axis=-1))
-        orientation[1:] *= np.cumprod(np.where(flips == 0, 1.0, flips))[:, None]
+        orientation = continuous(orientation[:, None], orientation[:1])[:, 0]
         yaw = yaw_rad(orientation)
-        believed_yaw = yaw + motion.est_yaw_rad[:, drone] - motion.yaw_rad[:, drone]
         new["est_position_m"][:, drone] += position - motion.position_m[:, drone]
-        new["est_yaw_rad"][:, drone] = np.mod(believed_yaw + np.pi, 2 * np.pi) - np.pi
+        new["est_yaw_rad"][:, drone] = wrapped(yaw + motion.est_yaw_rad[:, drone] - motion.yaw_rad[:, drone])
         new["position_m"][:, drone], new["velocity_mps"][:, drone] = position, velocity
         new["orientation_xyzw"][:, drone], new["yaw_rad"][:, drone] = orientation, yaw
         new["acceleration_mps2"][:, drone] = acceleration

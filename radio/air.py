@@ -22,6 +22,7 @@ import simpy
 from numpy.typing import ArrayLike, NDArray
 
 from sortie.radio.channel.earshot import LinkList
+from sortie.radio.channel.flight import Flight, flight_of
 from sortie.radio.channel.snr import SQUARE, Channel, FloatArray, Jammer, linear
 from sortie.radio.channel.traces import read_links
 from sortie.radio.counters import Counters
@@ -86,7 +87,7 @@ class Air:
         self,
         env: simpy.Environment,
         settings: AirSettings,
-        positions_m: ArrayLike,
+        positions_m: ArrayLike | Flight,
         *,
         seed: int,
         frame_s: float,
@@ -98,9 +99,10 @@ class Air:
             raise ValueError(f"publish_spread is {publish_spread!r}, must be in [0, 1]")
         self._env = env
         self._settings = settings
-        trace = None if settings.trace is None else read_links(settings.trace, np.shape(positions_m)[1])
+        flight = flight_of(positions_m, up)
+        trace = None if settings.trace is None else read_links(settings.trace, flight.drones)
         traced = set() if trace is None else {(min(link), max(link)) for link in trace.links}
-        self.channel = Channel(settings, positions_m, seed, replication, frame_s, up, sorted(traced))
+        self.channel = Channel(settings, flight, seed, replication, frame_s, always=sorted(traced))
         self._n = n_drones = self.channel.n
         self.counters = Counters()
         self._gone: set[int] = set()
@@ -200,7 +202,7 @@ class Air:
             found = self._uses[ends] = flow, use, snr_db, self._uses_since
         return found
 
-    def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
+    def reroute(self, positions_m: ArrayLike | Flight, up: ArrayLike | None = None) -> None:
         """From the next frame on the fleet flies another way (see `Channel.reroute`)."""
         self.channel.reroute(positions_m, up)
 

@@ -65,6 +65,12 @@ def yaw_rad(quaternion_xyzw: npt.ArrayLike) -> Array:
     return yaw
 
 
+def wrapped(angle_rad: npt.ArrayLike) -> Array:
+    """Angles [...] within [−π, π)."""
+    within: Array = np.mod(np.asarray(angle_rad, dtype=float) + np.pi, 2 * np.pi) - np.pi
+    return within
+
+
 def up_vector(quaternion_xyzw: npt.ArrayLike) -> Array:
     """The body's z axis in the world, [..., 3], of unit quaternions [..., 4]: third column of the rotation matrix."""
     x, y, z, w = np.moveaxis(np.asarray(quaternion_xyzw, dtype=np.float64), -1, 0)

@@ -1,10 +1,11 @@
-"""Where every drone is, how it is tilted and what it believes, for a whole sortie at once.
+"""The nominal flight: where every drone is, how it is tilted and what it believes, as long as nothing moves it elsewhere.
 
 The formation is a rigid virtual structure that moves along the route and turns with it. A drone holds its slot
 up to a smooth random offset, in a mean wind with gusts of its own. Its attitude follows from its acceleration by
 differential flatness; no controller is simulated. Nothing here needs the clock, so the whole flight is computed
 as arrays [T frames, N drones, ...] before it begins. It is computed in blocks of frames, and long flights lie on disk
-(`sortie.scenarios.scratch`). Frames as in `sortie.fleet.flight.frames`.
+(`sortie.scenarios.scratch`). Manoeuvres change it in flight (`sortie.fleet.flight.manoeuvres`). Frames as in
+`sortie.fleet.flight.frames`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.flight.frames import up_vector, yaw_rad
+from sortie.fleet.flight.frames import wrapped, yaw_rad
 from sortie.fleet.flight.noise import LAGS, GaussMarkov, Smooth
 from sortie.fleet.flight.ways import raised, route_path, ways_of
 from sortie.scenarios import schema, scratch
@@ -37,9 +38,22 @@ class MotionError(SortieError):
     """The motion asked for cannot be flown; the message names the drone, the time and the settings."""
 
 
+OF_A_DRONE = (
+    "position_m",
+    "orientation_xyzw",
+    "velocity_mps",
+    "acceleration_mps2",
+    "body_rates_radps",
+    "yaw_rad",
+    "est_position_m",
+    "est_yaw_rad",
+)
+"""What `Trajectories` has of each drone that changes where it flies another way."""
+
+
 @dataclass(frozen=True, slots=True)
 class Trajectories:
-    """A flown formation. Every array is read-only."""
+    """A flight, or some frames of one. Every array is read-only."""
 
     time_s: Array  # [T]
     position_m: Array  # [T, N, 3] ENU
@@ -58,18 +72,14 @@ class Trajectories:
         for each in fields(self):
             getattr(self, each.name).setflags(write=False)
 
+    def __getitem__(self, frames: slice) -> Trajectories:
+        """Some frames."""
+        return Trajectories(**{each.name: getattr(self, each.name)[frames] for each in fields(self)})
+
     @property
     def air_speed_mps(self) -> Array:
         """Horizontal speed through the air [T, N]."""
         return air_speed_mps(self.velocity_mps, self.wind_mps)
-
-    def up(self) -> Array:
-        """The bodies' z axes [T, N, 3], ENU; each call computes them anew."""
-        up = scratch.empty(self.position_m.shape)
-        for rows in scratch.blocks(len(up), self.orientation_xyzw[0].nbytes):
-            up[rows] = up_vector(self.orientation_xyzw[rows])
-            scratch.release()
-        return up
 
     def bounds_m(self) -> tuple[float, float, float, float]:
         """x_min, y_min, x_max, y_max of everything flown, ENU."""
@@ -87,6 +97,13 @@ def air_speed_mps(velocity_mps: Array, wind_mps: Array) -> Array:
     """Horizontal speed through the air [...] of velocities and winds [..., 3]."""
     air = velocity_mps[..., :2] - wind_mps[..., :2]
     return np.hypot(air[..., 0], air[..., 1])
+
+
+def thrust_mps2(velocity_mps: Array, acceleration_mps2: Array, wind_mps: Array) -> Array:
+    """The thrust over mass [..., 3], ENU, that a motion needs in its wind."""
+    thrust = acceleration_mps2 + DRAG_PER_S * (velocity_mps - wind_mps)
+    thrust[..., 2] += GRAVITY_MPS2
+    return thrust
 
 
 def attitude(thrust_mps2: Array, heading_rad: Array) -> Array:
@@ -206,8 +223,7 @@ class _Flight:
         gusts = self._gusts.block(self._draws("gust", frames, 3))
         wind = np.array([*config.wind_mps, 0.0]) + np.moveaxis(gusts, -1, 1)
 
-        thrust = acceleration + DRAG_PER_S * (velocity - wind)
-        thrust[..., 2] += GRAVITY_MPS2
+        thrust = thrust_mps2(velocity, acceleration, wind)
         if thrust[..., 2].min() <= 0:
             frame, drone = np.unravel_index(np.argmin(thrust[..., 2]), thrust.shape[:2])
             raise MotionError(
@@ -216,9 +232,8 @@ class _Flight:
                 f"{config.gust_sigma_mps:g} cannot be flown"
             )
         quaternion = attitude(thrust, heading)
-        before = quaternion[:1] if self._before is None else self._before[None]
-        quaternion = _continuous(np.concatenate([before, quaternion]))[1:]
-        self._before = quaternion[-1]
+        quaternion = continuous(quaternion, quaternion[0] if self._before is None else self._before)
+        self._before = quaternion[-1].copy()
         yaw = yaw_rad(quaternion)
 
         est_position = position.copy()
@@ -237,7 +252,7 @@ class _Flight:
             "wind_mps": wind,
             "yaw_rad": yaw,
             "est_position_m": est_position,
-            "est_yaw_rad": np.mod(est_yaw + np.pi, 2 * np.pi) - np.pi,
+            "est_yaw_rad": wrapped(est_yaw),
             "frame_position_m": raised(path.position_m, fleet.formation.altitude_m),
             "frame_yaw_rad": path.yaw_rad,
         }
@@ -262,9 +277,9 @@ def body_rates(quaternion_xyzw: Array, step_s: float) -> Array:
     return np.concatenate([rates, rates[-1:]])
 
 
-def _continuous(quaternion: Array) -> Array:
-    """Of the two quaternions of each attitude take the one nearer to the frame before."""
-    flips = np.sign(np.einsum("tni,tni->tn", quaternion[1:], quaternion[:-1]))
+def continuous(quaternion: Array, before: Array) -> Array:
+    """Attitudes [T, N, 4]: of the two quaternions of each the one nearer to the frame before. `before` is [N, 4], or one."""
+    chain = np.concatenate([np.broadcast_to(before, quaternion[:1].shape), quaternion])
+    flips = np.sign((chain[1:] * chain[:-1]).sum(axis=-1))
     flips[flips == 0] = 1.0
-    quaternion[1:] *= np.cumprod(flips, axis=0)[..., None]
-    return quaternion
+    return quaternion * np.cumprod(flips, axis=0)[..., None]

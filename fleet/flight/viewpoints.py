@@ -3,8 +3,7 @@
 A drone's place is its slot plus a shift, both in the formation's frame (x forward, y left), so that places which keep
 their distance go on keeping it however the formation flies and turns. A shift changes by moves: straight lines from
 standing to standing, spread in time like the route's corners, so that speed and acceleration are bounded and have no
-jumps. A move is granted only if the whole rest of the flight is safe with it, everybody ending the move that he is on
-and then standing where it ends. What flies at any time was found safe to the end, so nothing has to be taken back.
+jumps. Whether a move is safe is judged with everybody ending the move that he is on and then standing where it ends.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ import numpy.typing as npt
 
 from sortie.fleet.flight.motion import MotionError
 from sortie.fleet.flight.route import FramePath, bend, spread
+from sortie.fleet.flight.safety import INSTANTS_S, JITTERS
 from sortie.fleet.flight.ways import route_path
 from sortie.scenarios import schema
 from sortie.scenarios.formation import slots
@@ -28,12 +28,6 @@ Place = tuple[float, float]
 
 LEAST_MOVE_M = 2.0
 """A wish for a place nearer than this to where a drone stands moves nothing: jitter and estimates are no reason."""
-SHARES = (1.0, 0.75, 0.5, 0.25)
-"""What is tried of a wish before it is refused, the most first."""
-INSTANTS_S = 0.1
-"""At which two moves are held against each other."""
-JITTERS = 5.0
-"""Places keep so many standard deviations of the pose jitter off the bounds, so that the drones keep them."""
 _PEAK_SPEED, _PEAK_ACCELERATION = 2.25, 9.0
 """Of a unit step spread over a unit of time (quadratic B-spline)."""
 
@@ -164,51 +158,43 @@ def shifts(plan: Plan, time_s: Array) -> tuple[Array, Array, Array]:
     return total[0], total[1], total[2]
 
 
-# --- the safety layer ------------------------------------------------------------------------------
+# --- what is safe ----------------------------------------------------------------------------------
 
 
-def grant(
-    drone: int,
-    wanted_m: Place,
-    plans: Sequence[Plan],
-    course: Course,
-    bounds: Bounds,
-    frame: int,
-    gone: Container[int] = (),
-) -> Move | str | None:
-    """What is granted of a drone's wish: the safety layer.
+@dataclass(frozen=True, slots=True)
+class ViewpointWish:
+    """A drone's wish for another place (`sortie.fleet.flight.safety.Wish`)."""
 
-    Args:
-        drone: who asks.
-        wanted_m: the shift that it asks for, the formation's frame.
-        plans: every drone's moves so far.
-        frame: the move would begin with it.
-        gone: drones that have left the air for good, to whom nobody comes near.
+    drone: int
+    wanted_m: Place
+    """The shift that it asks for, in the formation's frame."""
+    plans: Sequence[Plan]
+    """Every drone's moves so far."""
+    course: Course
+    bounds: Bounds
+    frame: int
+    """The move would begin with it."""
+    gone: Container[int] = ()
+    """Drones that have left the air for good, to whom nobody comes near."""
 
-    Returns:
-        A move as far towards the wish as is safe; None where the drone stands there already, or is on its way and has to
-        arrive first; or why nothing is granted.
-    """
-    plan, now_s = plans[drone], float(course.time_s[frame])
-    if plan and plan[-1].end_s > now_s:
-        return None
-    start, wish = standing_m(plan), _within(wanted_m, bounds.reach_m)
-    if math.dist(start, wish) < LEAST_MOVE_M:
-        return None
-    refused = ""
-    for share in SHARES:
+    def attempt(self, share: float) -> Move | None:
+        """The move of a share of the way; None where the drone stands there already, or is on its way and has to arrive."""
+        plan, now_s = self.plans[self.drone], float(self.course.time_s[self.frame])
+        if plan and plan[-1].end_s > now_s:
+            return None
+        start, wish = standing_m(plan), _within(self.wanted_m, self.bounds.reach_m)
         end = (start[0] + share * (wish[0] - start[0]), start[1] + share * (wish[1] - start[1]))
         if math.dist(start, end) < LEAST_MOVE_M:
-            break
-        move = Move(now_s, _width_s(math.dist(start, end), bounds), start, end)
-        near = _too_near(drone, move, plans, course, bounds, gone)
+            return None
+        return Move(now_s, _width_s(math.dist(start, end), self.bounds), start, end)
+
+    def refusal(self, move: Move) -> str:
+        """Why a move is not safe to the end of the flight."""
+        near = _too_near(self.drone, move, self.plans, self.course, self.bounds, self.gone)
         if near is not None:
-            refused = f"would come too near drone {near}"
-        elif not fenced(course, bounds, drone, (*plan, move), frame):
-            refused = "would leave the fence"
-        else:
-            return move
-    return refused or None
+            return f"would come too near drone {near}"
+        plan = (*self.plans[self.drone], move)
+        return "" if fenced(self.course, self.bounds, self.drone, plan, self.frame) else "would leave the fence"
 
 
 def fenced(course: Course, bounds: Bounds, drone: int, plan: Plan, frame: int) -> bool:

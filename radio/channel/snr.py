@@ -16,13 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 from sortie.radio.channel.antenna import Antennas
 from sortie.radio.channel.draws import StreamShadowing, fade_table_db
 from sortie.radio.channel.earshot import LinkList, all_links
+from sortie.radio.channel.flight import Flight, flight_of
 from sortie.radio.channel.large_fleet import EPOCH, Crowd
 from sortie.radio.channel.pathloss import path_loss_db, range_m
 from sortie.radio.channel.shadowing import ShadowField
 from sortie.radio.own_links import changed_snr, own_link
 from sortie.radio.rates import CURVES, group_curve
 from sortie.radio.settings import AirSettings
-from sortie.scenarios import scratch
 from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
@@ -57,15 +57,6 @@ def earshot_m(settings: AirSettings) -> float:
     needed_db = min(CURVES[0].snr_db(0.5), group_db)
     noise = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
     return range_m(settings, settings.tx_power_dbm - noise + gain_db - needed_db + 2.0)
-
-
-def _is_finite(values: FloatArray) -> bool:
-    """Whether [frames, ...] all are; block by block, since a long flight lies on disk."""
-    for rows in scratch.blocks(len(values), values[0].nbytes if len(values) else 0):
-        if not np.isfinite(values[rows]).all():
-            return False
-        scratch.release()
-    return True
 
 
 def linear(snr_db: AnyFloats) -> FloatArray:
@@ -127,12 +118,13 @@ class Channel:
     the frame before (the first frame's own, in the first). `snr_db` and `shadow_db` are squares [N, N], sender by receiver,
     NaN on the diagonal.
 
-    What follows from the flight alone is worked out for a block of frames in one pass; a frame in which nothing
-    else interferes is only looked up.
+    What follows from the flight alone is worked out for some frames in one pass; a frame in which nothing else
+    interferes is only looked up.
 
     Args:
         settings: see `sortie.radio.settings.AirSettings`.
-        positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1.
+        positions_m: [T, N, 3], ENU: where each drone will be in each frame; ids are 0 … N − 1. Or a flight, which gives
+            some frames at once.
         seed, replication: as in `sortie.scenarios.streams.stream`.
         frame_s: time between two calls of `advance`.
         up: [T, N, 3], ENU: the unit vector along each airframe's z axis; None is level flight.
@@ -145,27 +137,18 @@ class Channel:
     def __init__(
         self,
         settings: AirSettings,
-        positions_m: ArrayLike,
+        positions_m: ArrayLike | Flight,
         seed: int,
         replication: int,
         frame_s: float,
         up: ArrayLike | None = None,
         always: Sequence[tuple[int, int]] = (),
     ) -> None:
-        self._positions_m = p = np.asarray(positions_m, dtype=float)
-        if p.ndim != 3 or p.shape[1] < 1 or p.shape[2] != 3:
-            raise ValueError(f"positions_m has shape {p.shape}, must be (frames, drones, 3)")
-        if not _is_finite(p):
-            raise ValueError("positions_m holds a value that is not finite")
+        self._flight = flight_of(positions_m, up)
         if not frame_s > 0:
             raise ValueError(f"frame_s is {frame_s!r}, must be > 0")
-        self._up = u = None if up is None else np.asarray(up, dtype=float)
-        if u is not None and u.shape != p.shape:
-            raise ValueError(f"up has shape {u.shape}, must be {p.shape}, as positions_m")
-        if u is not None and not _is_finite(u):
-            raise ValueError("up holds a value that is not finite")
         self.settings = settings
-        self.n = n_drones = p.shape[1]
+        self.n = n_drones = self._flight.drones
         self._antennas = Antennas(settings.antennas(n_drones))
         self.frame = -1
         self.noise_dbm = noise_dbm(settings.bandwidth_mhz, settings.noise_figure_db)
@@ -200,7 +183,8 @@ class Channel:
         # the block, [frames, L] each; of a large fleet [frames, P]
         self._snr_db: AnyFloats
         self._shadow_db: AnyFloats
-        self._gain: FloatArray | None = None  # of a small fleet
+        self._gain: FloatArray  # of a small fleet
+        self._known = 0  # so many frames of a small fleet's block are worked out
 
     def advance(self, extra_loss_db: ArrayLike | None = None, jammers: Sequence[Jammer] = ()) -> None:
         """Move on by one frame.
@@ -213,14 +197,16 @@ class Channel:
             IndexError: the flight is over.
             ValueError: if a shape is wrong.
         """
-        if self.frame + 1 >= len(self._positions_m):
-            raise IndexError(f"the flight has {len(self._positions_m)} frames")
+        if self.frame + 1 >= self._flight.frames:
+            raise IndexError(f"the flight has {self._flight.frames} frames")
         self.frame += 1
         row = self.frame % self._block
         if row == 0:
             self._refill()
+        elif row >= self._known and self._crowd is None:
+            self._work_out(row)
         links = self.links
-        gain = None if self._gain is None else self._gain[row]
+        gain = None if self._crowd is not None else self._gain[row]
         now = FrameLinks(links, self._snr_db[row], gain, of_pairs=self._crowd is not None)
         if self._own is not None or extra_loss_db is not None or jammers:
             now = FrameLinks(links, self._changed(now.snr_db, extra_loss_db, jammers))
@@ -232,7 +218,7 @@ class Channel:
         links, snr = self.links, snr_db.copy()
         if self._own is not None:
             square_db = links.square(snr, OUT_OF_RANGE_DB)
-            at_m, t_s = self._positions_m[self.frame], self.frame * self._frame_s
+            (at_m, _), t_s = self._pose(), self.frame * self._frame_s
             snr = changed_snr(self._own, t_s, at_m, square_db)[links.sender, links.receiver]
         if extra_loss_db is not None:
             extra = np.asarray(extra_loss_db, dtype=float)
@@ -243,7 +229,7 @@ class Channel:
             snr -= self.noise_rise_db(jammers)[links.receiver]
         return snr
 
-    def reroute(self, positions_m: ArrayLike, up: ArrayLike | None = None) -> None:
+    def reroute(self, positions_m: ArrayLike | Flight, up: ArrayLike | None = None) -> None:
         """From the next frame on the fleet flies another way; what was drawn of shadowing stays.
 
         In fleets of more than `SQUARE` drones links follow it from the next block of `EPOCH` frames on.
@@ -254,14 +240,16 @@ class Channel:
         Raises:
             ValueError: if a shape is another one or a number is not finite.
         """
-        p = np.asarray(positions_m, dtype=float)
-        u = None if up is None else np.asarray(up, dtype=float)
-        for name, new in (("positions_m", p), ("up", u)):
-            if new is not None and (new.shape != self._positions_m.shape or not _is_finite(new)):
-                raise ValueError(f"{name} has shape {new.shape}, must be {self._positions_m.shape} and finite")
-        self._positions_m, self._up = p, u
-        if self._crowd is None and self.frame >= 0:
-            self._work_out(self.frame // self._block * self._block)
+        flight, planned = flight_of(positions_m, up), self._flight
+        shape, must = ((each.frames, each.drones, 3) for each in (flight, planned))
+        if shape != must:
+            raise ValueError(f"positions_m has shape {shape}, must be {must} and finite")
+        self._flight, self._known = flight, self.frame % self._block + 1
+
+    def _pose(self) -> tuple[FloatArray, FloatArray | None]:
+        """Positions and z axes [N, 3] in this frame."""
+        p, up = self._flight.poses(slice(self.frame, self.frame + 1))
+        return p[0], None if up is None else up[0]
 
     @property
     def snr_db(self) -> FloatArray:
@@ -275,7 +263,7 @@ class Channel:
 
     def noise_rise_db(self, jammers: Sequence[Jammer]) -> FloatArray:
         """[N]: how far the jammers lift each receiver's noise."""
-        p = self._positions_m[self.frame]
+        p, up = self._pose()
         total_mw = np.full(self.n, 10.0 ** (self.noise_dbm / 10.0))
         for place, power_dbm in jammers:
             where = np.asarray(place, dtype=float)
@@ -283,8 +271,8 @@ class Channel:
             d = np.sqrt((toward**2).sum(axis=1))
             loss_db = path_loss_db(self.settings, d, p[:, 2], np.full(self.n, where[2]))
             if not self._antennas.lossless:
-                up = np.array([0.0, 0.0, 1.0]) if self._up is None else self._up[self.frame]
-                cosine = (toward * up).sum(axis=1) / np.maximum(d, 1e-9)
+                axis = np.array([0.0, 0.0, 1.0]) if up is None else up
+                cosine = (toward * axis).sum(axis=1) / np.maximum(d, 1e-9)
                 loss_db = loss_db + self._antennas.loss_db(slice(None), cosine)
             total_mw += 10.0 ** ((power_dbm - loss_db) / 10.0)
         return np.asarray(10.0 * np.log10(total_mw) - self.noise_dbm)
@@ -292,26 +280,28 @@ class Channel:
     # --- a block of frames ---------------------------------------------------------------------------
 
     def _refill(self) -> None:
-        c, p = self.settings, self._positions_m[self.frame : self.frame + self._block]
-        up = None if self._up is None else self._up[self.frame : self.frame + self._block]
+        """Draw what a block needs that begins with this frame."""
         if self._crowd is not None:
+            p, up = self._flight.poses(slice(self.frame, self.frame + self._block))
             self.links, gain_db, self._shadow_db = self._crowd.block(self.frame, p, up)
-            self._snr_db = gain_db + (c.tx_power_dbm - self.noise_dbm)
+            self._snr_db = gain_db + (self.settings.tx_power_dbm - self.noise_dbm)
             return
-        if self._field is None:
-            self._shadow_db = self._drawn.block(len(p)).reshape(len(p), -1)
-        self._work_out(self.frame)
+        shape = min(self._block, self._flight.frames - self.frame), self.n * self.n
+        self._snr_db, self._gain = np.empty(shape), np.empty(shape)
+        self._shadow_db = self._drawn.block(shape[0]).reshape(shape) if self._field is None else np.empty(shape)
+        self._work_out(0)
 
-    def _work_out(self, first: int) -> None:
-        """The block that begins with a frame, from what was drawn for it and where the drones are."""
-        c, p = self.settings, self._positions_m[first : first + self._block]
-        up = None if self._up is None else self._up[first : first + self._block]
-        loss_db = self._loss_db(p, up)
+    def _work_out(self, row: int) -> None:
+        """The next frames of the block from this one on, from what was drawn for them and where the drones are."""
+        c, frame = self.settings, self.frame
+        rows = slice(row, min(row + EPOCH, len(self._snr_db)))
+        p, up = self._flight.poses(slice(frame, frame + rows.stop - row))
         if self._field is not None:
-            at = [self._field.between(q, (first + t) * self._frame_s) for t, q in enumerate(p)]
-            self._shadow_db = np.stack(at).reshape(len(p), -1)
-        self._snr_db = c.tx_power_dbm - self.noise_dbm - loss_db + self._shadow_db
-        self._gain = linear(self._snr_db)
+            at = [self._field.between(q, (frame + t) * self._frame_s) for t, q in enumerate(p)]
+            self._shadow_db[rows] = np.stack(at).reshape(len(p), -1)
+        snr_db = c.tx_power_dbm - self.noise_dbm - self._loss_db(p, up) + self._shadow_db[rows]
+        self._snr_db[rows], self._gain[rows] = snr_db, linear(snr_db)
+        self._known = rows.stop
 
     def _loss_db(self, p: FloatArray, up: FloatArray | None) -> FloatArray:
         """[frames, N²] of [frames, N, 3] positions: path and antennas."""

@@ -115,9 +115,9 @@ class FleetHandle:
 
     @property
     def positions_m(self) -> NDArray[np.float64]:
-        motion = self._world.motion.position_m
-        frame = min(frame_at(self.t_s, self.frame_s), len(motion) - 1)
-        return _read_only(np.array(motion[frame], dtype=float))
+        motion = self._world.motion
+        frame = min(frame_at(self.t_s, self.frame_s), motion.frames - 1)
+        return _read_only(motion[frame : frame + 1].position_m[0].copy())
 
     @property
     def airborne(self) -> NDArray[np.bool_]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 
-from sortie.fleet.flight.descent import descending, level_again
 from sortie.fleet.flight.steps import landing_s
 from sortie.scenarios.frames import with_frame
 from sortie.scenarios.schema import MemberEvent, Scenario
+from sortie.sim.engine.manoeuvres import Manoeuvres
 from sortie.sim.engine.world import World, at
 
 
@@ -20,13 +19,11 @@ class Membership:
     LANDING without a region while it descends along the formation's way, and leaves the fleet on the ground.
     """
 
-    def __init__(self, scenario: Scenario, world: World) -> None:
-        self._world, self._mission, self._frame_s = world, scenario.mission, scenario.frame_s
-        self._level, self._stations = world.motion, {station.drone for station in scenario.fleet.ground}
+    def __init__(self, scenario: Scenario, world: World, manoeuvres: Manoeuvres) -> None:
+        self._world, self._mission, self._manoeuvres = world, scenario.mission, manoeuvres
+        self._frame_s, self._stations = scenario.frame_s, {station.drone for station in scenario.fleet.ground}
         self._homebound: dict[int, float] = {}
         """By drone that went home and did not come back: when it touches down."""
-        self.on_join: Callable[[int], None] = lambda drone: None
-        """Called with each drone that joins."""
         self._replaced: set[int] = set()
         self._reserves = [list(group.reserve) for group in self._mission.groups]
         first: dict[int, str] = {}
@@ -44,7 +41,7 @@ class Membership:
                     at(world.env, with_frame(end_s, self._frame_s), partial(self.go_home, drone, "its legs end"))
 
     def renew(self, frame: int) -> None:
-        """Send home those whose charge says so, and replace those who left. Call it first in a frame."""
+        """Send home those whose charge says so, and replace those who left."""
         world, limit = self._world, self._mission.handover_soc
         for group, reserves in zip(self._mission.groups, self._reserves, strict=True):
             if not group.reserve:
@@ -65,7 +62,7 @@ class Membership:
         Args:
             text: what the record says; empty says that it takes off, or that a ground station is switched on.
         """
-        world, frame = self._world, self._world.next_frame
+        world = self._world
         self._awaited.discard(drone)
         if world.drones[drone].airborne:
             return
@@ -75,9 +72,8 @@ class Membership:
             for reserves in self._reserves:
                 if drone in reserves:
                     reserves.remove(drone)
-            if self._homebound.pop(drone, None) is not None and frame < len(world.motion.time_s):
-                world.reroute(level_again(world.motion, self._level, drone, frame))
-            self.on_join(drone)
+            self._homebound.pop(drone, None)
+            self._manoeuvres.appear(drone)
 
     def go_home(self, drone: int, text: str = "told to") -> None:
         """A drone that flies goes home; nothing happens to one on the ground or on its way."""
@@ -87,14 +83,10 @@ class Membership:
         self._homebound[drone] = math.inf
         world.homebound.add(drone)
         world.note(drone, "drone_leaves", f"goes home: {text}")
-        frame = world.next_frame
-        if frame >= len(world.motion.time_s):
-            return
-        world.reroute(descending(world.motion, drone, frame, self._mission.descent_mps))
-        height_m = float(world.motion.position_m[frame, drone, 2])
-        down_s = frame * self._frame_s + height_m / self._mission.descent_mps
-        self._homebound[drone] = down_s
-        at(world.env, with_frame(down_s, self._frame_s), partial(self._touch_down, drone, down_s))
+        down_s = self._manoeuvres.descend(drone, self._mission.descent_mps)
+        if down_s is not None:
+            self._homebound[drone] = down_s
+            at(world.env, with_frame(down_s, self._frame_s), partial(self._touch_down, drone, down_s))
 
     def _touch_down(self, drone: int, down_s: float) -> None:
         world = self._world

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import simpy
 
@@ -45,6 +45,7 @@ from sortie.scenarios.frames import with_frame
 from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.scenarios.schema import PolicyChange, PolicySection, Scenario
 from sortie.sim.engine.audit import Audit
+from sortie.sim.engine.manoeuvres import Planners, Viewpoints
 from sortie.sim.engine.world import at
 from sortie.sim.results.views import Journal
 
@@ -94,16 +95,6 @@ class PolicyPlan(NamedTuple):
     def chooses_viewpoints(self) -> bool:
         """Whether any of its policies chooses viewpoints."""
         return any(viewpoint_of(policy.decide) is not None for policy in self.policies.values())
-
-
-class Moves(Protocol):
-    """Where drones may be moved in flight."""
-
-    def request(self, drone: int, viewpoint: Reposition | None) -> None:
-        """Request a viewpoint for a drone; None requests its slot."""
-
-    def read(self, drone: int, view: FleetView) -> None:
-        """Show the view of a decision to the drone's planner, if it has one."""
 
 
 def plan_of(section: PolicySection, first: NamedPolicy | None = None) -> PolicyPlan:
@@ -194,7 +185,8 @@ class Pilot:
         drone: int,
         plan: PolicyPlan,
         audit: Audit,
-        moves: Moves | None = None,
+        viewpoints: Viewpoints | None = None,
+        planners: Planners | None = None,
         journal: Journal | None = None,
     ) -> None:
         """Put a pilot together.
@@ -203,10 +195,12 @@ class Pilot:
             drone: whose pilot it is.
             plan: the scenario's policies.
             audit: records what breaks invariants, and who decides.
-            moves: takes the viewpoints that the policy chooses, and shows views to planners; None where nobody moves so.
+            viewpoints: takes those that the policy chooses; None where no policy of the plan does.
+            planners: have the drone's, which reads its views; None where no drone has one.
             journal: keeps every decision; None keeps none.
         """
-        self.drone, self._moves, self._journal = drone, moves, journal
+        self.drone, self._journal = drone, journal
+        self._viewpoints, self._planners = viewpoints, planners
         self.policy = plan.of_makes.get(drone, plan.first)
         self._viewpoint = viewpoint_of(self.policy.decide)
         changes = enumerate(plan.changes)
@@ -225,8 +219,8 @@ class Pilot:
         if policy.name != self.policy.name:
             self._audit.took_over(self.drone, self.policy.name, policy.name, reason)
             self.policy, self._viewpoint = policy, viewpoint_of(policy.decide)
-            if self._viewpoint is None and self._moves is not None:
-                self._moves.request(self.drone, None)
+            if self._viewpoint is None and self._viewpoints is not None:
+                self._viewpoints.request(self.drone, None)
 
     @property
     def handshake_bytes(self) -> int:
@@ -254,11 +248,11 @@ class Pilot:
         decisions[self.policy.name] = decisions.get(self.policy.name, 0) + 1
         shown, self._shown = self._shown, None
         read, asked = view if shown is None else shown.view, None
-        if self._moves is not None:
-            if self._viewpoint is not None:
-                asked = ask_viewpoint(self.policy, self._viewpoint, read)
-                self._moves.request(self.drone, asked)
-            self._moves.read(self.drone, read)
+        if self._viewpoint is not None and self._viewpoints is not None:
+            asked = ask_viewpoint(self.policy, self._viewpoint, read)
+            self._viewpoints.request(self.drone, asked)
+        if self._planners is not None:
+            self._planners.read(self.drone, read)
         directives = ask(self.policy, read)
         if self._journal is not None:
             self.check(directives, read)  # before its parts are read

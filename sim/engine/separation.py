@@ -32,7 +32,7 @@ class Separation:
     def check(self, frame: int) -> None:
         """Note the pairs that are too near since this frame. Call it after everything that moves drones."""
         world, (one, other) = self._world, self._pairs.T
-        position_m = np.asarray(world.motion.position_m[frame])
+        (position_m,) = world.motion[frame : frame + 1].position_m
         airborne = np.array([status.airborne for status in world.drones])
         apart_m = np.linalg.norm(position_m[one] - position_m[other], axis=-1)
         apart_m[~(airborne[one] & airborne[other])] = np.inf

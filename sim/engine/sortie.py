@@ -16,6 +16,8 @@ import simpy
 from sortie.fleet.agent import Agent
 from sortie.fleet.clock import DroneClock, oscillators
 from sortie.fleet.energy.battery import FleetBatteries
+from sortie.fleet.flight.manoeuvres import Motion
+from sortie.fleet.flight.steering import area_m
 from sortie.fleet.gate import Gate
 from sortie.fleet.memory import PeerMemory
 from sortie.fleet.messages.auth import Sealer
@@ -26,7 +28,7 @@ from sortie.fleet.sensor_faults import sensor_errors
 from sortie.fleet.traces import flown_motion
 from sortie.perception.detectors import Detector, DetectsMany, LooksByAnother, make_detector
 from sortie.perception.scene.scene_model import SceneModel
-from sortie.policies.contract import FleetView, Policy, Reposition
+from sortie.policies.contract import Policy
 from sortie.radio import Air
 from sortie.radio.event_loop import EventLoop
 from sortie.radio.rates import STANDARDS
@@ -35,10 +37,10 @@ from sortie.scenarios.schema import Perception, Scenario
 from sortie.scenarios.streams import stream
 from sortie.sim.apart import Said, call_within
 from sortie.sim.engine.audit import Audit
-from sortie.sim.engine.choreography import Choreography
 from sortie.sim.engine.events import Acted, Events, group_key
 from sortie.sim.engine.fusing import FindingEachFrame, Fusing
 from sortie.sim.engine.garbage import LEFTOVERS, cycles_searched_rarely
+from sortie.sim.engine.manoeuvres import Manoeuvres, Planners, Viewpoints
 from sortie.sim.engine.membership import Membership
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.mixed import mixed
@@ -48,7 +50,6 @@ from sortie.sim.engine.people import People
 from sortie.sim.engine.pilot import NamedPolicy, Pilot, PolicyPlan, named_policy, plan_for, plan_of, schedule_policies
 from sortie.sim.engine.scoring import Scorer, taking_turns
 from sortie.sim.engine.separation import Separation
-from sortie.sim.engine.steering import Steering, area_m
 from sortie.sim.engine.tracking import Ahead, FleetTracking, OwnBoxesOf, TargetSeen
 from sortie.sim.engine.transport import Transport
 from sortie.sim.engine.world import OwnSenses, World, air_settings
@@ -79,21 +80,6 @@ class Observer(Protocol):
 
     def begin(self, scenario: Scenario, scene: SceneModel) -> None: ...
     def second(self, t_s: float, new: dict[str, pa.Table]) -> None: ...
-
-
-class Moved:
-    """Who moves drones in flight."""
-
-    def __init__(self, choreography: Choreography | None, steering: Steering | None) -> None:
-        self._choreography, self._steering = choreography, steering
-
-    def request(self, drone: int, viewpoint: Reposition | None) -> None:
-        if self._choreography is not None:
-            self._choreography.request(drone, viewpoint)
-
-    def read(self, drone: int, view: FleetView) -> None:
-        if self._steering is not None:
-            self._steering.read(drone, view)
 
 
 DetectorMaker = Callable[[SceneModel, Perception, int, int], Detector | None]
@@ -201,9 +187,8 @@ class Parts:
     transport: Transport
     membership: Membership
     events: Events
-    choreography: Choreography | None
-    """None where no policy chooses viewpoints."""
-    steering: Steering
+    manoeuvres: Manoeuvres
+    planners: Planners
     pilots: Sequence[Pilot]
     agents: Sequence[Agent]
     detector: Detector | None
@@ -236,24 +221,24 @@ def build(
     table = PeerTable(len(drones), window_of(rules.detached_after_periods))
     memories = [PeerMemory(i, rules, statuses[i], table) for i in drones]
 
-    motion, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
+    nominal, traces = flown_motion(scenario.fleet, scenario.duration_s, scenario.frame_s, seed, replication)
     charges = {i: trace.battery for i, trace in traces.items() if trace.battery is not None}
     mains = {station.drone for station in scenario.fleet.ground if station.mains}
     batteries = FleetBatteries(scenario.fleet.batteries, scenario.fleet.overrides, len(drones), charges, mains)
+    motion = Motion(nominal)
     air = Air(
         env,
         air_settings(scenario),
-        motion.position_m,
+        motion,
         seed=seed,
         replication=replication,
         frame_s=scenario.frame_s,
-        up=motion.up(),
     )
     mission = scenario.mission
     scene = SceneModel(
         scenario.perception.scene,
         mission.target,
-        area_m(scenario.fleet, motion.bounds_m()),
+        area_m(scenario.fleet, nominal.bounds_m()),
         mission.more_targets,
         scenario.perception.people,
     )
@@ -261,7 +246,7 @@ def build(
     gnss, drawn = scenario.fleet.clock.gnss, oscillators(scenario.fleet.clock, len(drones), seed, replication)
     clocks = [DroneClock(status, each, gnss=gnss) for status, each in zip(statuses, drawn, strict=True)]
     people = People(scenario, scene, recorder, (seed, replication))
-    errors = sensor_errors(scenario, motion.position_m, seed, replication)
+    errors = sensor_errors(scenario, nominal.position_m, seed, replication)
     link_log = LinkLog(len(drones), recorder)
     world = World(
         env, scenario, statuses, motion, batteries, air, scene, plan, recorder, clocks, people, errors, link_log
@@ -277,19 +262,17 @@ def build(
         links=link_log,
     )
 
-    audit, choreography = Audit(env, recorder), None
+    audit, manoeuvres, viewpoints = Audit(env, recorder), Manoeuvres(scenario, world), None
     if policies.chooses_viewpoints:
         posed = any(trace.pose is not None for trace in traces.values())
-        choreography = Choreography(scenario, world, posed_by_trace=posed)
-    membership = Membership(scenario, world)
-    steering = Steering(scenario, world, membership, seed, replication)
+        viewpoints = Viewpoints(scenario, world, posed_by_trace=posed)
+        manoeuvres.serve(viewpoints)
+    membership = Membership(scenario, world, manoeuvres)
+    planners = Planners(scenario, world, membership.go_home, seed, replication)
+    if planners.anyone:
+        manoeuvres.serve(planners)
     journal = Journal(env) if scenario.record.views or scenario.record.disagreement else None
-    moves = (
-        Moved(choreography, steering if steering.anyone else None)
-        if choreography is not None or steering.anyone
-        else None
-    )
-    pilots = [Pilot(i, policies, audit, moves, journal) for i in drones]
+    pilots = [Pilot(i, policies, audit, viewpoints, planners if planners.anyone else None, journal) for i in drones]
     notes = AgentNotes(recorder, pilots)
     detector = mixed(detector_of, scene, scenario, seed, replication)
     looking = detector.looks if isinstance(detector, LooksByAnother) else detector
@@ -331,8 +314,8 @@ def build(
         transport,
         membership,
         events,
-        choreography,
-        steering,
+        manoeuvres,
+        planners,
         pilots,
         agents,
         detector,
@@ -359,12 +342,9 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
 
     if observer is not None:
         observer.begin(parts.scenario, parts.scene)
-    moves = [] if parts.choreography is None else [parts.choreography.renew]
-    if parts.steering.anyone:
-        moves.append(parts.steering.renew)
     separation = Separation(parts.scenario, world)
     watch = [separation.check] if separation.anyone else []
-    world.start(each_second, [parts.membership.renew, *moves, parts.events.step, *watch])
+    world.start(each_second, [parts.membership.renew, parts.manoeuvres.renew, parts.events.step, *watch])
     for agent in parts.agents:
         agent.start()
     if scorer is not None:

@@ -18,8 +18,8 @@ from sortie.fleet.clock import DroneClock
 from sortie.fleet.computer import Work, headrooms
 from sortie.fleet.coverage import cameras_of
 from sortie.fleet.energy.battery import FleetBatteries
-from sortie.fleet.flight.motion import Trajectories
-from sortie.fleet.flight.rotor import fleet_power_w
+from sortie.fleet.flight.manoeuvres import Manoeuvre, Motion
+from sortie.fleet.flight.rotor import RotorPower
 from sortie.fleet.plane import DroneStatus
 from sortie.fleet.senses import FlightSenses, Sensed, believed
 from sortie.perception.detectors import Detector
@@ -106,7 +106,7 @@ class World:
         env: simpy.Environment,
         scenario: Scenario,
         drones: Sequence[DroneStatus],
-        motion: Trajectories,
+        motion: Motion,
         batteries: FleetBatteries,
         air: Air,
         scene: SceneModel,
@@ -134,12 +134,9 @@ class World:
         self._clocks, self.people = clocks, people
         self._scenario, self._recorder = scenario, recorder
         self._computers = scenario.fleet.computers
-        # What the rotors draw follows from the motion alone, so the whole flight is computed at once.
-        self._rotor_w = fleet_power_w(scenario.fleet, motion)
-        self._cameras = cameras_of(scenario.fleet)
-        self._without_camera = scenario.fleet.without_camera
-        self._errors = errors
-        self._flight = self._senses(motion)
+        self._rotors, self._errors = RotorPower(scenario.fleet, motion), errors
+        cameras, blind = cameras_of(scenario.fleet), scenario.fleet.without_camera
+        self._flight = FlightSenses(motion, scenario.frame_s, scene.height_field, cameras, errors, blind)
         recorder.unfold["states"] = self._unfold_states
         self._delays_s = scenario.compute_delays_s
         self._busy_sensing = [min(1.0, delay_s * scenario.context.rate_hz) for delay_s in self._delays_s]
@@ -148,7 +145,7 @@ class World:
         self._stepped_to_s = 0.0
         self._busy_at_s, self._links = (0.0, 0.0), links
         self._receptions = (0,) * (1 + len(LOSS_CAUSES))  # heard and lost to each cause, up to the frame's begin
-        self._frame = 0
+        self.frame = 0
         self._work = deque([[Work()] * n], maxlen=1 + max(1, round(scenario.context.rate_hz * SECOND_S)))
         self._headrooms = [(1.0, 1.0)] * n
         self._down: dict[
@@ -180,7 +177,7 @@ class World:
             if frame:
                 self.write_receptions()
                 self._measure_headrooms()
-            self._frame = frame
+            self.frame = frame
             self.read_clocks()
             self.now = self.plan.at(env.now)
             for prepare in before_frame:
@@ -208,16 +205,12 @@ class World:
         for clock in self._clocks:
             clock.read(self.env.now)
 
-    def reroute(self, motion: Trajectories) -> None:
-        """Replace the motion from the present frame on; earlier frames must be equal."""
-        self.motion = motion
-        self._rotor_w = fleet_power_w(self._scenario.fleet, motion)
-        self._flight = self._senses(motion)
-        self.air.reroute(motion.position_m, motion.up())
-
-    def _senses(self, motion: Trajectories) -> FlightSenses:
-        frame_s, field = self._scenario.frame_s, self.scene.height_field
-        return FlightSenses(motion, frame_s, field, self._cameras, self._errors, self._without_camera)
+    def reroute(self, manoeuvres: Sequence[Manoeuvre]) -> None:
+        """Change the motion by manoeuvres that begin with one frame, the present one or the next."""
+        self.motion.change(manoeuvres)
+        self._rotors.forget()
+        self._flight.forget()
+        self.air.reroute(self.motion)
 
     def drain(self) -> None:
         """Drain the batteries for the time since the last call, and land the drones that are empty."""
@@ -230,7 +223,7 @@ class World:
         self._airtime_s = airtime_s
         self.batteries.step(
             dt_s,
-            self._rotor_w[self._frame].tolist(),
+            self._rotors.at(self.frame).tolist(),
             [busy if d.perceiving else 0.0 for d, busy in zip(self.drones, self._busy_sensing, strict=True)],
             airtime_share,
         )
@@ -328,7 +321,7 @@ class World:
         counters = self.air.counters
         now = (counters.receptions, *counters.lost_to.values())
         since = [after - before for before, after in zip(self._receptions, now, strict=True)]
-        self._recorder.rows["receptions"].append((self._frame * self._scenario.frame_s, *since))
+        self._recorder.rows["receptions"].append((self.frame * self._scenario.frame_s, *since))
         self._receptions = now
 
     def _write_medium(self) -> None:
@@ -375,7 +368,7 @@ class World:
     def _unfold_states(self, rows: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Columns of the `states` table: what the motion knows already is kept by the frame, not by the drone."""
         now_s, frames, *changing = zip(*rows, strict=True)
-        n, m = len(self.drones), self.motion
+        n, m = len(self.drones), self.motion[: frames[-1] + 1]
         at = np.tile(np.array(frames)[:, None], n)
         for drone, several in self._down.items():
             for since, until in several:
@@ -401,6 +394,12 @@ class World:
     def sensed(self, drone: int, frame: int) -> Sensed:
         """The drone's pose, velocity and coverage in a frame."""
         return self._flight.at(frame)[drone]
+
+    def misplaced_m(self, drone: int, frame: int) -> list[float]:
+        """By how much a drone believes to be elsewhere than it is, ENU; faults of its sensors included."""
+        here = self.sensed(drone, frame).capture
+        off_m: list[float] = (np.array(here.est_position_m) - np.array(here.position_m)).tolist()
+        return off_m
 
     def believed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times [T] of all frames, and in each the positions [T, N, 3] and headings [T, N] that drones believe to have."""

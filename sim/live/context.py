@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
 
@@ -20,7 +20,8 @@ import pyarrow.compute as pc
 
 from sortie.fleet.agent import Platform, Task
 from sortie.fleet.coverage import cameras_of
-from sortie.fleet.flight.motion import Trajectories
+from sortie.fleet.flight.motion import OF_A_DRONE, Trajectories
+from sortie.fleet.flight.steering import area_m
 from sortie.fleet.senses import FlightSenses, Sensed
 from sortie.fleet.traces import flown_motion
 from sortie.perception.geometry import Cameras
@@ -34,7 +35,6 @@ from sortie.sim.apart import Said, call_within
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build, fly
-from sortie.sim.engine.steering import area_m
 from sortie.sim.engine.tracking import FleetTracking, TargetSeen, cars_in_reach
 
 _REPLAYED_EVENTS = frozenset({"landed", "power_lost"}).union(*(kind.told_live for kind in KINDS.values()))
@@ -105,13 +105,10 @@ def _flown(scenario: Scenario, progress: Callable[[float], None] | None) -> list
     context = scenario.context.model_copy(update={"roster": False})
     flown = scenario.model_copy(update={"perception": perception, "context": context, "events": honest})
     parts = build(flown, plan_for(flown), flown.seed)
-    bounds = area_m(flown.fleet, parts.world.motion.bounds_m())
+    bounds = area_m(flown.fleet, parts.world.motion.nominal.bounds_m())
     fly(parts, progress)
-    tables = parts.recorder.finish()
-    return [
-        _trace(scenario, drone, _only(parts.world.motion, drone), bounds, tables)
-        for drone in range(scenario.fleet.drones)
-    ]
+    tables, motion = parts.recorder.finish(), parts.world.motion[:]
+    return [_trace(scenario, drone, _only(motion, drone), bounds, tables) for drone in range(scenario.fleet.drones)]
 
 
 def _trace(
@@ -152,13 +149,8 @@ def _runs(airborne: np.ndarray, frame_s: float) -> tuple[tuple[float, float], ..
 
 def _only(motion: Trajectories, drone: int) -> Trajectories:
     """One drone's motion."""
-    n = motion.position_m.shape[1]
-    values = {f.name: getattr(motion, f.name) for f in fields(motion)}
-    fleet_wide = {"time_s", "frame_position_m", "frame_yaw_rad"}
-    assert all(value.shape[1] == n for name, value in values.items() if name not in fleet_wide)  # noqa: S101
-    return Trajectories(
-        **{name: value if name in fleet_wide else value[:, drone : drone + 1].copy() for name, value in values.items()}
-    )
+    own = {name: getattr(motion, name)[:, drone : drone + 1].copy() for name in (*OF_A_DRONE, "wind_mps")}
+    return replace(motion, **own)
 
 
 class ReplaySenses:
