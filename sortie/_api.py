@@ -164,7 +164,7 @@ class Comparison:
         outcome by its name with dots, such as `ap50.mission`; null where a sortie has none, 0 where it counted none."""
         import pyarrow as pa
 
-        from sortie.sim.results.outcome_names import lacking
+        from sortie.sim.results.outcome import lacking
 
         rows = [
             {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, **s.outcome.flat()} for s in self.sorties

@@ -16,8 +16,7 @@ from sortie.scenarios.reading.nodes import nearest
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
 from sortie.sim.results.accuracy_table import WithAccuracy
-from sortie.sim.results.outcome import OutcomeDict, outcome
-from sortie.sim.results.outcome_names import is_zero_count
+from sortie.sim.results.outcome import OutcomeDict, is_zero_count, outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.run_files import RECORDING
 from sortie.sim.user_errors import missing, user_errors

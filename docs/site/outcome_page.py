@@ -13,7 +13,7 @@ import pyarrow as pa
 from sortie.scenarios.report_text import table
 from sortie.sim.folders import write_text
 from sortie.sim.results import accuracy_table, beliefs, disagreement, links, rosters, views
-from sortie.sim.results.outcome_names import fields
+from sortie.sim.results.outcome import fields
 from sortie.sim.results.record import ABOUT, TABLES
 
 PAGE = Path(__file__).resolve().parents[2] / "sim" / "results" / "outcome.md"

@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.report_text import interval
 from sortie.scenarios.schema import DecisionExpectation, Expectation, Scenario
-from sortie.sim.results.outcome import OutcomeDict, is_number
-from sortie.sim.results.outcome_names import possible
+from sortie.sim.results.outcome import OutcomeDict, is_number, possible
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.transitions import changes, describe
 

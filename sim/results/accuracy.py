@@ -36,11 +36,6 @@ def matched(record: SortieRecord, *, mission: bool, begin_s: float = 0.0) -> dic
     return score(record, [CAR], begin_s).pools[CAR, MISSION if mission else FULL_SCENE].by_fusion()
 
 
-def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
-    """AP@0.5 of cars in the full scene and in the mission disc, pooled over egos and scored frames; null without any."""
-    return score(record, [CAR]).ap(CAR, begin_s, end_s)
-
-
 def both_matched(record: SortieRecord) -> Both:
     """The cars of every scored fusion matched in the full scene and in the mission disc."""
     scored = score(record, [CAR])
@@ -114,18 +109,12 @@ class Accuracy(OutcomeSection):
     full_scene: Share | None = figure(
         "AP@0.5 over all targets within range, pooled over egos and scored fusions; of vehicles by rotated BEV IoU."
     )
-    mission: Share | None = figure(
-        "The same of detections and targets whose centres lie in the mission disc, while there is one."
-    )
+    mission: Share | None = figure("The same within the mission disc, while there is one: by the centres of boxes.")
 
 
 class Ap50(Accuracy):
-    detector: str = figure(
-        "The detector that flew: `perception.detector`, or for one passed in its `name` or module and class."
-    )
-    fusion: str | None = figure(
-        "`perception.fusion` or `perception.recorded_fusion`; null where the scenario's detector did not fly."
-    )
+    detector: str = figure("`perception.detector`, or of one that was passed its `name`, or module and class.")
+    fusion: str | None = figure("`perception.fusion` or `recorded_fusion`; null where another detector flew.")
     calibration: str | None = figure("Which fit a surrogate detector is of.")
     grounded_blind: Accuracy = figure(
         "The same with every drone that left the air, or has not joined yet, counted as blind: at each scored instant "

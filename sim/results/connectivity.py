@@ -30,9 +30,7 @@ class Bottleneck(OutcomeSection):
 class ConnectivityOutcome(OutcomeSection):
     """Null without links, and where fewer than two drones ever fly."""
 
-    connected_share: Share | None = figure(
-        "Share of the moments at which every drone in the air reaches every other, over hops if need be."
-    )
+    connected_share: Share | None = figure("Share of the moments at which all drones that fly reach each other.")
     partitioned_s: Seconds | None = figure("The rest of them, as time: for how long the fleet was in parts.")
     mean_hops: Amount | None = figure(
         "Links on the shortest route, the mean over all pairs with one; in fleets of more than 200 drones from some "

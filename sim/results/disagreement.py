@@ -81,9 +81,7 @@ def pairs_of(table: pa.Table) -> list[Pair]:
 class Causes(OutcomeSection):
     roster: Share | None = figure("One of them has not heard a drone.")
     trust: Share | None = figure("One of them doubts a drone.")
-    values: Share | None = figure(
-        "They read other values in one descriptor: its author does not believe the lie that it publishes."
-    )
+    values: Share | None = figure("They read one descriptor differently: its author does not believe its own lie.")
     descriptor: Share | None = figure("One of them has a later descriptor of a drone, with other contents.")
     age: Share | None = figure("A descriptor is too old for one of them: packets were lost, or clocks differ.")
 
@@ -99,9 +97,7 @@ class Disagreement(OutcomeSection):
     mean_s: Seconds | None = figure("How long one lasts on average, in whole frames.")
     p99_s: Seconds | None = figure("99th percentile of that.")
     longest_s: Seconds | None = figure("The longest.")
-    causes: Causes = figure(
-        "The share by cause: which difference between the two views must go for the choices to agree."
-    )
+    causes: Causes = figure("The share by cause: which difference between views must go for choices to agree.")
 
     @classmethod
     def compute(cls, flown: Flown) -> dict[str, Any]:

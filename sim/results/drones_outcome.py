@@ -17,9 +17,7 @@ class Drone(OutcomeSection):
     voltage_v: Volts = figure("At the pack's terminals.")
     airborne: bool = figure("Whether it still flew; of a ground station, whether it was on.")
     energy_j: Joules = figure("Spent to the very end, all causes.")
-    ap50: Accuracy = figure(
-        "How well this drone saw, over its own scored fusions; null where it had no scored fusion, or no car was there."
-    )
+    ap50: Accuracy = figure("Over this drone's own scored fusions; null where it had none, or no car was there.")
 
 
 def drones(flown: Flown) -> dict[str, dict[str, Any]]:

@@ -38,29 +38,21 @@ BLOCK_FRAMES = 512
 
 
 class MissionOutcome(OutcomeSection):
-    flown_share: Share = figure(
-        "Share of drone-seconds flown: 1 where all fly from beginning to end. Ground stations do not count."
-    )
+    flown_share: Share = figure("Share of drone-seconds flown, without ground stations: 1 where all fly to the end.")
     region_observed_share: Share | None = figure(
         "Share of the mission region's area in view, averaged over the time in which there is a region. A place is in "
         "view where it lies in the picture of one of the five cameras of a drone, on flat ground without houses and "
         "trees, and in the square of the drone's feature map. The drone flies, and its perception ran within the last "
         "second."
     )
-    target_in_view_share: Share | None = figure(
-        "Share of the time of phase `track` in which the target's place is in view, as above."
-    )
-    target_longest_out_of_view_s: Seconds | None = figure(
-        "Longest unbroken time of phase `track` in which no drone has the target in view."
-    )
+    target_in_view_share: Share | None = figure("Share of phase `track` with the target's place in view, as above.")
+    target_longest_out_of_view_s: Seconds | None = figure("Longest gap in phase `track`: the target is in no view.")
     target_detected_share: Share | None = figure(
         "Share of the time of phase `track` in which a box of at least one drone overlaps the target with an IoU of at "
         "least 0.5. Each scored instant stands for its scoring period. Null where drones take turns at being scored: a "
         "drone that is not scored may have the target."
     )
-    target_longest_undetected_s: Seconds | None = figure(
-        "Longest unbroken time of phase `track` in which no drone's boxes hold the target."
-    )
+    target_longest_undetected_s: Seconds | None = figure("Longest gap in phase `track`: the target is in no box.")
 
     @classmethod
     def compute(cls, flown: Flown) -> dict[str, float | None]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from operator import attrgetter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -65,9 +65,7 @@ class Outcome(OutcomeSection):
     """All of `outcome.json`; what is a ratio of nothing is null."""
 
     scenario: str = figure("Its name.")
-    policy: str = figure(
-        "The policy that flew, by its name; one passed as a callable by its `name` or module and function."
-    )
+    policy: str = figure("The policy that flew, by name; a callable by its `name`, or module and function.")
     seed: Count = figure("Of every random draw.")
     replication: Count = figure("Which draw of a campaign.")
     version: str = figure("The code that made the record: release, plus sign, digest of the package and its libraries.")
@@ -84,15 +82,11 @@ class Outcome(OutcomeSection):
         "for, and for all where cars are the only class."
     )
     tracking: TrackingOutcome = figure("How well each drone that flies follows the cars, beside `ap50`.")
-    mission: MissionOutcome = figure(
-        "The mission of the whole fleet; null where there is no region, no target or no detector."
-    )
+    mission: MissionOutcome = figure("The mission of the whole fleet; null without a region, a target or a detector.")
     people: PeopleOutcome = figure("People and thermal cameras; null without both, and where nobody was in a region.")
     bytes: BytesOutcome = figure("What was sent.")
     context: ContextOutcome = figure("What the context plane lost.")
-    connectivity: ConnectivityOutcome = figure(
-        "The fleet's graph of usable links (table `links`), looked at every 10 s from take-off on."
-    )
+    connectivity: ConnectivityOutcome = figure("The graph of usable links (table `links`), every 10 s from take-off.")
     context_share: Share | None = figure("Context bytes over all bytes.")
     data_rate_mbps: Mbps = figure("Payload bytes handed to the radio over the whole sortie, as Mb/s.")
     deadline_miss_rate: Share | None = figure(
@@ -112,18 +106,12 @@ class Outcome(OutcomeSection):
     drones: dict[str, Drone] = figure("Each as the last frame begins.")
     energy_j: dict[str, Joules] = figure("By cause, and `total`; hover outweighs the radio about a hundredfold.")
     policies: PoliciesOutcome = figure("Who decided, and how often it was put right.")
-    switches: PerMinute | None = figure(
-        "Changes of what a link carries, per link and minute; links that change alike count each."
-    )
+    switches: PerMinute | None = figure("Changes of what a link carries, per link and minute; each link counts.")
     transitions: list[Transition] = figure("Each change of what links carry.")
     phases: list[PhaseOutcome] = figure("By mission phase.")
-    distrusted_by: dict[str, Count] = figure(
-        "For each drone that anyone came to doubt (`fleet/trust.py`), how many did."
-    )
+    distrusted_by: dict[str, Count] = figure("Of each drone that any came to doubt (`fleet/trust.py`), by how many.")
     events: list[Event] = figure("What happened to the fleet: scenario events, landings, policies that took over.")
-    disagreement: Disagreement = figure(
-        "How often drones' views lead to different choices; null without `record.disagreement`."
-    )
+    disagreement: Disagreement = figure("Views that lead to different choices; null without `record.disagreement`.")
     metrics: dict[str, float | None] = figure("Figures of the user's own, by the names in `metrics`.")
     policy_eval_us: DecisionTimes = figure("Wall time of a decision; no part of the fingerprint.")
     wall_s: Seconds | None = figure("Wall time of the flight; no part of the fingerprint.")
@@ -167,19 +155,21 @@ def _descriptor_drops(flown: Flown) -> dict[str, int]:
     return dict(counts)
 
 
-def _ages_s(flown: Flown) -> Iterator[NDArray[np.float64]]:
-    """Ages of descriptors, piece after piece."""
-    return (batch.column(0).to_numpy() for batch in batches(flown.tables, "ages", ["age_s"]))
+def _numbers(flown: Flown, table: str, column: str) -> Iterator[NDArray[np.float64]]:
+    """The numbers of a column, or of its lists, piece after piece."""
+    for batch in batches(flown.tables, table, [column]):
+        values = batch.column(0)
+        yield (values.flatten() if pa.types.is_list(values.type) else values).to_numpy()
 
 
-def _data_ages_s(flown: Flown) -> Iterator[NDArray[np.float64]]:
-    """Ages of fused captures, piece after piece."""
-    return (batch.column(0).flatten().to_numpy() for batch in batches(flown.tables, "fusions", ["ages_s"]))
+def _ages(flown: Flown, table: str, column: str) -> dict[str, float | None]:
+    found = percentiles(lambda: _numbers(flown, table, column), (50.0, 99.0))
+    return dict(zip(Ages.model_fields, found or (None, None), strict=True))
 
 
-def _percentiles(flown: Flown, pieces: Callable[[Flown], Iterator[NDArray[np.float64]]]) -> dict[str, float | None]:
-    found = percentiles(lambda: pieces(flown), (50.0, 99.0))
-    return dict.fromkeys(Ages.model_fields) if found is None else dict(zip(Ages.model_fields, found, strict=True))
+def _data_age_mean_s(flown: Flown) -> float | None:
+    ages_s = [np.zeros(0), *_numbers(flown, "fusions", "ages_s")]
+    return cast("float | None", pc.mean(pa.array(np.concatenate(ages_s))).as_py())
 
 
 FIGURES: dict[str, Callable[[Flown], Any]] = {
@@ -196,9 +186,9 @@ FIGURES: dict[str, Callable[[Flown], Any]] = {
     "deadline_miss_rate": lambda flown: traffic_of(flown)[0].miss_rate(),
     "payload_fates": lambda flown: traffic_of(flown)[0].fates(),
     "medium_busy_fraction": lambda flown: flown.record.totals["medium_busy_fraction"],
-    "age_s": lambda flown: _percentiles(flown, _ages_s),
-    "data_age_s": lambda flown: _percentiles(flown, _data_ages_s),
-    "data_age_mean_s": lambda flown: pc.mean(pa.array(np.concatenate([np.zeros(0), *_data_ages_s(flown)]))).as_py(),
+    "age_s": lambda flown: _ages(flown, "ages", "age_s"),
+    "data_age_s": lambda flown: _ages(flown, "fusions", "ages_s"),
+    "data_age_mean_s": _data_age_mean_s,
     "descriptor_drops": _descriptor_drops,
     "battery": battery,
     "drones": drones,

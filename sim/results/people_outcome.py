@@ -30,18 +30,12 @@ class PeopleOutcome(OutcomeSection):
         "Of the people in a drone's region at a scored fusion, the share of which the drone had a box within 2 m, its "
         "own or a peer's."
     )
-    located_alone_share: Share | None = figure(
-        "The same by the drone's own thermal camera in that frame, without its peers."
-    )
-    in_region_drone_s: Seconds | None = figure(
-        "Time in which a person truly was in a flying drone's region, summed over drones. Ground stations do not count."
-    )
-    unknown_share: Share | None = figure(
-        "Share of that time in which the drone did not know it, from its own camera or from attached peers."
-    )
+    located_alone_share: Share | None = figure("The same by the drone's own thermal camera in that frame.")
+    in_region_drone_s: Seconds | None = figure("Time with people in regions of flying drones, summed over drones.")
+    unknown_share: Share | None = figure("Share of that time in which the drone did not know it, itself or by peers.")
     unknown_longest_s: Seconds | None = figure("Longest unbroken time of one drone in which it did not know it.")
     false_alert_share: Share | None = figure(
-        "Share of the time in which a drone had a region and nobody was there, in which it took somebody to be there."
+        "Of a drone's time with nobody in its region, the share in which it took somebody to be there."
     )
 
     @classmethod

@@ -12,9 +12,7 @@ from sortie.sim.results.traffic import feature_payload_p50, traffic_of
 
 
 class PhaseOutcome(OutcomeSection):
-    phase: str = figure(
-        "A phase of `mission.phases`. Its figures are of the whole fleet, also of drones in `mission.groups`."
-    )
+    phase: str = figure("A phase of `mission.phases`, for the whole fleet: drones of `mission.groups` too.")
     begin_s: Seconds = figure("From when.")
     end_s: Seconds = figure("Until when, exclusive.")
     ap50: Accuracy = figure("Average precision of cars within it.")

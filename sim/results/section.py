@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from functools import cached_property
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -19,7 +19,7 @@ INSTANT_S = 1e-6
 """A frame begins a few digits beside the time that a scenario names."""
 Span = tuple[float, float]
 """From a time (inclusive) to another (exclusive)."""
-Part = TypeVar("Part")
+Computes = TypeVar("Computes", bound="Callable[[Flown], Any]")
 
 
 def _quantity(unit: str, **ends: Any) -> Any:
@@ -71,17 +71,16 @@ class Flown:
         return [((p.at_s, until_s), p.phase) for p, until_s in zip(phases, ends_s, strict=True) if p.at_s < end_s]
 
 
-def once(compute: Callable[[Flown], Part]) -> Callable[[Flown], Part]:
+def once(compute: Computes) -> Computes:
     """Decorates a function of a flown sortie that several sections call: it runs at the first call, and its result is kept."""
 
     @functools.wraps(compute)
-    def part(flown: Flown) -> Part:
+    def part(flown: Flown) -> Any:
         if compute not in flown.parts:
             flown.parts[compute] = compute(flown)
-        found: Part = flown.parts[compute]
-        return found
+        return flown.parts[compute]
 
-    return part
+    return cast(Computes, part)
 
 
 def ratio(part: float, whole: float) -> float | None:

@@ -103,9 +103,7 @@ class BytesOutcome(OutcomeSection):
     context_descriptors: Bytes = figure("Descriptors as sent, 28 B of authentication included.")
     context_directives: Bytes = figure("Directives at 36 B, counted when they change.")
     data_sent: Bytes = figure("Payloads handed to the radio: delivered + lost + expired + in flight.")
-    handshakes_sent: Bytes = figure(
-        "What a method put on its links before payloads (`sortie.policies.catalogue.prior`), part of `data_sent`."
-    )
+    handshakes_sent: Bytes = figure("Requests and answers of methods (`policies.catalogue.prior`), in of `data_sent`.")
     data_delivered: Bytes = figure("Arrived; of payloads that came in part, that part.")
     data_lost: Bytes = figure("Lost on the air.")
     data_expired: Bytes = figure("Past their deadline, or replaced by a newer one before they were through.")

@@ -26,7 +26,7 @@ class PoliciesOutcome(OutcomeSection):
     decisions: dict[str, Count] = figure("By policy.")
     changes: Count = figure("How often a drone's policy was replaced in flight.")
     shield_interventions: Count = figure(
-        "Directives of policies that the shield replaced or could not put right, and changes that it made at gates."
+        "Directives that the shield replaced or could not put right, and its changes at gates."
     )
     invariant_violations: Count = figure(
         "Violations of invariants by what the gates enforced, after staleness rules and damping; one that lasts counts "

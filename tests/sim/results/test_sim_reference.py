@@ -16,9 +16,8 @@ from sortie import radio
 from sortie.sim.check.golden import figures
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.engine.transport import OTHER_SPACE
-from sortie.sim.results.outcome import OutcomeDict, outcome
+from sortie.sim.results.outcome import OutcomeDict, check_number, fields, open_keys, outcome
 from sortie.sim.results.outcome_fields import WALL, Outcome
-from sortie.sim.results.outcome_names import check_number, fields, open_keys
 from sortie.sim.results.record import ABOUT, TABLES
 from sortie.sim.results.traffic import REASONS
 
