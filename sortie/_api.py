@@ -164,12 +164,10 @@ class Comparison:
         outcome by its name with dots, such as `ap50.mission`; null where a sortie has none, 0 where it counted none."""
         import pyarrow as pa
 
-        from sortie._run import numbers
-        from sortie.sim.results.outcome_fields import lacking
+        from sortie.sim.results.outcome import lacking
 
         rows = [
-            {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, **dict(numbers(s.outcome))}
-            for s in self.sorties
+            {"policy": s.policy, "seed": s.seed, "town_seed": s.town_seed, **s.outcome.flat()} for s in self.sorties
         ]
         names = list(dict.fromkeys(name for row in rows for name in row))
         fleets = [len(s.outcome["battery"]) for s in self.sorties]

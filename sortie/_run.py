@@ -9,15 +9,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.nodes import nearest
 from sortie.sim.folders import RunError
 from sortie.sim.results import run_folder
 from sortie.sim.results.accuracy_table import WithAccuracy
-from sortie.sim.results.outcome import outcome
-from sortie.sim.results.outcome_fields import is_zero_count
+from sortie.sim.results.outcome import OutcomeDict, is_zero_count, outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.run_files import RECORDING
 from sortie.sim.user_errors import missing, user_errors
@@ -111,8 +110,16 @@ class Run:
         return WithAccuracy(self.record)
 
     @cached_property
-    def outcome(self) -> dict[str, Any]:
-        """All figures of the sortie, nested as in `outcome.json`. A ratio with a denominator of 0 is None."""
+    def outcome(self) -> OutcomeDict:
+        """All figures of the sortie, nested as in `outcome.json`. A ratio with a denominator of 0 is None.
+
+        It is a dictionary, and a field is computed when it is first read. `get` takes a name with dots as well.
+
+        Example:
+            >>> run = sortie.fly("track_target", {"duration_s": 2, "perception.detector": "none"})
+            >>> run.outcome["bytes"]["data_sent"] == run.outcome.get("bytes.data_sent")
+            True
+        """
         return outcome(self.record)
 
     @property
@@ -126,7 +133,7 @@ class Run:
             >>> run.metrics["bytes.data_sent"] == run.outcome["bytes"]["data_sent"]
             True
         """
-        return Metrics(numbers(self.outcome))
+        return Metrics(self.outcome.flat())
 
     def graph(self, t_s: float) -> nx.DiGraph:
         """The fleet as a graph at a moment, for `networkx`: drones as nodes, links within earshot as edges.
@@ -271,12 +278,3 @@ def as_path(name: str, value: object) -> Path:
     if not isinstance(value, str | os.PathLike):
         raise RunError(f"{name}: {value!r}, must be a path")
     return Path(value)
-
-
-def numbers(value: Any, prefix: str = "") -> list[tuple[str, float]]:
-    """The numbers of an outcome with their dotted names."""
-    if isinstance(value, Mapping):
-        return [pair for key, inner in value.items() for pair in numbers(inner, f"{prefix}.{key}" if prefix else key)]
-    if isinstance(value, list):
-        return [pair for i, inner in enumerate(value) for pair in numbers(inner, f"{prefix}.{i}")]
-    return [(prefix, value)] if isinstance(value, int | float) and not isinstance(value, bool) else []

@@ -1,25 +1,23 @@
-"""Make `sim/results/outcome.md`, the reference of outcome and record, from `sortie.sim.results.outcome_fields` and `.record`.
+"""Make `sim/results/outcome.md`, the reference of outcome and record, from the outcome's JSON Schema and `sortie.sim.results.record`.
 
 `python docs/site/outcome_page.py` writes it anew; a test holds it to the code, and the code to what a sortie gives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Any
 
 import pyarrow as pa
 
 from sortie.scenarios.report_text import table
 from sortie.sim.folders import write_text
 from sortie.sim.results import accuracy_table, beliefs, disagreement, links, rosters, views
-from sortie.sim.results.outcome_fields import Outcome
+from sortie.sim.results.outcome import fields
 from sortie.sim.results.record import ABOUT, TABLES
 
 PAGE = Path(__file__).resolve().parents[2] / "sim" / "results" / "outcome.md"
-_NAMES = {float: "number", int: "whole number", bool: "true, false", str: "text", NoneType: "null"}
+_NAMES = {"number": "number", "integer": "whole number", "boolean": "true, false", "string": "text", "null": "null"}
 _COLUMNS = {
     pa.float64(): "",
     pa.int32(): "int",
@@ -44,10 +42,12 @@ def page() -> str:
         "## outcome.json",
         "",
         "A dot leads into an object, `*` stands for each of its keys, `[]` for each entry of a list. Bounds of `expect:` in "
-        "a scenario name a field in the same way: `bytes.context_sent`, `battery.1`.",
+        "a scenario name a field in the same way: `bytes.context_sent`, `battery.1`. `run.outcome.model()` gives it as a "
+        "pydantic model, `Outcome`. A share is 0 … 1; other units are of numbers that are 0 or more.",
         "",
         *table(
-            ("field", "value", "meaning"), ((f"`{path}`", value, meaning) for path, value, meaning in fields(Outcome))
+            ("field", "value", "unit", "meaning"),
+            ((f"`{name}`", value(declared), unit(declared), declared["description"]) for name, declared, _ in fields()),
         ),
         "",
         "## The record's tables",
@@ -86,40 +86,23 @@ def page() -> str:
     return "\n".join(lines)
 
 
-def fields(section: Any, path: str = "") -> Iterator[tuple[str, str, str]]:
-    """Path, value and meaning of every field of a typed dictionary, those inside it after it."""
-    for name, hint in get_type_hints(section, include_extras=True).items():
-        kind, meaning, *_ = get_args(hint)
-        inner, mark = _inner(kind)
-        yield f"{path}{name}", _value(kind), meaning
-        if inner is not None:
-            yield from fields(inner, f"{path}{name}{mark}.")
+def value(kind: dict[str, Any]) -> str:
+    """What a field holds, in words, by its JSON Schema."""
+    if "anyOf" in kind:
+        return ", ".join(map(value, kind["anyOf"]))
+    if kind.get("type") == "array":
+        return "list" if "$ref" in kind["items"] else f"list of {value(kind['items'])}s"
+    if not (inner := kind.get("additionalProperties")) or "$ref" in inner:
+        return _NAMES.get(kind.get("type", ""), "object")
+    first, *null = inner.get("anyOf", [inner])
+    return f"object of {value(first)}s" + " or null" * bool(null)
 
 
-def _inner(kind: Any) -> tuple[Any, str]:
-    """The typed dictionary that a field holds, and the mark by which a path goes there."""
-    if is_typeddict(kind):
-        return kind, ""
-    of = get_args(kind)
-    if of and is_typeddict(of[-1]):
-        return of[-1], ".*" if get_origin(kind) is dict else "[]"
-    return None, ""
-
-
-def _value(kind: Any) -> str:
-    origin, of = get_origin(kind), get_args(kind)
-    if is_typeddict(kind):
-        return "object"
-    if origin is dict:
-        if is_typeddict(of[1]):
-            return "object"
-        kinds = get_args(of[1]) or (of[1],)
-        return f"object of {_NAMES[kinds[0]]}s" + " or null" * (NoneType in kinds)
-    if origin is list:
-        return "list" if is_typeddict(of[0]) else f"list of {_NAMES[of[0]]}s"
-    if origin is UnionType:
-        return ", ".join(_NAMES[member] for member in of)
-    return _NAMES[kind]
+def unit(kind: dict[str, Any]) -> str:
+    """The unit of a field, or of what it holds; empty where it has none."""
+    inner = kind.get("anyOf", [kind])[0]
+    inner = inner.get("additionalProperties") or inner.get("items") or inner
+    return str(inner.get("unit", ""))
 
 
 def _columns(columns: dict[str, pa.DataType]) -> str:

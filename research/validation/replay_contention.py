@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from research.validation.stored import Cell, Column, Table
 from sortie.scenarios.reading.load import load
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.transitions import transitions
 
 SEEDS = range(1, 6)
 DWELL_S = (0.0, 1.0, 2.0, 5.0, 10.0)

@@ -19,7 +19,7 @@ from sortie.sim.experiment.flight_file import fly_all, users_file
 from sortie.sim.folders import RunError
 from sortie.sim.policy_text import flown_by
 from sortie.sim.results.explain import explain_metric
-from sortie.sim.results.outcome import outcome
+from sortie.sim.results.outcome import OutcomeDict, outcome
 from sortie.sim.results.record import SortieRecord
 
 
@@ -114,11 +114,11 @@ class _Flights:
     def __init__(self, duration_s: float, progress: Callable[[float], None] | None) -> None:
         self._begin_s, self._duration_s, self._progress = 0.0, duration_s, progress
 
-    def fly(self, scenario: Scenario, replications: range) -> list[dict[str, Any]]:
+    def fly(self, scenario: Scenario, replications: range) -> list[OutcomeDict]:
         tasks = [task_of(scenario, (OUTCOME,), replication=k) for k in replications]
         flights = fly_all(tasks, kept=users_file(), watch=self._at)
         self._begin_s += len(tasks) * self._duration_s
-        return [flight.values[OUTCOME] for flight in flights]
+        return [flight.outcome for flight in flights]
 
     def _at(self, task: Task, t_s: float) -> None:
         if self._progress is not None:
@@ -126,7 +126,7 @@ class _Flights:
 
 
 def _with_explanation(
-    verdict: Verdict, scenario: Scenario, record: SortieRecord, results: Sequence[dict[str, Any]]
+    verdict: Verdict, scenario: Scenario, record: SortieRecord, results: Sequence[OutcomeDict]
 ) -> Verdict:
     """A failed verdict with facts from the record of its replication. Only the first replication's record is kept, so
     another one is flown once more."""

@@ -9,9 +9,9 @@ from typing import Any, TypeAlias
 from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.report_text import interval
 from sortie.scenarios.schema import DecisionExpectation, Expectation, Scenario
-from sortie.sim.results.outcome import changes, describe
-from sortie.sim.results.outcome_fields import metric, possible
+from sortie.sim.results.outcome import OutcomeDict, is_number, possible
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.transitions import changes, describe
 
 TOLERANCE = 1e-9
 
@@ -37,9 +37,9 @@ class Verdict:
 def check(
     scenario: Scenario,
     record: SortieRecord,
-    result: dict[str, Any],
-    replications: Sequence[dict[str, Any]] = (),
-    others: Mapping[str, Sequence[dict[str, Any]]] | None = None,
+    result: OutcomeDict,
+    replications: Sequence[OutcomeDict] = (),
+    others: Mapping[str, Sequence[OutcomeDict]] | None = None,
 ) -> list[Verdict]:
     """Every expectation of the scenario, in its order.
 
@@ -77,7 +77,7 @@ def in_words(e: Expectation) -> str:
     return f"{e.metric}{over} {' and '.join(bounds)}{off}{sure}"
 
 
-_Pair: TypeAlias = tuple[dict[str, Any], dict[str, Any] | None]
+_Pair: TypeAlias = tuple[OutcomeDict, OutcomeDict | None]
 """An outcome, and that of the same sortie by the policy that the expectation is over, where it is over one."""
 
 
@@ -88,17 +88,13 @@ def _got(e: Expectation, pair: _Pair) -> Any:
         KeyError: no such field, or no difference as one of the two is no number.
     """
     result, other = pair
-    own = metric(result, e.metric)
+    own = result.at(e.metric)
     if other is None:
         return own
-    theirs = metric(other, e.metric)
-    if not (_is_number(own) and _is_number(theirs)):
+    theirs = other.at(e.metric)
+    if not (is_number(own) and is_number(theirs)):
         raise KeyError(f"{own} and {theirs} under {e.over}, no difference")
     return own - theirs
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _check_one(expectation: Expectation, pairs: Sequence[_Pair]) -> Verdict:
@@ -119,13 +115,13 @@ def _check_one(expectation: Expectation, pairs: Sequence[_Pair]) -> Verdict:
     if expectation.at_least is not None or expectation.at_most is not None:
         holds = (
             holds
-            and _is_number(got)
+            and is_number(got)
             and (expectation.at_least is None or got >= expectation.at_least - slack)
             and (expectation.at_most is None or got <= expectation.at_most + slack)
         )
     shown = f"{got:.6g}" if isinstance(got, float) else str(got)
     if pairs[0][1] is not None:
-        both = (f"{metric(result, name):.6g}" for result in pairs[0] if result is not None)
+        both = (f"{result.at(name):.6g}" for result in pairs[0] if result is not None)
         shown += f" ({', '.join(both)} under {expectation.over})"
     return Verdict(expected, shown, holds, expectation.because, name)
 
@@ -143,7 +139,7 @@ def _check_mean(e: Expectation, pairs: Sequence[_Pair]) -> Verdict:
             value = _got(e, pair)
         except KeyError as error:
             return Verdict(expected, f"replication {i}: {error.args[0]}", False, e.because, e.metric, replication=i)
-        if not _is_number(value):
+        if not is_number(value):
             return Verdict(expected, f"replication {i}: {value}, no number", False, e.because, e.metric, replication=i)
         values.append(float(value))
     if len(values) < e.replications:

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from sortie.sim.folders import RunError, write_text
+from sortie.sim.results.outcome import is_number, leaves
+from sortie.sim.results.outcome_fields import WALL
 
-LEFT_OUT = ("fingerprint", "version", "own_files", "wall_s", "realtime_factor", "policy_eval_us")
+LEFT_OUT = ("fingerprint", "version", "own_files", *WALL)
 """Wall clock, and what changes with every release."""
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 """Tolerances of a new file; edit them there. Other processors round a network's output differently."""
@@ -25,20 +27,7 @@ def golden_path(scenario: Path) -> Path:
 
 def figures(result: dict[str, Any]) -> dict[str, Any]:
     """An outcome as flat dotted figures, without what golden outcomes leave out; null where there is none."""
-    flat: dict[str, Any] = {}
-
-    def walk(prefix: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for key, inner in value.items():
-                walk(f"{prefix}.{key}", inner)
-        elif isinstance(value, list):
-            for i, inner in enumerate(value):
-                walk(f"{prefix}.{i}", inner)
-        else:
-            flat[prefix[1:]] = value
-
-    walk("", {k: v for k, v in result.items() if k not in LEFT_OUT})
-    return flat
+    return dict(leaves({k: v for k, v in result.items() if k not in LEFT_OUT}))
 
 
 def with_relative_files(folder: Path, result: dict[str, Any], files: Iterable[str]) -> dict[str, Any]:
@@ -88,8 +77,8 @@ def differences(path: Path, result: dict[str, Any]) -> dict[str, tuple[Any, Any]
     expected, got = golden["outcome"], figures(result)
 
     def same(a: Any, b: Any) -> bool:
-        numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in (a, b))
-        return math.isclose(a, b, rel_tol=relative, abs_tol=absolute) if numbers else a == b
+        numbers = is_number(a) and is_number(b)
+        return math.isclose(a, b, rel_tol=relative, abs_tol=absolute) if numbers else bool(a == b)
 
     names = {**expected, **got}
     return {
@@ -124,7 +113,7 @@ def told(moved: dict[str, tuple[Any, Any]]) -> tuple[str, str]:
 
 def _relative(was: Any, now: Any) -> float:
     """By what part of the larger one two figures differ; 1 where they are no numbers."""
-    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in (was, now)):
+    if not (is_number(was) and is_number(now)):
         return 1.0
     largest = max(abs(was), abs(now))
     return abs(now - was) / largest if largest else 0.0

@@ -13,7 +13,7 @@ from sortie.scenarios.schema import Scenario
 from sortie.scenarios.shipped import located
 from sortie.sim.folders import RunError
 from sortie.sim.policy_text import flown_by
-from sortie.sim.results.outcome_fields import kind_at, open_keys
+from sortie.sim.results.outcome import kind_at, open_keys
 
 
 def not_there(scenario: Scenario) -> list[str]:

@@ -23,6 +23,7 @@ from sortie.sim.experiment.pools import processes
 from sortie.sim.folders import RunError
 from sortie.sim.results.accuracy import FULL_SCENE, MISSION, Both
 from sortie.sim.results.box_rows import Key
+from sortie.sim.results.outcome import OutcomeDict
 from sortie.sim.results.record import SortieRecord
 
 SEEDS = 8
@@ -71,7 +72,7 @@ class Compared:
     seed: int
     town_seed: int
     """`perception.scene.seed`: the town that it flew in."""
-    outcome: dict[str, Any]
+    outcome: OutcomeDict
     gain: dict[str, float | None]
     """AP@0.5 minus the first policy's in this sortie, `full_scene` and `mission`, over the fusions that both policies
     made; None where it is not defined."""
@@ -186,7 +187,7 @@ def compare(
                     gains = gains_over(ours, its)
                     within += _within(contender.label, ours, its, gains) if len(seeds) == 1 else ()
                 town_seed = town.perception.scene.seed
-                flown.append(Compared(contender.label, seed, town_seed, row.values[OUTCOME], gains, again))
+                flown.append(Compared(contender.label, seed, town_seed, row.outcome, gains, again))
     return Flown(tuple(flown), tuple(within if len(seeds) == 1 else _over_sorties(flown)))
 
 

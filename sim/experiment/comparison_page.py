@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sortie.sim.experiment.compare import Flown
-from sortie.sim.experiment.comparison_text import at, comparison_blocks, heading, what_gains_are
+from sortie.sim.experiment.comparison_text import comparison_blocks, heading, what_gains_are
 from sortie.sim.experiment.half_width import Precision
 from sortie.sim.folders import write_text
 from sortie.sim.results.blocks import Figure, Heading, Paragraph, html_page
@@ -28,14 +28,14 @@ from sortie.sim.results.report_figures import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DOTS: tuple[tuple[str, tuple[str, ...], float], ...] = (
-    ("AP@0.5, full scene", ("ap50", "full_scene"), 1.0),
-    ("AP@0.5, mission disc", ("ap50", "mission"), 1.0),
-    ("Data delivered, MB", ("bytes", "data_delivered"), 1e-6),
-    ("Deadlines missed, %", ("deadline_miss_rate",), 100.0),
-    ("Energy, kJ", ("energy_j", "total"), 1e-3),
+DOTS: tuple[tuple[str, str, float], ...] = (
+    ("AP@0.5, full scene", "ap50.full_scene", 1.0),
+    ("AP@0.5, mission disc", "ap50.mission", 1.0),
+    ("Data delivered, MB", "bytes.data_delivered", 1e-6),
+    ("Deadlines missed, %", "deadline_miss_rate", 100.0),
+    ("Energy, kJ", "energy_j.total", 1e-3),
 )
-"""Caption, place in the outcome, and factor of each figure that has a dot for each sortie."""
+"""Caption, name in the outcome, and factor of each figure that has a dot for each sortie."""
 Plot = tuple[str, float, Callable[["Axes"], None]]
 
 
@@ -78,7 +78,7 @@ def _dots(flown: Flown, labels: Sequence[str]) -> Iterator[Plot]:
     """A figure for each of `DOTS` that any sortie has."""
     for caption, place, factor in DOTS:
         values = [
-            [factor * v for s in flown.sorties if s.policy == label and (v := at(s.outcome, place)) is not None]
+            [factor * v for s in flown.sorties if s.policy == label and (v := s.outcome.number(place)) is not None]
             for label in labels
         ]
         if any(values):

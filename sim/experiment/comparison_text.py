@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from sortie.sim.experiment.compare import BLOCK_S, BY_BOTH, Compared, Flown, Gai
 from sortie.sim.experiment.conditions import mean_of_known
 from sortie.sim.experiment.half_width import Precision
 from sortie.sim.results.blocks import Block, Items, Paragraph, Table, markdown
+from sortie.sim.results.outcome import OutcomeDict
 from sortie.sim.results.sentences import turns_in_words
 from sortie.sim.results.summary import titled
 
@@ -191,7 +192,7 @@ def side_by_side(flown: Flown) -> dict[str, list[str]]:
 
     rows = {}
     for name, place, text in ROWS:
-        value = partial(at, place=place.split("."))
+        value = partial(OutcomeDict.number, name=place)
         if place.startswith(IF_GROUNDED) and all(s.outcome["mission"]["flown_share"] == 1.0 for s in flown.sorties):
             continue
         if place.startswith(IF_KNOWN) and all(value(s.outcome) is None for s in flown.sorties):
@@ -200,15 +201,8 @@ def side_by_side(flown: Flown) -> dict[str, list[str]]:
         rows[name] = gain if text is None else means(value, text)
     rows["charge left, least"] = means(lambda outcome: min(outcome["battery"].values(), default=None), percent)
     for own in dict.fromkeys(name for s in flown.sorties for name in s.outcome["metrics"]):
-        rows[f"metrics.{own}"] = means(partial(at, place=("metrics", own)), lambda v: number(v, ".4g"))
+        rows[f"metrics.{own}"] = means(partial(OutcomeDict.number, name=f"metrics.{own}"), lambda v: number(v, ".4g"))
     return rows
-
-
-def at(outcome: Any, place: Sequence[str]) -> float | None:
-    """A figure of an outcome."""
-    for part in place:
-        outcome = outcome[part]
-    return None if outcome is None else float(outcome)
 
 
 def _gain(gain: Gain | None, sorties: int) -> str:

@@ -159,7 +159,7 @@ def scenario_of(conditions: ConditionSet, condition: Condition, policy: str) -> 
 
 def _cell(policy: str, condition: Condition, flights: Sequence[Flight]) -> Cell:
     frames = [m for flight in flights for m in flight.values[MATCHED][0][condition.metric].values()]
-    results = [flight.values[OUTCOME] for flight in flights]
+    results = [flight.outcome for flight in flights]
     return Cell(
         policy,
         condition.name,

@@ -18,7 +18,7 @@ from sortie.sim.experiment.plan import CampaignPlan
 from sortie.sim.experiment.pools import Pool, processes
 from sortie.sim.experiment.store import CampaignStore
 from sortie.sim.folders import RunError
-from sortie.sim.results.outcome_fields import possible
+from sortie.sim.results.outcome import possible
 
 
 @dataclass(frozen=True, slots=True)

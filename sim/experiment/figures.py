@@ -12,7 +12,7 @@ import numpy as np
 
 from sortie.scenarios.intervals import Estimate, Floats, mean_interval
 from sortie.sim.experiment.rows import CampaignRows, is_accuracy
-from sortie.sim.results.outcome_fields import possible
+from sortie.sim.results.outcome import possible
 
 MAX_METRICS, MAX_FIELDS = 8, 6
 APART = 0.012

@@ -9,7 +9,6 @@ import functools
 import hashlib
 import inspect
 import json
-import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -38,8 +37,7 @@ from sortie.sim.folders import RunError
 from sortie.sim.identity import codes_here, file_digest, flight_code, name_of, packages
 from sortie.sim.process import own_process
 from sortie.sim.results.accuracy import both_matched
-from sortie.sim.results.outcome import outcome
-from sortie.sim.results.outcome_fields import lacking, metric
+from sortie.sim.results.outcome import OutcomeDict, outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.user_errors import in_line
 
@@ -103,6 +101,11 @@ class Flight:
     key: str = ""
     files: Mapping[str, str] = field(default_factory=dict)
     """Digests of the files that it read beside Sortie's own, by absolute path."""
+
+    @property
+    def outcome(self) -> OutcomeDict:
+        """The whole outcome, where it was asked for."""
+        return OutcomeDict(self.values[OUTCOME])
 
 
 class OtherCodeError(RunError):
@@ -229,7 +232,7 @@ def fly(
     for path, digest in task.files.items():
         _check_file(path, digest)
     keep(record)
-    result = outcome(record)
+    result = outcome(record)  # figures that nobody asked for are not computed
     values: dict[str, Any] = {}
     for name in task.figures:
         if name == OUTCOME:
@@ -237,7 +240,7 @@ def fly(
         elif name == MATCHED:
             values[name] = [both_matched(one) for one in (record, *boxes_of_draws(record, make, draws))]
         elif name != PROCESSOR_S:
-            values[name] = number(result, name)
+            values[name] = result.number(name)
     if PROCESSOR_S in task.figures:
         values[PROCESSOR_S] = time.process_time() - begin_s
     return Flight("", record.fingerprint[:16], values, task.key, {**files_read.files_read(), **task.files})
@@ -272,15 +275,6 @@ def fly_in_worker(task: Task, memory_b: int | None = None) -> Flight:
 def failed(task: Task, error: str) -> Flight:
     """The row of a flight without a result."""
     return Flight(error, "", dict.fromkeys(task.figures), task.key, task.files)
-
-
-def number(result: dict[str, Any], name: str) -> float | None:
-    """A metric's number; None where this flight has none, 0 of a count. Another flight may have one."""
-    try:
-        value = metric(result, name)
-    except KeyError:
-        return lacking(name, len(result.get("battery", ())))
-    return float(value) if value is not None and math.isfinite(value) else None
 
 
 def _check_file(path: str, digest: str) -> None:

@@ -38,6 +38,7 @@ from sortie.sim.experiment.flight_file import fly_all
 from sortie.sim.folders import RunError
 from sortie.sim.identity import name_of
 from sortie.sim.results.accuracy import Both
+from sortie.sim.results.outcome import OutcomeDict
 from sortie.sim.user_errors import user_errors
 
 METRICS = tuple(f"ap50.{area}" for area in AREAS)
@@ -71,7 +72,7 @@ class Row(NamedTuple):
     seed: int
     gains: Gains
     processor_s: float
-    outcomes: Mapping[str, dict[str, Any]] = {}
+    outcomes: Mapping[str, OutcomeDict] = {}
     """By policy; of the surrogate none."""
 
 
@@ -243,7 +244,7 @@ def fly_torch(contenders: Sequence[Contender], seed: int, kept: Path | None = No
     """One seed under every policy by the detector of the contenders' scenarios, which they share."""
     flights = _fly(contenders, seed, SHARED, (OUTCOME, MATCHED, PROCESSOR_S), kept)
     gains = gains_between([c.label for c in contenders], [flight.values[MATCHED][0] for flight in flights])
-    outcomes = {c.label: flight.values[OUTCOME] for c, flight in zip(contenders, flights, strict=True)}
+    outcomes = {c.label: flight.outcome for c, flight in zip(contenders, flights, strict=True)}
     return Row("torch", seed, gains, _processor_s(flights), outcomes)
 
 

@@ -16,7 +16,7 @@ from sortie.scenarios.intervals import AMOUNT, LEVEL, SHARE, Estimate, Floats, R
 from sortie.scenarios.schema.conditions import ConditionSet
 from sortie.sim.experiment.flight import Flight
 from sortie.sim.folders import RunError
-from sortie.sim.results.outcome_fields import possible
+from sortie.sim.results.outcome import possible
 
 METRICS = (
     "ap50.mission",

@@ -37,7 +37,7 @@ from sortie.sim.experiment.spread import TAIL, Floats, design, drawn_fields, gri
 from sortie.sim.folders import RunError
 from sortie.sim.identity import flight_code, packages
 from sortie.sim.policy_text import policy_overrides
-from sortie.sim.results.outcome_fields import check_number, open_keys
+from sortie.sim.results.outcome import check_number, open_keys
 
 FORMAT = 2
 

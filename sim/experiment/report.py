@@ -23,7 +23,7 @@ from sortie.sim.experiment.store import TABLE, CampaignTable
 from sortie.sim.experiment.winners import other_winners, rule, winner
 from sortie.sim.folders import RunError, write_text
 from sortie.sim.results.blocks import Block, Code, Figure, Heading, Items, Paragraph, Table, html_page, markdown
-from sortie.sim.results.outcome_fields import possible
+from sortie.sim.results.outcome import possible
 
 REPORT, PAGE = "report.md", "report.html"
 FIGURES = {

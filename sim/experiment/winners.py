@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sortie.scenarios.intervals import LEVEL, Estimate, Floats, mean_interval
 from sortie.sim.experiment.rows import CampaignRows, sign
-from sortie.sim.results.outcome_fields import possible
+from sortie.sim.results.outcome import possible
 
 
 @dataclass(frozen=True, slots=True)

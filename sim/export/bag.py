@@ -48,9 +48,9 @@ from sortie.sim.export.scene_markers import MARKERS, TOWN, SceneMarkers, Timed
 from sortie.sim.export.telemeter import Telemeter
 from sortie.sim.export.topics import CONTEXT, Topic, TopicKind
 from sortie.sim.folders import writing
-from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words, event_in_words
+from sortie.sim.results.transitions import transitions
 
 POSE, TF, BATTERY, LOG, FIX, CLOCK = (
     "geometry_msgs/msg/PoseStamped",

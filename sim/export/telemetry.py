@@ -25,9 +25,9 @@ from sortie.sim.export.endpoint import open_address
 from sortie.sim.export.origin import origin_of
 from sortie.sim.export.telemeter import Telemeter
 from sortie.sim.folders import RunError
-from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.sentences import decision_in_words, event_in_words
+from sortie.sim.results.transitions import transitions
 
 MARK = "simulated flight, written by Sortie"
 """What each drone says first in a log."""

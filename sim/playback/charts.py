@@ -24,12 +24,12 @@ from sortie.sim.playback.links import LinkMatrix
 from sortie.sim.results import links, palette
 from sortie.sim.results.accuracy_table import WINDOW_S
 from sortie.sim.results.link_traffic import mean_goodput
-from sortie.sim.results.outcome import transitions
 from sortie.sim.results.palette import Floats
 from sortie.sim.results.record import TABLES
 from sortie.sim.results.sentences import decision_in_words, event_in_words
 from sortie.sim.results.sightings import Sighting
 from sortie.sim.results.traffic import settled
+from sortie.sim.results.transitions import transitions
 
 MARKED = ("ap", "battery", "goodput", "traffic", "age", "lost", "medium")
 """Plots in which phase changes and events are marked."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +15,11 @@ from numpy.typing import NDArray
 from sortie.perception.classes import CAR, TargetClass
 from sortie.perception.metrics.ap import Judged, Matched, average_precision, judge
 from sortie.perception.types import Boxes
+from sortie.scenarios.plugins.reference import is_file
 from sortie.sim.results.box_rows import Columns, Key, columns_of, fusion_blocks, fusions_of, kinds_of
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
+from sortie.sim.results.section import Count, Flown, Hertz, OutcomeSection, Share, figure, once
 from sortie.sim.results.spool import InTime
 
 Both = dict[str, dict[Key, Matched]]
@@ -31,11 +34,6 @@ def matched(record: SortieRecord, *, mission: bool, begin_s: float = 0.0) -> dic
         mission: count the mission disc alone, and only fusions made while there is one.
     """
     return score(record, [CAR], begin_s).pools[CAR, MISSION if mission else FULL_SCENE].by_fusion()
-
-
-def accuracy(record: SortieRecord, begin_s: float = 0.0, end_s: float = float("inf")) -> dict[str, float | None]:
-    """AP@0.5 of cars in the full scene and in the mission disc, pooled over egos and scored frames; null without any."""
-    return score(record, [CAR]).ap(CAR, begin_s, end_s)
 
 
 def both_matched(record: SortieRecord) -> Both:
@@ -105,6 +103,84 @@ class Scored:
             every = sought + self.grounded[scope]
             blind[scope] = sought / every * (ap or 0.0) if every else None
         return blind
+
+
+class Accuracy(OutcomeSection):
+    full_scene: Share | None = figure(
+        "AP@0.5 over all targets within range, pooled over egos and scored fusions; of vehicles by rotated BEV IoU."
+    )
+    mission: Share | None = figure("The same within the mission disc, while there is one: by the centres of boxes.")
+
+
+class Ap50(Accuracy):
+    detector: str = figure("`perception.detector`, or of one that was passed its `name`, or module and class.")
+    fusion: str | None = figure("`perception.fusion` or `recorded_fusion`; null where another detector flew.")
+    calibration: str | None = figure("Which fit a surrogate detector is of.")
+    grounded_blind: Accuracy = figure(
+        "The same with every drone that left the air, or has not joined yet, counted as blind: at each scored instant "
+        "it detects nothing, and the cars about the place that it would have in the formation count as missed. Equal "
+        "where all fly to the end."
+    )
+    sample_rate_hz: Hertz = figure("Accuracy is sampled at this rate while traffic runs at the full one.")
+    scored_fusions: Count = figure("How many fusions were scored.")
+    scored_drones: Count = figure(
+        "How many drones are scored at each scored instant (`perception.egos`), 0 without a detector. Where they are "
+        "fewer than `scorable_drones`, drones take turns in a random order, and accuracy is an estimate for the whole "
+        "fleet."
+    )
+    scorable_drones: Count = figure("How many drones may be scored: all but ground stations that are not.")
+
+    @classmethod
+    def compute(cls, flown: Flown) -> dict[str, Any]:
+        record, scenario = flown.record, flown.scenario
+        return {
+            **scored(flown).ap(CAR),
+            "detector": record.detector,
+            "fusion": _fusion(record),
+            "calibration": record.calibration,
+            "grounded_blind": scored(flown).grounded_blind(),
+            "sample_rate_hz": min(scenario.perception.sample_rate_hz, scenario.context.rate_hz),
+            "scored_fusions": flown.tables["fusions"].num_rows,
+            "scored_drones": 0 if record.detector == "none" else scenario.scored_drones,
+            "scorable_drones": len(scenario.scorable_drones),
+        }
+
+
+def _fusion(record: SortieRecord) -> str | None:
+    """What fuses payloads, as the scenario names it; None where a detector flew that the scenario does not name."""
+    section = record.scenario.perception
+    fuses = record.detector == section.detector != "none" and not is_file(section.detector)
+    return (section.recorded_fusion or section.fusion) if fuses else None
+
+
+class ByClass(OutcomeSection):
+    car: Accuracy = figure("The same as `ap50`.")
+    truck: Accuracy = figure("Trucks, likewise. The shipped detectors call every vehicle a car.")
+    person: Accuracy = figure(
+        "People, by distance: a box may be of a person within 2 m of it. Boxes are those of the ego's own thermal "
+        "camera joined with those that its peers sent; everybody in the ego's square counts, hidden or not."
+    )
+
+    @classmethod
+    def compute(cls, flown: Flown) -> dict[str, dict[str, float | None]]:
+        """The figures of a sortie; null of classes that drones do not look for."""
+        wanted = _looked_for(flown)
+        return {
+            kind.name.lower(): scored(flown).ap(kind) if kind in wanted else dict.fromkeys((FULL_SCENE, MISSION))
+            for kind in TargetClass
+        }
+
+
+def _looked_for(flown: Flown) -> list[TargetClass]:
+    """The classes that drones look for; none where cars are the only one, as `ap50` says it."""
+    classes = flown.scenario.perception.classes
+    return [kind for kind in TargetClass if len(classes) > 1 and kind.name.lower() in classes]
+
+
+@once
+def scored(flown: Flown) -> Scored:
+    """The fusions of a sortie, matched for cars and for all classes that drones look for."""
+    return score(flown.record, [CAR, *(kind for kind in _looked_for(flown) if kind != CAR)])
 
 
 def score(record: SortieRecord, kinds: Sequence[TargetClass], begin_s: float = 0.0) -> Scored:

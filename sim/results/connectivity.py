@@ -16,24 +16,49 @@ from sortie.scenarios.disc import LISTED_IDS
 from sortie.sim.results import links
 from sortie.sim.results.graph import edges_of, rows_at
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.section import Amount, Count, Flown, Mbps, OutcomeSection, Seconds, Share, figure
 
 SAMPLE_S = 10.0
 
 
-def connectivity_outcome(record: SortieRecord) -> dict[str, Any]:
-    """The section `connectivity` of the outcome; null without links, and where fewer than two drones ever fly."""
-    looks = list(_looks(record)) if links.TABLE in record.tables else []
-    hops = [look.hops for look in looks if look.hops is not None]
-    worst = min((look.bottleneck for look in looks if look.bottleneck), key=lambda edge: edge[2], default=None)
-    share = sum(look.connected for look in looks) / len(looks) if looks else None
-    cut_by = Counter(drone for look in looks for drone in look.articulation)
-    return {
-        "connected_share": share,
-        "partitioned_s": None if share is None else (1.0 - share) * record.scenario.duration_s,
-        "mean_hops": sum(hops) / len(hops) if hops else None,
-        "bottleneck": dict(zip(("sender", "receiver", "mbps"), worst or (None, None, None), strict=True)),
-        "articulation": {str(drone): cut_by[drone] / len(looks) for drone in sorted(cut_by)},
-    }
+class Bottleneck(OutcomeSection):
+    sender: Count | None = figure("Whose link it is.")
+    receiver: Count | None = figure("To whom.")
+    mbps: Mbps | None = figure("What it would carry alone on the channel.")
+
+
+class ConnectivityOutcome(OutcomeSection):
+    """Null without links, and where fewer than two drones ever fly."""
+
+    connected_share: Share | None = figure("Share of the moments at which all drones that fly reach each other.")
+    partitioned_s: Seconds | None = figure("The rest of them, as time: for how long the fleet was in parts.")
+    mean_hops: Amount | None = figure(
+        "Links on the shortest route, the mean over all pairs with one; in fleets of more than 200 drones from some "
+        "200 of them."
+    )
+    bottleneck: Bottleneck = figure(
+        "The link that limited the worst-off pair that was connected, at the worst moment. Null in fleets of more than "
+        "200 drones."
+    )
+    articulation: dict[str, Share] = figure(
+        "Share of the moments at which the fleet, or its part, would have fallen apart without the drone; of drones "
+        "with any."
+    )
+
+    @classmethod
+    def compute(cls, flown: Flown) -> dict[str, Any]:
+        looks = list(_looks(flown.record)) if links.TABLE in flown.tables else []
+        hops = [look.hops for look in looks if look.hops is not None]
+        worst = min((look.bottleneck for look in looks if look.bottleneck), key=lambda edge: edge[2], default=None)
+        share = sum(look.connected for look in looks) / len(looks) if looks else None
+        cut_by = Counter(drone for look in looks for drone in look.articulation)
+        return {
+            "connected_share": share,
+            "partitioned_s": None if share is None else (1.0 - share) * flown.scenario.duration_s,
+            "mean_hops": sum(hops) / len(hops) if hops else None,
+            "bottleneck": dict(zip(Bottleneck.model_fields, worst or (None, None, None), strict=True)),
+            "articulation": {str(drone): cut_by[drone] / len(looks) for drone in sorted(cut_by)},
+        }
 
 
 def _looks(record: SortieRecord) -> Iterator[Connectivity]:

@@ -25,6 +25,7 @@ from sortie.policies.registry import describe_error
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.sim.results.arrow_types import columns_of, from_table, to_table
+from sortie.sim.results.section import Count, Flown, OutcomeSection, Seconds, Share, figure
 from sortie.sim.results.views import Decision
 
 TABLE = "disagreement"
@@ -77,8 +78,34 @@ def pairs_of(table: pa.Table) -> list[Pair]:
     return from_table(Pair, table)
 
 
+class Causes(OutcomeSection):
+    roster: Share | None = figure("One of them has not heard a drone.")
+    trust: Share | None = figure("One of them doubts a drone.")
+    values: Share | None = figure("They read one descriptor differently: its author does not believe its own lie.")
+    descriptor: Share | None = figure("One of them has a later descriptor of a drone, with other contents.")
+    age: Share | None = figure("A descriptor is too old for one of them: packets were lost, or clocks differ.")
+
+
+class Disagreement(OutcomeSection):
+    share: Share | None = figure(
+        "Share of the time in which two drones' views lead to different directives for a link, over all pairs of "
+        "drones and all links. Both take the policy of the link's source, and put the source in the ego's place. A "
+        "disc that moved by less than damping ignores is no difference."
+    )
+    sends_share: Share | None = figure("The part of it in episodes where one would send and the other would not.")
+    episodes: Count | None = figure("How often such a disagreement began, for one pair and link.")
+    mean_s: Seconds | None = figure("How long one lasts on average, in whole frames.")
+    p99_s: Seconds | None = figure("99th percentile of that.")
+    longest_s: Seconds | None = figure("The longest.")
+    causes: Causes = figure("The share by cause: which difference between views must go for choices to agree.")
+
+    @classmethod
+    def compute(cls, flown: Flown) -> dict[str, Any]:
+        return figures(pairs_of(flown.tables[TABLE]) if TABLE in flown.tables else ())
+
+
 def figures(pairs: Iterable[Pair]) -> dict[str, Any]:
-    """The outcome's figures (`sortie.sim.results.outcome_fields.Disagreement`); all null where nothing was compared."""
+    """The figures of `Disagreement`; all null where nothing was compared."""
     pairs = list(pairs)
     compared_s = plain_sum(pair.compared_s for pair in pairs)
     episodes = [episode for pair in pairs for episode in pair.episodes]

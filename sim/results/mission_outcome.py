@@ -1,7 +1,7 @@
 """Figures of the mission as a whole: who flew, and what of the region and the target the fleet saw.
 
 Accuracy covers the drones that still fly. A fleet that loses drones may keep its accuracy and miss its mission, and these
-figures show it. `sortie.sim.results.outcome_fields.MissionOutcome` defines each of them.
+figures show it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from sortie.perception.geometry import FULL, USUAL, Cameras, Lens, camera_margin
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.scene.traffic import TARGET_SIZE_M, TargetPath
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.section import INSTANT_S, Flown, OutcomeSection, Seconds, Share, figure
 from sortie.sim.results.spool import batches, in_blocks
 
 Floats = NDArray[np.float64]
@@ -34,30 +35,46 @@ FOUND_IOU = 0.5
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 BLOCK_FRAMES = 512
 """Frames worked out at once."""
-_INSTANT_S = 1e-6
 
 
-def mission_outcome(record: SortieRecord) -> dict[str, float | None]:
-    """The section `mission` of the outcome."""
-    n = record.scenario.fleet.drones
-    t_s, flying, looked = _flown(record.tables, n)
-    width_s = np.diff(t_s, append=record.scenario.duration_s)
-    looking = flying & _lately(looked, _frames_a_look(record))
-    groups = _groups(record.tables["mission"])
-    tracks = _tracked(groups, len(t_s))
-    in_view, region_share = _seen(record, groups, tracks, looking, t_s)
-    in_view_share, out_of_view_s = _share_and_gap((in_view[k], tracked, width_s) for k, (_, tracked) in tracks.items())
-    detected_share, undetected_s = _detected(record, t_s, {k: tracked for k, (_, tracked) in tracks.items()})
-    return {
-        "flown_share": _flown_share(
-            np.delete(flying, [s.drone for s in record.scenario.fleet.ground], axis=1), width_s
-        ),
-        "region_observed_share": region_share,
-        "target_in_view_share": in_view_share,
-        "target_longest_out_of_view_s": out_of_view_s,
-        "target_detected_share": detected_share,
-        "target_longest_undetected_s": undetected_s,
-    }
+class MissionOutcome(OutcomeSection):
+    flown_share: Share = figure("Share of drone-seconds flown, without ground stations: 1 where all fly to the end.")
+    region_observed_share: Share | None = figure(
+        "Share of the mission region's area in view, averaged over the time in which there is a region. A place is in "
+        "view where it lies in the picture of one of the five cameras of a drone, on flat ground without houses and "
+        "trees, and in the square of the drone's feature map. The drone flies, and its perception ran within the last "
+        "second."
+    )
+    target_in_view_share: Share | None = figure("Share of phase `track` with the target's place in view, as above.")
+    target_longest_out_of_view_s: Seconds | None = figure("Longest gap in phase `track`: the target is in no view.")
+    target_detected_share: Share | None = figure(
+        "Share of the time of phase `track` in which a box of at least one drone overlaps the target with an IoU of at "
+        "least 0.5. Each scored instant stands for its scoring period. Null where drones take turns at being scored: a "
+        "drone that is not scored may have the target."
+    )
+    target_longest_undetected_s: Seconds | None = figure("Longest gap in phase `track`: the target is in no box.")
+
+    @classmethod
+    def compute(cls, flown: Flown) -> dict[str, float | None]:
+        record, n = flown.record, flown.scenario.fleet.drones
+        t_s, flying, looked = _flown(record.tables, n)
+        width_s = np.diff(t_s, append=record.scenario.duration_s)
+        looking = flying & _lately(looked, _frames_a_look(record))
+        groups = _groups(record.tables["mission"])
+        tracks = _tracked(groups, len(t_s))
+        in_view, region_share = _seen(record, groups, tracks, looking, t_s)
+        tracked = {k: now for k, (_, now) in tracks.items()}
+        in_view_share, out_of_view_s = _share_and_gap((in_view[k], now, width_s) for k, now in tracked.items())
+        detected_share, undetected_s = _detected(record, t_s, tracked)
+        in_the_air = np.delete(flying, [station.drone for station in record.scenario.fleet.ground], axis=1)
+        return {
+            "flown_share": _flown_share(in_the_air, width_s),
+            "region_observed_share": region_share,
+            "target_in_view_share": in_view_share,
+            "target_longest_out_of_view_s": out_of_view_s,
+            "target_detected_share": detected_share,
+            "target_longest_undetected_s": undetected_s,
+        }
 
 
 def _flown_share(flying: Bools, width_s: Floats) -> float:
@@ -195,7 +212,7 @@ def _detected(record: SortieRecord, frame_s: Floats, tracked: dict[int, Bools]) 
         return None, None
     instants = np.array(scenario.scored_frames) * scenario.frame_s + scenario.perception.fusion_delay_s
     periods_s = np.array([period.start for period in scenario.scoring_periods]) * scenario.frame_s
-    flown = instants < scenario.duration_s - _INSTANT_S
+    flown = instants < scenario.duration_s - INSTANT_S
     instants, lasts_s = instants[flown], np.diff(periods_s, append=scenario.duration_s)[flown]
     size_m = TARGET_SIZE_M[:2]
     paths = {k: TargetPath.of(scenario.mission.targets[k]) for k in tracked}
@@ -208,12 +225,12 @@ def _detected(record: SortieRecord, frame_s: Floats, tracked: dict[int, Bools]) 
         if not batch.num_rows:
             continue
         at_s, *box = (column.to_numpy() for column in batch.columns)
-        found, of = np.stack(box, axis=-1), np.searchsorted(instants, at_s - _INSTANT_S)
+        found, of = np.stack(box, axis=-1), np.searchsorted(instants, at_s - INSTANT_S)
         here = slice(int(of.min()), int(of.max()) + 1)
         for k, truth in truths.items():
             _, which, iou = overlapping(found, truth[here], of, np.arange(len(instants))[here])
             hit[k][here][which[iou >= FOUND_IOU]] = True
-    frame = np.searchsorted(frame_s, instants + _INSTANT_S, side="right") - 1
+    frame = np.searchsorted(frame_s, instants + INSTANT_S, side="right") - 1
     return _share_and_gap((hit[k], now[frame], lasts_s) for k, now in tracked.items())
 
 

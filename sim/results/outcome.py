@@ -1,291 +1,320 @@
-"""The outcome of a sortie: the values of outcome.json, computed from the record.
+"""The outcome of a sortie: the values of outcome.json, each computed from the record when it is first read.
 
-Everything here is computed from the record's tables, piece after piece: they may be larger than memory. `outcome.md` beside this file lists
-every field.
+Everything is computed from the record's tables, piece after piece: they may be larger than memory. `outcome.md` beside
+this file lists every field.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
+import functools
+import math
+from collections import UserDict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-from numpy.typing import NDArray
+from sortie.fleet.energy.battery import CAUSES, RECORDED
+from sortie.fleet.messages.auth import DropReason
+from sortie.radio.transmission import Status
+from sortie.scenarios.intervals import FLAG, Range
+from sortie.scenarios.reading.nodes import nearest
+from sortie.sim.folders import RunError
+from sortie.sim.results.outcome_fields import FIGURES, WALL, Outcome
+from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.section import Flown
+from sortie.sim.results.traffic import REASONS
 
-from sortie.perception.classes import CAR, TargetClass
-from sortie.policies.verification.enforced import CAUSES
-from sortie.radio.counters import CAUSES as LOSS_CAUSES
-from sortie.scenarios.plugins.reference import is_file
-from sortie.scenarios.representation import CELL_NAMES
-from sortie.sim.results import disagreement
-from sortie.sim.results.accuracy import FULL_SCENE, MISSION, Scored, score
-from sortie.sim.results.connectivity import connectivity_outcome
-from sortie.sim.results.mission_outcome import mission_outcome
-from sortie.sim.results.people_outcome import people_outcome
-from sortie.sim.results.record import DECISIONS_OF, VIOLATIONS_OF, SortieRecord
-from sortie.sim.results.selection import Pieces, percentiles
-from sortie.sim.results.spool import batches
-from sortie.sim.results.tracking_outcome import tracking_outcome
-from sortie.sim.results.traffic import Span, Traffic, feature_payload_p50, traffic
-
-_INSTANT_S = 1e-6
-"""A frame begins a few digits beside the time that a scenario names."""
+_LATER = object()
+"""Stands in an outcome for a figure that nobody has read yet."""
 
 
-def outcome(record: SortieRecord) -> dict[str, Any]:
-    """All figures of one sortie, JSON-ready; ratios of nothing are null."""
-    tables, totals = record.tables, record.totals
-    phases = list(_phases(record))
-    sent, *by_phase = traffic(tables, [span for span, _ in phases])
-    data_sent = sent.sent_bytes
-    context_bytes = totals["context_descriptor_bytes"] + totals["context_directive_bytes"]
-    scenario = record.scenario
-    minutes = scenario.duration_s / 60.0
-    links = scenario.fleet.drones * (scenario.fleet.drones - 1)
-    switched = list(transitions(tables["directives"], {}))
-    looked_for = _looked_for(scenario.perception.classes)
-    scored = score(record, [CAR, *(kind for kind in looked_for if kind != CAR)])
-    drones = _drones(tables["states"], tables["energy"], scenario.fleet.drones, scored)
-    return {
-        "scenario": scenario.name,
-        "policy": record.policy,
-        "seed": record.seed,
-        "replication": record.replication,
-        "version": record.version,
-        "own_files": dict(record.own_files),
-        "fingerprint": record.fingerprint,
-        "duration_s": scenario.duration_s,
-        "frame_s": scenario.frame_s,
-        "ap50": {
-            **scored.ap(CAR),
-            "detector": record.detector,
-            "fusion": _fusion(record),
-            "calibration": record.calibration,
-            "grounded_blind": scored.grounded_blind(),
-            "sample_rate_hz": min(scenario.perception.sample_rate_hz, scenario.context.rate_hz),
-            "scored_fusions": tables["fusions"].num_rows,
-            "scored_drones": 0 if record.detector == "none" else scenario.scored_drones,
-            "scorable_drones": len(scenario.scorable_drones),
-        },
-        "ap_by_class": _by_class(scored, looked_for),
-        "tracking": tracking_outcome(record),
-        "mission": mission_outcome(record),
-        "people": people_outcome(record),
-        "bytes": {
-            "context_sent": int(context_bytes),
-            "context_descriptors": int(totals["context_descriptor_bytes"]),
-            "context_directives": int(totals["context_directive_bytes"]),
-            "data_sent": data_sent,
-            "handshakes_sent": sent.handshake_bytes,
-            **{f"data_{status}": count for status, count in sent.bytes_by_status().items()},
-        },
-        "context": _context(tables["receptions"], 0.0, scenario.duration_s),
-        "connectivity": connectivity_outcome(record),
-        "context_share": _ratio(context_bytes, context_bytes + data_sent),
-        "data_rate_mbps": data_sent * 8e-6 / scenario.duration_s,
-        "deadline_miss_rate": sent.miss_rate(),
-        "payload_fates": sent.fates(),
-        "medium_busy_fraction": totals["medium_busy_fraction"],
-        "age_s": _p50_p99(lambda: _column(tables, "ages", "age_s")),
-        "data_age_s": _p50_p99(lambda: _flat(tables, "fusions", "ages_s")),
-        "data_age_mean_s": pc.mean(
-            pa.array(np.concatenate([np.zeros(0), *_flat(tables, "fusions", "ages_s")]))
-        ).as_py(),
-        "descriptor_drops": _counts(tables, "drops", "reason"),
-        "battery": {d: v["soc"] for d, v in drones.items()},
-        "drones": drones,
-        "energy_j": _energy(tables["energy"]),
-        "policies": {
-            "decisions": {k.removeprefix(DECISIONS_OF): v for k, v in totals.items() if k.startswith(DECISIONS_OF)},
-            "changes": totals["policy_changes"],
-            "shield_interventions": totals["shield_interventions"],
-            "invariant_violations": totals["invariant_violations"],
-            "violated_ticks": totals["violated_ticks"],
-            "violations_by_cause": {c.replace(" ", "_"): totals[f"{VIOLATIONS_OF}{c}"] for c in CAUSES},
-        },
-        "switches": sum(len(c["peers"]) for c in switched) / (links * minutes) if links else None,
-        "transitions": switched,
-        "phases": [
-            _phase(record, scored, payloads, span, name)
-            for payloads, (span, name) in zip(by_phase, phases, strict=True)
-        ],
-        "distrusted_by": _distrusted_by(tables),
-        "events": tables["events"].to_pylist(),
-        "disagreement": disagreement.figures(
-            disagreement.pairs_of(tables[disagreement.TABLE]) if disagreement.TABLE in tables else ()
-        ),
-        "metrics": dict(record.metrics),
-        "policy_eval_us": {
-            "p50": record.wall.get("policy_eval_us_p50"),
-            "p99": record.wall.get("policy_eval_us_p99"),
-        },
-        "wall_s": record.wall.get("wall_s"),
-        "realtime_factor": _ratio(scenario.duration_s, record.wall.get("wall_s", 0.0)),
-    }
+def outcome(record: SortieRecord) -> OutcomeDict:
+    """All figures of one sortie, JSON-ready; ratios of nothing are null. A field is computed when it is first read."""
+    return OutcomeDict(dict.fromkeys(Outcome.model_fields, _LATER), Flown(record))
 
 
-# --- traffic, decisions, energy ------------------------------------------------------------------
+class OutcomeDict(dict[str, Any]):
+    """An outcome as a dictionary of plain dictionaries, lists and numbers, as in `outcome.json`.
 
-
-def _sum(column: pa.ChunkedArray) -> int:
-    return int(pc.sum(pc.cast(column, pa.int64())).as_py() or 0)
-
-
-def _ratio(part: float, whole: float) -> float | None:
-    return part / whole if whole else None
-
-
-def _column(tables: Mapping[str, pa.Table], name: str, column: str) -> Iterator[NDArray[np.float64]]:
-    """A table's column, piece after piece."""
-    return (batch.column(0).to_numpy() for batch in batches(tables, name, [column]))
-
-
-def _flat(tables: Mapping[str, pa.Table], name: str, column: str) -> Iterator[NDArray[np.float64]]:
-    """The values in a column of lists, piece after piece."""
-    return (batch.column(0).flatten().to_numpy() for batch in batches(tables, name, [column]))
-
-
-def _p50_p99(pieces: Pieces) -> dict[str, float | None]:
-    found = percentiles(pieces, (50.0, 99.0))
-    return dict.fromkeys(("p50", "p99")) if found is None else dict(zip(("p50", "p99"), found, strict=True))
-
-
-def _counts(tables: Mapping[str, pa.Table], name: str, column: str) -> dict[str, int]:
-    """How often each value stands in a column, in the order in which they first come."""
-    counts: Counter[str] = Counter()
-    for batch in batches(tables, name, [column]):
-        for each in pc.value_counts(batch.column(0)).to_pylist():
-            counts[str(each["values"])] += each["counts"]
-    return dict(counts)
-
-
-def _looked_for(classes: Sequence[str]) -> list[TargetClass]:
-    """The classes that drones look for; none where cars are the only one, as `ap50` says it."""
-    return [kind for kind in TargetClass if len(classes) > 1 and kind.name.lower() in classes]
-
-
-def _by_class(scored: Scored, looked_for: Sequence[TargetClass]) -> dict[str, dict[str, float | None]]:
-    """AP of each class that drones look for; null of others."""
-    return {
-        kind.name.lower(): scored.ap(kind) if kind in looked_for else dict.fromkeys((FULL_SCENE, MISSION))
-        for kind in TargetClass
-    }
-
-
-def _fusion(record: SortieRecord) -> str | None:
-    """What fuses payloads, as the scenario names it; None where a detector flew that the scenario does not name."""
-    section = record.scenario.perception
-    fuses = record.detector == section.detector != "none" and not is_file(section.detector)
-    return (section.recorded_fusion or section.fusion) if fuses else None
-
-
-def _distrusted_by(tables: Mapping[str, pa.Table]) -> dict[str, int]:
-    """For each doubted drone, how many drones doubted it."""
-    pairs = {
-        (row["peer"], row["drone"])
-        for batch in batches(tables, "trust", ["drone", "peer", "trust"])
-        for row in batch.to_pylist()
-        if row["trust"] < 1.0
-    }
-    return {str(peer): sum(p == peer for p, _ in pairs) for peer in sorted({p for p, _ in pairs})}
-
-
-def _context(receptions: pa.Table, begin_s: float, end_s: float) -> dict[str, Any]:
-    """Shares of descriptor receptions that were lost, in frames that begin from `begin_s` to before `end_s`."""
-    t_s = receptions["t_s"].to_numpy() + _INSTANT_S
-    within = receptions.filter(pa.array((begin_s <= t_s) & (t_s < end_s)))
-    lost = {cause: _sum(within[cause]) for cause in LOSS_CAUSES}
-    every = _sum(within["heard"]) + sum(lost.values())
-    return {
-        "lost": _ratio(sum(lost.values()), every),
-        "lost_to": {cause: _ratio(count, every) for cause, count in lost.items()},
-    }
-
-
-def _drones(states: pa.Table, energy: pa.Table, drones: int, scored: Scored) -> dict[str, dict[str, Any]]:
-    """Each drone at the end, the energy it spent, and how well it saw."""
-    last = states.slice(max(0, states.num_rows - drones))
-    spent = np.zeros(drones)
-    np.add.at(spent, energy["drone"].to_numpy(), energy["energy_j"].to_numpy())
-    return {
-        str(row["drone"]): {
-            **{name: row[name] for name in ("soc", "voltage_v", "airborne")},
-            "energy_j": float(spent[row["drone"]]),
-            "ap50": {scope: scored.pools[CAR, scope].ap_of(row["drone"]) for scope in (FULL_SCENE, MISSION)},
-        }
-        for row in last.to_pylist()
-    }
-
-
-def _energy(energy: pa.Table) -> dict[str, float]:
-    by_cause = energy.group_by("cause", use_threads=False).aggregate([("energy_j", "sum")])
-    return {
-        **{row["cause"]: row["energy_j_sum"] for row in by_cause.to_pylist()},
-        "total": float(pc.sum(energy["energy_j"]).as_py() or 0.0),
-    }
-
-
-def describe(row: dict[str, Any]) -> str:
-    """A directive in words: `features ρ=0.25 at 10 Hz in 32 m`."""
-    if row["representation"] == "none" or row["rate_hz"] <= 0:
-        return "nothing"
-    budget = f" ρ={row['rho']:.3g}" if row["representation"] in CELL_NAMES else ""
-    roi = "" if np.isnan(row["roi_radius_m"]) else f" in {row['roi_radius_m']:.0f} m"
-    return f"{row['representation']}{budget} at {row['rate_hz']:g} Hz{roi}"
-
-
-def changes(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[tuple[dict[str, Any], str, str]]:
-    """The directives that change what their link carries (a disc that moves is no change), with what before and after.
-
-    `carried` is what each (drone, peer) carried before. It is brought up to date when the next change is asked for.
+    Example:
+        >>> read = OutcomeDict({"ap50": {"mission": 0.5, "fusion": None}, "battery": {"0": 0.9}})
+        >>> read["ap50"]["mission"], read.get("ap50.mission"), read.get("ap50.hota", "nothing"), read.flat()
+        (0.5, 0.5, 'nothing', {'ap50.mission': 0.5, 'battery.0': 0.9})
     """
-    for row in chain.from_iterable(batch.to_pylist() for batch in directives.to_batches()):
-        link, level = (row["drone"], row["peer"]), describe(row)
-        before = carried.get(link, "nothing")
-        if level != before:
-            yield row, before, level
-            carried[link] = level
+
+    def __init__(self, values: Mapping[str, Any] | Iterable[tuple[str, Any]] = (), flown: Flown | None = None) -> None:
+        """Args: `flown` is what values that stand for later are computed from."""
+        super().__init__(values)
+        self._flown = flown
+
+    def __getitem__(self, name: str) -> Any:
+        value = super().__getitem__(name)
+        if value is _LATER and self._flown is not None:
+            self[name] = value = FIGURES[name](self._flown)
+        return value
+
+    def __iter__(self) -> Iterator[str]:
+        return super().__iter__()  # without this, dict() and ** would copy what lies in memory, values for later too
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """A figure by its name, which may have dots: `ap50.mission`. A count that is not there is 0."""
+        try:
+            return self.at(name)
+        except KeyError:
+            return default
+
+    def at(self, name: str) -> Any:
+        """A figure by its name with dots; list items by number. A count that is not there is 0.
+
+        Raises:
+            KeyError: no such field, naming the fields that there are.
+        """
+        value: Any = self
+        parts = name.split(".")
+        for depth, part in enumerate(parts):
+            if isinstance(value, list) and part.isdigit() and int(part) < len(value):
+                value = value[int(part)]
+            elif isinstance(value, dict) and part in value:
+                value = value[part]
+            elif is_zero_count(name, self._drones):
+                return 0
+            else:
+                known = f"0 … {len(value) - 1}" if isinstance(value, list) else "nothing"
+                known = ", ".join(value) if isinstance(value, dict) else known
+                where = ".".join(parts[:depth]) or "the outcome"
+                raise KeyError(f"{name}: {where} has no {part!r}, it has {known}")
+        return value
+
+    def number(self, name: str) -> float | None:
+        """A figure as a number; None where this flight has none, 0 of a count. Another flight may have one."""
+        try:
+            value = self.at(name)
+        except KeyError:
+            return lacking(name, self._drones)
+        return float(value) if value is not None and math.isfinite(value) else None
+
+    def flat(self) -> dict[str, float]:
+        """All numbers by their names with dots; those without a value are left out."""
+        return {name: value for name, value in leaves(self) if is_number(value)}
+
+    def model(self) -> Outcome:
+        """The outcome as a frozen pydantic model, validated.
+
+        Raises:
+            pydantic.ValidationError: a figure is missing, unknown or out of its range.
+        """
+        return Outcome.model_validate(self.data)
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """All values in a plain dictionary. `pprint` prints them, as those of any dictionary that has them as `data`."""
+        return dict(self)
+
+    __repr__ = UserDict.__repr__
+
+    @property
+    def _drones(self) -> int:
+        return len(self["battery"]) if "battery" in self else 0
+
+    def _complete(self) -> None:
+        for name in self:
+            self[name]
+        self._flown = None  # the record may leave memory
+
+    def __reduce__(self) -> Any:
+        return OutcomeDict, (self.data,)
 
 
-def transitions(directives: pa.Table, carried: dict[tuple[int, int], str]) -> Iterator[dict[str, Any]]:
-    """The `changes` of links; those of a drone that change alike in one entry.
+def _with_all_values(name: str) -> Callable[..., Any]:
+    """A method of dictionaries that looks at values, after all of them have been computed."""
+    method = getattr(dict, name)
 
-    The same entries as `outcome.json` has, but in slices: `carried` is what each (drone, peer) carried before and is
-    brought up to date. Each entry comes before the next one's changes are in `carried`.
+    def looking(*outcomes: Any, **options: Any) -> Any:
+        for each in outcomes:
+            if isinstance(each, OutcomeDict):
+                each._complete()
+        return method(*outcomes, **options)
+
+    return looking
+
+
+for _name in ("items", "values", "pop", "popitem", "setdefault", "__eq__", "__ne__"):
+    setattr(OutcomeDict, _name, _with_all_values(_name))
+
+
+def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """All values of an outcome that are no section or list, with their names."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from leaves(inner, f"{name}.{key}" if name else key)
+    elif isinstance(value, list):
+        for k, inner in enumerate(value):
+            yield from leaves(inner, f"{name}.{k}")
+    else:
+        yield name, value
+
+
+def is_number(value: Any) -> bool:
+    """Whether a figure is a number; yes and no are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+# --- names -------------------------------------------------------------------------------------------
+
+Schema = dict[str, Any]
+"""JSON Schema of a field or a section."""
+
+
+@functools.cache
+def outcome_schema() -> Schema:
+    """The outcome's JSON Schema."""
+    return Outcome.model_json_schema()
+
+
+def _resolved(schema: Schema) -> Schema:
+    """A schema without reference; of a field that may be null, that of its value."""
+    schema = next(iter(schema.get("anyOf", [schema])))
+    return outcome_schema()["$defs"][schema["$ref"].rpartition("/")[2]] if "$ref" in schema else schema
+
+
+def fields(schema: Schema | None = None, path: str = "") -> Iterator[tuple[str, Schema, Schema]]:
+    """Every field of a section, those inside it after it: its name, its schema as declared, and that of its value.
+
+    In names `*` stands for each key of an object, and `[]` for each entry of a list.
     """
-    entry: dict[str, Any] | None = None
-    for row, before, level in changes(directives, carried):
-        change = {"t_s": row["t_s"], "drone": row["drone"], "from": before, "to": level, "reason": row["reason"]}
-        if entry is not None and all(entry[k] == v for k, v in change.items()):
-            entry["peers"].append(row["peer"])
-        else:
-            if entry is not None:
-                yield entry
-            entry = {**change, "peers": [row["peer"]]}
-    if entry is not None:
-        yield entry
+    for name, declared in (schema or outcome_schema())["properties"].items():
+        here = _resolved(declared)
+        yield f"{path}{name}", declared, here
+        mark = ".*" if here.get("additionalProperties") else "[]" if "items" in here else ""
+        inner = _resolved(here.get("items") or here.get("additionalProperties") or here)
+        if "properties" in inner:
+            yield from fields(inner, f"{path}{name}{mark}.")
 
 
-def _phases(record: SortieRecord) -> Iterator[tuple[Span, str]]:
-    phases, end_s = record.scenario.mission.phases, record.scenario.duration_s
-    for phase, following in zip(phases, [*phases[1:], None], strict=True):
-        if phase.at_s < end_s:
-            yield (phase.at_s, min(end_s, following.at_s) if following else end_s), phase.phase
+@functools.cache
+def counted() -> tuple[str, ...]:
+    """Where an outcome counts by key: a key that is not there was counted 0 times."""
+    kinds = ((name, here.get("additionalProperties")) for name, _, here in fields())
+    return tuple(name for name, kind in kinds if kind and kind.get("type") == "integer")
 
 
-def _phase(record: SortieRecord, scored: Scored, payloads: Traffic, span: Span, name: str) -> dict[str, Any]:
-    begin_s, end_s = span
+def is_zero_count(name: str, drones: int) -> bool:
+    """Whether a dotted name that an outcome of so many drones does not have is a count of 0; policies are not known here."""
+    section, _, key = name.rpartition(".")
+    return section in counted() and key in open_keys(drones, 0, (), traced=False)[section]
+
+
+def lacking(name: str, drones: int) -> int | None:
+    """What a run of so many drones has of a number that another run has and its own outcome lacks: 0 of a count, but for
+    one of a drone that is not there; else None.
+
+    Example:
+        >>> lacking("distrusted_by.1", 2), lacking("distrusted_by.7", 2), lacking("policies.decisions.silence", 2)
+        (0, None, 0)
+    """
+    of_nobody = name.startswith("distrusted_by.") and not is_zero_count(name, drones)
+    return 0 if name.startswith(tuple(f"{section}." for section in counted())) and not of_nobody else None
+
+
+def open_keys(
+    drones: int, phases: int, policies: Collection[str], *, traced: bool, metrics: Collection[str] = ()
+) -> dict[str, Collection[str]]:
+    """What the objects of an outcome that are open (`*` in the reference) may be keyed by, and how many phases there are.
+
+    Args:
+        drones, phases: at most so many.
+        policies: those that may decide, as the record names them.
+        traced: whether drones may follow a trace.
+        metrics: names of the user's own.
+    """
+    ids = tuple(map(str, range(drones)))
+    part = {Status.PARTIAL: (*REASONS[Status.LOST], *REASONS[Status.EXPIRED])}
     return {
-        "phase": name,
-        "begin_s": begin_s,
-        "end_s": end_s,
-        "ap50": scored.ap(CAR, begin_s, end_s),
-        "context": _context(record.tables["receptions"], begin_s, end_s),
-        "data_rate_mbps": payloads.sent_bytes * 8e-6 / (end_s - begin_s),
-        "feature_payload_bytes": feature_payload_p50(record.tables, span),
-        "deadline_miss_rate": payloads.miss_rate(),
+        "payload_fates": tuple(f"{s}/{r}" if r else str(s) for s, reasons in (REASONS | part).items() for r in reasons),
+        "descriptor_drops": tuple(map(str, DropReason)),
+        "battery": ids,
+        "drones": ids,
+        "connectivity.articulation": ids,
+        "distrusted_by": ids,
+        "energy_j": (*CAUSES, *([RECORDED] if traced else []), "total"),
+        "policies.decisions": tuple(name for name in policies if "." not in name),  # a dot would lead further
+        "phases": tuple(map(str, range(phases))),
+        "metrics": metrics,
+        "own_files": (),  # digests are no numbers
     }
+
+
+def check_number(name: str, keys: Mapping[str, Collection[str]]) -> None:
+    """Hold a dotted name against the reference: some run's outcome may have a number there.
+
+    Args:
+        keys: as `open_keys` gives them; a list that is not among them may be of any length.
+
+    Raises:
+        RunError: it never has one: no such field, wall clock, or no number; with what could have been meant.
+    """
+    if name.partition(".")[0] in WALL:
+        raise RunError(f"{name}: is wall clock, a metric must follow from the run alone")
+    if what := _no_number(kind_at(name, keys)):
+        raise RunError(f"{name}: is {what}, a metric must be a number")
+
+
+def kind_at(name: str, keys: Mapping[str, Collection[str]]) -> Schema:
+    """The kind of a field of an outcome, by its dotted name.
+
+    Args:
+        keys: as `open_keys` gives them; a list that is not among them may be of any length.
+
+    Raises:
+        RunError: no outcome has it; with what could have been meant.
+    """
+    kind, above = outcome_schema(), ""
+    for part in name.split("."):
+        known = kind.get("properties", keys.get(above))
+        below = _below(kind, part)
+        counts = known is None and "items" in kind and part.isdecimal() and part.isascii()
+        if below is None or not (counts or part in (known or ())):
+            raise RunError(f"{name}: {above or 'the outcome'} has no {part!r}, {_instead(kind, part, known)}")
+        kind, above = below, f"{above}.{part}" if above else part
+    return kind
+
+
+def possible(name: str) -> Range:
+    """The values that a metric can have, by its dotted name; any value where the reference does not have it.
+
+    Example:
+        >>> possible("drones.2.soc"), possible("bytes.data_sent")
+        (Range(low=0.0, high=1.0, yes_or_no=False), Range(low=0.0, high=inf, yes_or_no=False))
+    """
+    kind: Schema | None = outcome_schema()
+    for part in name.split("."):
+        kind = None if kind is None else _below(kind, part)
+    if kind is None:
+        return Range()
+    if kind.get("type") == "boolean":
+        return FLAG
+    return Range(float(kind.get("minimum", -math.inf)), float(kind.get("maximum", math.inf)))
+
+
+def _below(kind: Schema, part: str) -> Schema | None:
+    """The kind of what stands under a key or number; None where nothing can."""
+    found = kind.get("properties", {}).get(part) or kind.get("additionalProperties") or kind.get("items")
+    return _resolved(found) if found else None
+
+
+def _instead(kind: Schema, part: str, keys: Collection[str] | None) -> str:
+    """What could have been meant by a key that is not there, or what there is."""
+    what = _no_number(kind)
+    if what in ("", "text"):
+        return f"it is {what or 'a number'}"
+    if what == "a list" and keys is None:
+        return "it has entries by number"
+    known = list(keys or ())
+    if all(key.isdecimal() for key in known):
+        return f"it has {known[0]} … {known[-1]}" if known else "it has none that can be named"
+    near = nearest(part, known)
+    return f"did you mean {near}?" if near else f"it has {', '.join(known)}"
+
+
+def _no_number(kind: Schema) -> str:
+    """What a field is that is no number, in words; empty where it is one."""
+    return {"object": "a section", "array": "a list", "string": "text"}.get(kind["type"], "")

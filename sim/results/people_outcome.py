@@ -1,7 +1,4 @@
-"""Figures about people: what the thermal cameras found, and how well drones knew of people in their regions.
-
-`sortie.sim.results.outcome_fields.PeopleOutcome` defines each of them.
-"""
+"""Figures about people: what the thermal cameras found, and how well drones knew of people in their regions."""
 
 from __future__ import annotations
 
@@ -15,45 +12,61 @@ from numpy.typing import NDArray
 from sortie.perception.classes import NEAR_M, PERSON
 from sortie.perception.metrics.ap import Matched, average_precision, best_pairs, hits
 from sortie.perception.thermal import in_cone
-from sortie.sim.results.outcome_fields import PeopleOutcome
 from sortie.sim.results.record import SortieRecord, classes_in
 from sortie.sim.results.regions import Regions
+from sortie.sim.results.section import INSTANT_S, Flown, OutcomeSection, Seconds, Share, figure
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-_INSTANT_S = 1e-6
 
-
-def people_outcome(record: SortieRecord) -> dict[str, float | None]:
-    """The section `people` of the outcome."""
-    perception = record.scenario.perception
-    if not perception.people and perception.thermal is None:
-        return dict.fromkeys(PeopleOutcome.__annotations__)
-    n, frame_s = record.scenario.fleet.drones, record.scenario.frame_s
-    states = record.tables["states"]
-    t_s = states["t_s"].to_numpy()[::n]
-    fleet = record.scenario.fleet
-    there = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, n))
-    flying = there & [fleet.station(drone) is None for drone in range(n)]
-    people_m = _people(record.tables["people"], len(t_s), len(perception.people))
-    discs = Regions(record.tables["mission"], record.scenario.mission).at(
-        np.repeat(t_s, n), np.tile(range(n), len(t_s))
+class PeopleOutcome(OutcomeSection):
+    ap_2m: Share | None = figure(
+        "AP of people, pooled over drones and frames: what a drone's thermal camera reports, against everybody in its "
+        "cone, hidden or not. A detection may be of a person within 2 m of it. `ap_by_class.person` is that of people "
+        "after sharing."
     )
-    discs = discs.reshape(-1, n, 3)
-    away_m = np.linalg.norm(people_m[:, None] - discs[:, :, None, :2], axis=-1)  # [T, N, people]
-    present = (away_m <= discs[:, :, None, 2]).any(axis=-1) & flying
-    known = _known(record.tables["alerts"], t_s, n, frame_s) & flying
-    without = flying & ~np.isnan(discs[..., 2]) & ~present
-    width_s = np.diff(t_s, append=record.scenario.duration_s)
-    return {
-        "ap_2m": None if perception.thermal is None else _average_precision(record, t_s, flying, people_m),
-        **dict(zip(("located_share", "located_alone_share"), _located(record), strict=True)),
-        "in_region_drone_s": _drone_s(present, width_s),
-        "unknown_share": _share(present & ~known, present, width_s),
-        "unknown_longest_s": _longest_s(present & ~known, width_s) if present.any() else None,
-        "false_alert_share": _share(without & known, without, width_s),
-    }
+    located_share: Share | None = figure(
+        "Of the people in a drone's region at a scored fusion, the share of which the drone had a box within 2 m, its "
+        "own or a peer's."
+    )
+    located_alone_share: Share | None = figure("The same by the drone's own thermal camera in that frame.")
+    in_region_drone_s: Seconds | None = figure("Time with people in regions of flying drones, summed over drones.")
+    unknown_share: Share | None = figure("Share of that time in which the drone did not know it, itself or by peers.")
+    unknown_longest_s: Seconds | None = figure("Longest unbroken time of one drone in which it did not know it.")
+    false_alert_share: Share | None = figure(
+        "Of a drone's time with nobody in its region, the share in which it took somebody to be there."
+    )
+
+    @classmethod
+    def compute(cls, flown: Flown) -> dict[str, float | None]:
+        record, perception = flown.record, flown.scenario.perception
+        if not perception.people and perception.thermal is None:
+            return dict.fromkeys(cls.model_fields)
+        n, frame_s = record.scenario.fleet.drones, record.scenario.frame_s
+        states = record.tables["states"]
+        t_s = states["t_s"].to_numpy()[::n]
+        fleet = record.scenario.fleet
+        there = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, n))
+        flying = there & [fleet.station(drone) is None for drone in range(n)]
+        people_m = _people(record.tables["people"], len(t_s), len(perception.people))
+        discs = Regions(record.tables["mission"], record.scenario.mission).at(
+            np.repeat(t_s, n), np.tile(range(n), len(t_s))
+        )
+        discs = discs.reshape(-1, n, 3)
+        away_m = np.linalg.norm(people_m[:, None] - discs[:, :, None, :2], axis=-1)  # [T, N, people]
+        present = (away_m <= discs[:, :, None, 2]).any(axis=-1) & flying
+        known = _known(record.tables["alerts"], t_s, n, frame_s) & flying
+        without = flying & ~np.isnan(discs[..., 2]) & ~present
+        width_s = np.diff(t_s, append=record.scenario.duration_s)
+        return {
+            "ap_2m": None if perception.thermal is None else _average_precision(record, t_s, flying, people_m),
+            **dict(zip(("located_share", "located_alone_share"), _located(record), strict=True)),
+            "in_region_drone_s": _drone_s(present, width_s),
+            "unknown_share": _share(present & ~known, present, width_s),
+            "unknown_longest_s": _longest_s(present & ~known, width_s) if present.any() else None,
+            "false_alert_share": _share(without & known, without, width_s),
+        }
 
 
 def _located(record: SortieRecord) -> tuple[float | None, float | None]:
@@ -73,7 +86,7 @@ def _located(record: SortieRecord) -> tuple[float | None, float | None]:
         return None, None
     alone = _places(sightings, [round(t / frame_s) for t in sightings["t_s"].to_pylist()])
     joined = _places(boxes, boxes["t_s"].to_pylist())
-    frames = [(int(t / frame_s + _INSTANT_S), d) for t, d in keys]
+    frames = [(int(t / frame_s + INSTANT_S), d) for t, d in keys]
     return _near(here_m, [joined.get(k) for k in keys]), _near(here_m, [alone.get(k) for k in frames])
 
 
@@ -126,7 +139,7 @@ def _known(alerts: pa.Table, t_s: Floats, drones: int, frame_s: float) -> Bools:
     for drone in range(drones):
         mine = whose == drone
         # a drone decides within the frame
-        last = np.searchsorted(at_s[mine], t_s + frame_s - _INSTANT_S, side="right") - 1
+        last = np.searchsorted(at_s[mine], t_s + frame_s - INSTANT_S, side="right") - 1
         out[:, drone] = np.concatenate([known[mine].astype(bool), [False]])[last]  # −1: none yet
     return out
 
@@ -138,7 +151,7 @@ def _average_precision(record: SortieRecord, t_s: Floats, looking: Bools, people
     n = looking.shape[1]
     states, table = record.tables["states"], record.tables["sightings"]
     position = np.stack([states[c].to_numpy() for c in ("x_m", "y_m", "z_m")], axis=-1).reshape(-1, n, 3)
-    frame = np.searchsorted(t_s, table["t_s"].to_numpy() - _INSTANT_S)
+    frame = np.searchsorted(t_s, table["t_s"].to_numpy() - INSTANT_S)
     image = frame * n + table["drone"].to_numpy()
     spots = np.column_stack([table["x_m"].to_numpy(), table["y_m"].to_numpy()])
     score: Any = table["score"].to_numpy()

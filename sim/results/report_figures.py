@@ -22,10 +22,10 @@ from sortie.sim.results import links
 from sortie.sim.results.accuracy import matched
 from sortie.sim.results.accuracy_table import WINDOW_S, accuracy_table
 from sortie.sim.results.link_traffic import mean_goodput
-from sortie.sim.results.outcome import transitions
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
 from sortie.sim.results.sentences import event_in_words
 from sortie.sim.results.traffic import settled
+from sortie.sim.results.transitions import transitions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,6 +22,7 @@ from sortie.scenarios.reading.load import loads
 from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.base import models_of_the_past
 from sortie.sim.results import accuracy_table, beliefs, disagreement, links, rosters, views
+from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import CLASS_COLUMN, OF_CLASSES, TABLES, VIOLATIONS_OF, SortieRecord
 from sortie.sim.results.run_checks import LARGEST, MOST_CHARACTERS, Checks, ensure_boxes, ensure_each_once
 
@@ -56,6 +57,19 @@ _TOTALS = (
     *(f"{VIOLATIONS_OF}{cause}" for cause in CAUSES),
 )
 """Those that the outcome needs."""
+_OF_THE_RECORD = [
+    "scenario",
+    "duration_s",
+    "frame_s",
+    "policy",
+    "seed",
+    "replication",
+    "version",
+    "own_files",
+    "metrics",
+    "fingerprint",
+]
+"""Fields of the outcome that the record has too."""
 
 Text = Annotated[str, Field(max_length=MOST_CHARACTERS)]
 Count = Annotated[float, Field(ge=0, le=LARGEST)]
@@ -157,7 +171,7 @@ def _read_about(path: Path) -> dict[str, Any]:
     return about
 
 
-def _ensure_together(outcome: Mapping[str, Any], record: Any) -> None:
+def _ensure_together(read: Mapping[str, Any], record: SortieRecord) -> None:
     """Refuse files that are not of one run: what `outcome.json` has of the record must be the record's.
 
     The fingerprint is among it, which is computed from all values of the tables.
@@ -165,18 +179,11 @@ def _ensure_together(outcome: Mapping[str, Any], record: Any) -> None:
     Raises:
         ValueError: naming the field that differs.
     """
-    known = {
-        "scenario": record.scenario.name,
-        "duration_s": record.scenario.duration_s,
-        "frame_s": record.scenario.frame_s,
-        **{
-            name: getattr(record, name) for name in ("policy", "seed", "replication", "version", "own_files", "metrics")
-        },
-        "fingerprint": record.fingerprint,
-    }
-    for name, value in known.items():
-        if outcome.get(name, value if name != "fingerprint" else None) != value:
-            raise ValueError(f"outcome.json: {name} is {outcome.get(name)!r:.80}, the other files give {value!r:.80}")
+    known = outcome(record)
+    for name in _OF_THE_RECORD:
+        value = known[name]
+        if read.get(name, value if name != "fingerprint" else None) != value:
+            raise ValueError(f"outcome.json: {name} is {read.get(name)!r:.80}, the other files give {value!r:.80}")
 
 
 def _read_tables(folder: Path, scenario: Scenario) -> dict[str, pa.Table]:

@@ -18,19 +18,27 @@ from sortie.perception.motion import Tracks
 from sortie.perception.tracking.tracker import step
 from sortie.perception.types import Boxes
 from sortie.sim.results.box_rows import Columns, Key, columns_of, fusion_blocks, fusions_of, kinds_of
-from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.section import Flown, OutcomeSection, Share, figure
 from sortie.sim.results.spool import InTime, batches
 
 
-def tracking_outcome(record: SortieRecord) -> dict[str, float | None]:
-    """The section `tracking` of the outcome; null without a detector, a car, or a detector that knows
-    which car is which, and where drones take turns at being scored: a tracker needs all of a drone's boxes."""
-    nothing: dict[str, float | None] = {"hota": None, "det_a": None, "ass_a": None}
-    tables = record.tables
-    if record.scenario.takes_turns or not tables["fusions"].num_rows or not _is_known(tables):
-        return nothing
-    value = hota_of(_followed(tables, record.scenario.fleet.drones, record.scenario.duration_s))
-    return nothing if value is None else value._asdict()
+class TrackingOutcome(OutcomeSection):
+    hota: Share | None = figure(
+        "HOTA (higher order tracking accuracy, Luiten et al. 2021), the mean over 19 limits of overlap, 0.05 to 0.95. "
+        "A tracker follows each drone's boxes after fusion; its confirmed tracks are judged by rotated IoU on the "
+        "ground, over all cars within range. Null where the detector does not know which car is which, and where "
+        "drones take turns at being scored: a tracker needs all boxes of its drone."
+    )
+    det_a: Share | None = figure("DetA, its part that judges detection.")
+    ass_a: Share | None = figure("AssA, its part that judges whether tracks keep to their cars.")
+
+    @classmethod
+    def compute(cls, flown: Flown) -> dict[str, float | None]:
+        tables, scenario = flown.tables, flown.scenario
+        value = None
+        if not scenario.takes_turns and tables["fusions"].num_rows and _is_known(tables):
+            value = hota_of(_followed(tables, scenario.fleet.drones, scenario.duration_s))
+        return dict.fromkeys(cls.model_fields) if value is None else value._asdict()
 
 
 def _is_known(tables: Mapping[str, pa.Table]) -> bool:

@@ -12,14 +12,19 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from sortie.radio.transmission import Status
-from sortie.sim.results.outcome_fields import REASONS
 from sortie.sim.results.record import HANDSHAKE
+from sortie.sim.results.section import Bytes, Flown, OutcomeSection, Span, figure, once
 from sortie.sim.results.selection import percentiles
 from sortie.sim.results.spool import batches
 
 DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
-Span = tuple[float, float]
-"""From a time (inclusive) to another (exclusive)."""
+REASONS = {
+    Status.DELIVERED: ("", "other_feature_space"),
+    Status.LOST: ("fragment_lost", "no_link", "receiver_gone", "sender_gone"),
+    Status.EXPIRED: ("deadline_in_service", "deadline_queued", "replaced"),
+    Status.IN_FLIGHT: ("",),
+}
+"""By fate: the reasons that the radio gives, and that of a payload that its receiver cannot use; what arrived in part has those of what was lost or expired."""
 REST = {reason: status for status in (Status.LOST, Status.EXPIRED) for reason in REASONS[status]}
 """What the rest of a payload that arrived in part came to, by its reason."""
 _BY = ["representation", "status", "reason"]
@@ -91,6 +96,37 @@ class Traffic:
         known = sum(s.payloads for fate, s in payloads if fate.status != Status.IN_FLIGHT)
         missed = sum(s.payloads for fate, s in payloads if fate.reason in REASONS[Status.EXPIRED])
         return missed / known if known else None
+
+
+class BytesOutcome(OutcomeSection):
+    context_sent: Bytes = figure("Descriptors and directives.")
+    context_descriptors: Bytes = figure("Descriptors as sent, 28 B of authentication included.")
+    context_directives: Bytes = figure("Directives at 36 B, counted when they change.")
+    data_sent: Bytes = figure("Payloads handed to the radio: delivered + lost + expired + in flight.")
+    handshakes_sent: Bytes = figure("Requests and answers of methods (`policies.catalogue.prior`), in of `data_sent`.")
+    data_delivered: Bytes = figure("Arrived; of payloads that came in part, that part.")
+    data_lost: Bytes = figure("Lost on the air.")
+    data_expired: Bytes = figure("Past their deadline, or replaced by a newer one before they were through.")
+    data_in_flight: Bytes = figure("On the way at the end.")
+
+    @classmethod
+    def compute(cls, flown: Flown) -> dict[str, int]:
+        sent, totals = traffic_of(flown)[0], flown.record.totals
+        descriptors, directives = (int(totals[f"context_{what}_bytes"]) for what in ("descriptor", "directive"))
+        return {
+            "context_sent": descriptors + directives,
+            "context_descriptors": descriptors,
+            "context_directives": directives,
+            "data_sent": sent.sent_bytes,
+            "handshakes_sent": sent.handshake_bytes,
+            **{f"data_{status}": count for status, count in sent.bytes_by_status().items()},
+        }
+
+
+@once
+def traffic_of(flown: Flown) -> list[Traffic]:
+    """The traffic of a sortie, and then that of each phase of its mission."""
+    return traffic(flown.tables, [span for span, _ in flown.phases])
 
 
 def traffic(tables: Mapping[str, pa.Table], spans: Sequence[Span]) -> list[Traffic]:

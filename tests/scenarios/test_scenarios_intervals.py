@@ -22,7 +22,7 @@ from sortie.scenarios.intervals import (
     percentile_interval,
     resamples,
 )
-from sortie.sim.results.outcome_fields import possible
+from sortie.sim.results.outcome import possible
 
 
 def test_an_interval_without_a_range_is_students() -> None:

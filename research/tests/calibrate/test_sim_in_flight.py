@@ -16,7 +16,8 @@ from sortie.perception.surrogate.model import SHIPPED
 from sortie.scenarios.reading.load import load, load_conditions
 from sortie.scenarios.schema import Scenario
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.accuracy import accuracy, both_matched
+from sortie.sim.results.accuracy import both_matched
+from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 
 
@@ -70,10 +71,10 @@ def test_the_torch_detector_is_asked_what_its_own_sortie_asks(tmp_path: Path) ->
     found = {v.region: v for v in flights(str(path), SHIPPED, None, 0.5, ["all-4"])}
     sets = ["perception.detector=torch", "perception.sample_rate_hz=0.5", "policy.name=all-4", "policy.params={}"]
     scenario = load(path, sets)
-    own = accuracy(run_sortie(scenario))
+    own = outcome(run_sortie(scenario))["ap50"]
     assert found["full_scene"].torch == pytest.approx(own["full_scene"])
     ours = scenario.model_copy(update={"perception": scenario.perception.model_copy(update={"detector": "surrogate"})})
-    assert found["full_scene"].surrogate == pytest.approx(accuracy(run_sortie(ours))["full_scene"])
+    assert found["full_scene"].surrogate == pytest.approx(outcome(run_sortie(ours))["ap50"]["full_scene"])
 
 
 def test_a_set_is_flown_condition_by_condition_within_its_budgets(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from sortie.sim.check.checking import check_scenario, flights
 from sortie.sim.check.expectations import Verdict, check
 from sortie.sim.check.named import not_there
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import outcome
+from sortie.sim.results.outcome import OutcomeDict, outcome
 
 
 def judged(
@@ -36,7 +36,9 @@ def judged(
         "expect_decisions": (expectation,) if of_decisions else (),
     }
     scenario = example().model_copy(update=held)
-    (verdict,) = check(scenario, record or by_hand.record(), result, replications or [])
+    (verdict,) = check(
+        scenario, record or by_hand.record(), OutcomeDict(result), [*map(OutcomeDict, replications or ())]
+    )
     return verdict
 
 
@@ -160,7 +162,7 @@ def test_changes_of_links_are_counted_and_no_others_may_be_beside_them() -> None
     def others(*expected: dict[str, Any]) -> str:
         held = tuple(DecisionExpectation(**(window | each)) for each in expected)
         scenario = example().model_copy(update={"expect_decisions": held, "expect_no_other_changes": True})
-        *_, verdict = check(scenario.model_copy(update={"expect": ()}), record, {})
+        *_, verdict = check(scenario.model_copy(update={"expect": ()}), record, OutcomeDict())
         assert verdict.holds == verdict.got.startswith("0 others")
         return verdict.got
 
@@ -268,7 +270,7 @@ def test_a_bound_over_another_policy_is_of_the_difference_within_pairs() -> None
     wrong = []
     for bound, own, other, holds, got in OVER:
         scenario = example().model_copy(update={"expect": (Expectation(metric="m", over="silence", **bound),)})
-        results, theirs = ([{"m": value} for value in values] for values in (own, other))
+        results, theirs = ([OutcomeDict({"m": value}) for value in values] for values in (own, other))
         (verdict,) = check(scenario, by_hand.record(), results[0], results, {"silence": theirs})
         if verdict.holds is not holds or not verdict.got.startswith(got):
             wrong.append((bound, verdict))
@@ -278,7 +280,7 @@ def test_a_bound_over_another_policy_is_of_the_difference_within_pairs() -> None
 def test_silence_fails_each_paired_expectation_of_the_library() -> None:
     """Silence minus silence is 0 of every metric."""
     paired = {name: [e for e in load(name).expect if e.over is not None] for name in library()}
-    zero = [{"value": 0.0}]
+    zero = [OutcomeDict({"value": 0.0})]
     held = [
         (name, e.metric)
         for name, expectations in paired.items()
@@ -294,7 +296,7 @@ def test_silence_fails_each_paired_expectation_of_the_library() -> None:
     }
 
 
-def judged_over(expectation: Expectation, results: list[dict[str, Any]]) -> Verdict:
+def judged_over(expectation: Expectation, results: list[OutcomeDict]) -> Verdict:
     """The verdict of an expectation where both policies came to the same."""
     scenario = example().model_copy(update={"expect": (expectation,)})
     (verdict,) = check(scenario, by_hand.record(), results[0], results, {str(expectation.over): results})

@@ -13,30 +13,16 @@ from typing import Any
 import pytest
 
 from sortie.scenarios.reading.load import load
+from sortie.sim.check import golden
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 
 GOLDEN = Path(__file__).parent / "golden"
-LEFT_OUT = {"fingerprint", "version", "own_files", "wall_s", "realtime_factor", "policy_eval_us"}
-"""Wall clock, and what changes with every release; figures may differ in the last bits between processors."""
 
 
 def figures(result: dict[str, Any]) -> dict[str, float | str]:
-    """An outcome as flat dotted figures."""
-    flat: dict[str, float | str] = {}
-
-    def walk(prefix: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for key, inner in value.items():
-                walk(f"{prefix}.{key}" if prefix else key, inner)
-        elif isinstance(value, list):
-            for i, inner in enumerate(value):
-                walk(f"{prefix}.{i}", inner)
-        elif value is not None:
-            flat[prefix] = value
-
-    walk("", {k: v for k, v in result.items() if k not in LEFT_OUT})
-    return flat
+    """An outcome as golden files have it, without figures that have no value."""
+    return {name: value for name, value in golden.figures(result).items() if value is not None}
 
 
 def same(name: str, a: float | str, b: float | str, *, network: bool) -> bool:

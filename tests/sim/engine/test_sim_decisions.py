@@ -18,8 +18,9 @@ from sim_examples import PATIENT, example
 
 from sortie.policies.contract import Directive, Disc, FleetView, Representation
 from sortie.sim.engine.sortie import run_sortie
-from sortie.sim.results.outcome import describe, outcome
+from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
+from sortie.sim.results.transitions import describe
 
 PLAIN = Directive(0, 1, Representation.FEATURES, rho=0.05, rate_hz=10.0, reason="plain")
 NO_PHASES = "mission.phases=[{at_s: 0, phase: search}]"

@@ -11,8 +11,9 @@ from campaign_examples import BASE, CAMPAIGN, plan, write
 from sortie.policies.contract import PolicyError
 from sortie.scenarios.reading.campaign import load_campaign
 from sortie.scenarios.reading.load import ScenarioError
-from sortie.sim.experiment.flight import number, scenario_of_task
+from sortie.sim.experiment.flight import scenario_of_task
 from sortie.sim.folders import RunError
+from sortie.sim.results.outcome import OutcomeDict
 
 SPACING = "fleet.formation.spacing_m:"
 GRID = "{kind: grid, values: [20, 40]}"
@@ -165,7 +166,7 @@ def test_a_metric_that_a_run_does_not_have_is_null_and_a_count_is_zero() -> None
     wanted = {"a.b": 2.0, "a.c": None, "a.d": None, "a.e": None, "phases.0.x": 1.0, "phases.1.x": None}
     wanted |= {"payload_fates.delivered": 3.0, "payload_fates.lost/no_link": 0.0, "policies.decisions.silence": 0.0}
     wanted |= {"distrusted_by.0": 0.0, "descriptor_drops.forged": 0.0, "distrusted_by.7": None}  # there is no drone 7
-    assert {name: number(result, name) for name in wanted} == wanted
+    assert {name: OutcomeDict(result).number(name) for name in wanted} == wanted
 
 
 # --- policies -------------------------------------------------------------------------------------------------------

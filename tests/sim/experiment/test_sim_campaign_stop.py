@@ -16,7 +16,7 @@ from sortie.scenarios.schema.campaign import StopWhen
 from sortie.sim.experiment.drive import Progress, Stop, _drive
 from sortie.sim.experiment.flight import Flight, Task
 from sortie.sim.experiment.store import CampaignStore
-from sortie.sim.results.outcome_fields import possible
+from sortie.sim.results.outcome import possible
 
 AP = "ap50.mission"
 Values = list[list[list[float | None]]]

@@ -14,7 +14,7 @@ from campaign_examples import CAMPAIGN, rows_of
 from sortie.scenarios.intervals import LEVEL, mean_interval
 from sortie.sim.experiment.rows import CampaignRows, sign, winner_metrics
 from sortie.sim.experiment.winners import _best, _first, other_winners, rule, winner
-from sortie.sim.results.outcome_fields import possible
+from sortie.sim.results.outcome import possible
 
 NAN = math.nan
 AP = "ap50.mission"

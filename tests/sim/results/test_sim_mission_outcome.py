@@ -25,8 +25,7 @@ from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.accuracy import both_matched
 from sortie.sim.results.explain import explain_metric
 from sortie.sim.results.mission_outcome import _flown_share, sees_ground
-from sortie.sim.results.outcome import outcome
-from sortie.sim.results.outcome_fields import check_number, open_keys
+from sortie.sim.results.outcome import check_number, open_keys, outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
 from sortie.sim.results.report import page

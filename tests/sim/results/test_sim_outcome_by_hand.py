@@ -20,7 +20,6 @@ from sortie.sim.results.accuracy_table import accuracy_table, windowed_ap
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
 from sortie.sim.results.regions import Regions
-from sortie.sim.results.tracking_outcome import tracking_outcome
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +236,7 @@ def test_a_track_is_a_detection_when_it_is_confirmed_and_has_a_box() -> None:
     """Boxes lie exactly on the car, so DetA is the share of right detections in all cars and detections."""
     wrong = {}
     for drones, right, missed, false in TRACKED:
-        found, share = tracking_outcome(met(*drones)), pytest.approx(right / (right + missed + false))
+        found, share = outcome(met(*drones))["tracking"], pytest.approx(right / (right + missed + false))
         parts = ("det_a", "ass_a", "hota") if len(drones) == 1 else ("det_a",)  # one track and one car: all are equal
         if any(found[part] != share for part in parts):
             wrong[" | ".join(drones)] = found
@@ -246,7 +245,7 @@ def test_a_track_is_a_detection_when_it_is_confirmed_and_has_a_box() -> None:
 
 def test_tracks_of_two_drones_are_two_and_so_are_their_cars() -> None:
     """Five of seven and two of four: AssA is the mean over all seven."""
-    found = tracking_outcome(met("xxxxxxx", "x x x x"))
+    found = outcome(met("xxxxxxx", "x x x x"))["tracking"]
     ass_a = (5 * 5 / 7 + 2 * 2 / 4) / 7
     assert found == pytest.approx({"det_a": 7 / 11, "ass_a": ass_a, "hota": (7 / 11 * ass_a) ** 0.5})
 
@@ -260,7 +259,7 @@ def test_people_have_no_part_in_tracking() -> None:
         for k in range(5)
         for x_m in (0.3, 40.0)
     ]
-    found = tracking_outcome(met("xxxmx", more=more))
+    found = outcome(met("xxxmx", more=more))["tracking"]
     assert found == pytest.approx({"det_a": 2 / 5, "ass_a": 2 / 5, "hota": 2 / 5})
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, TypedDict, get_args, get_origin, get_type_hints, is_typeddict
 
 import outcome_page
 import pytest
+from pydantic import ValidationError
 from recorded import recorded
 from sim_examples import example
 
@@ -16,53 +16,35 @@ from sortie import radio
 from sortie.sim.check.golden import figures
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.engine.transport import OTHER_SPACE
-from sortie.sim.results.outcome import outcome
-from sortie.sim.results.outcome_fields import REASONS, WALL, Outcome, check_number, open_keys
+from sortie.sim.results.outcome import OutcomeDict, check_number, fields, open_keys, outcome
+from sortie.sim.results.outcome_fields import WALL, Outcome
 from sortie.sim.results.record import ABOUT, TABLES
-
-
-class Leaf(TypedDict):
-    x: Annotated[float | None, "A number."]
-
-
-class Tree(TypedDict):
-    one: Annotated[Leaf, "One."]
-    named: Annotated[dict[str, Leaf], "By name."]
-    many: Annotated[list[Leaf], "In a row."]
-    counts: Annotated[dict[str, int], "Counted."]
-
-
-def faults(value: Any, kind: Any, path: str) -> list[str]:
-    """Where a value is not of its kind; a typed dictionary has all of its keys and no other."""
-    origin, of = get_origin(kind), get_args(kind)
-    if is_typeddict(kind):
-        hints = get_type_hints(kind)
-        wrong = [f"{path}: keys {sorted(set(value) ^ set(hints))}"] if set(value) != set(hints) else []
-        return wrong + [f for k in set(value) & set(hints) for f in faults(value[k], hints[k], f"{path}.{k}")]
-    if origin is dict:
-        return [f for k, v in value.items() for f in faults(k, of[0], path) + faults(v, of[1], f"{path}.{k}")]
-    if origin is list:
-        return [f for k, v in enumerate(value) for f in faults(v, of[0], f"{path}[{k}]")]
-    if origin is UnionType:
-        return [] if any(not faults(value, member, path) for member in of) else [f"{path}: {value!r}"]
-    fits = type(value) in ((int, float) if kind is float else (kind,))
-    return [] if fits else [f"{path}: {value!r} is no {kind.__name__}"]
+from sortie.sim.results.traffic import REASONS
 
 
 def test_a_sortie_s_outcome_has_the_fields_of_the_reference() -> None:
-    for name in ("broken_link", "person", "members", "faults"):
-        assert faults(outcome(recorded(name)), Outcome, "outcome") == []
+    for name in ("broken_link", "person", "members", "faults", "surrogate"):
+        outcome(recorded(name)).model()
     result = outcome(recorded("broken_link"))
     assert all(result[k] for k in ("transitions", "phases", "events", "drones", "payload_fates"))
-    event = {"t_s": 1.0, "drone": True, "kind": "", "text": ""}
-    for change, fault in (
-        ({"extra": 1}, "outcome: keys ['extra']"),
-        ({"seed": 1.0}, "outcome.seed: 1.0 is no int"),
-        ({"switches": "few"}, "outcome.switches: 'few'"),
-        ({"age_s": {"p50": 0.1}}, "outcome.age_s: keys ['p99']"),
-        ({"events": [event]}, "outcome.events[0].drone: True is no int"),
+    assert list(result) == list(Outcome.model_fields)
+    wrong = {}
+    for change, where, why in (
+        ({"extra": 1}, ("extra",), "extra_forbidden"),
+        ({"seed": 1.0}, ("seed",), "int_type"),
+        ({"seed": -1}, ("seed",), "greater_than_equal"),
+        ({"switches": "few"}, ("switches",), "float_type"),
+        ({"context_share": 1.5}, ("context_share",), "less_than_equal"),
+        ({"battery": {"0": 2.0}}, ("battery", "0"), "less_than_equal"),
+        ({"metrics": {"own": math.inf}}, ("metrics", "own"), "finite_number"),
+        ({"age_s": {"p50": 0.1}}, ("age_s", "p99"), "missing"),
+        ({"events": [{"t_s": 1.0, "drone": True, "kind": "", "text": ""}]}, ("events", 0, "drone"), "int_type"),
     ):
-        assert faults({**result, **change}, Outcome, "outcome") == [fault]
+        with pytest.raises(ValidationError) as caught:
+            OutcomeDict({**result, **change}).model()
+        if (found := [(e["loc"], e["type"]) for e in caught.value.errors()]) != [(where, why)]:
+            wrong[where] = found
+    assert wrong == {}
 
 
 def test_every_number_of_an_outcome_may_be_named() -> None:
@@ -93,18 +75,27 @@ def test_every_number_of_an_outcome_may_be_named() -> None:
 
 
 def test_what_may_be_keyed_is_known_of_every_object_that_is_open() -> None:
-    found = {path for path, value, _ in outcome_page.fields(Outcome) if value.startswith("object of")}
-    found |= {path.partition(".*")[0] for path, _, _ in outcome_page.fields(Outcome) if ".*" in path}
+    found = {name for name, _, here in fields() if here.get("additionalProperties")}
     assert open_keys(1, 1, (), traced=False).keys() == found | {"phases"}
-    assert list(outcome_page.fields(Tree)) == [
-        ("one", "object", "One."),
-        ("one.x", "number, null", "A number."),
-        ("named", "object", "By name."),
-        ("named.*.x", "number, null", "A number."),
-        ("many", "list", "In a row."),
-        ("many[].x", "number, null", "A number."),
-        ("counts", "object of whole numbers", "Counted."),
-    ]
+    rows = {name: (outcome_page.value(kind), outcome_page.unit(kind)) for name, kind, _ in fields()}
+    wanted = {
+        "ap50": ("object", ""),
+        "ap50.mission": ("number, null", "share"),
+        "drones": ("object", ""),
+        "drones.*.voltage_v": ("number", "V"),
+        "drones.*.airborne": ("true, false", ""),
+        "battery": ("object of numbers", "share"),
+        "payload_fates": ("object of whole numbers", ""),
+        "own_files": ("object of texts", ""),
+        "metrics": ("object of numbers or null", ""),
+        "phases": ("list", ""),
+        "phases[].context.lost_to.hidden": ("number, null", "share"),
+        "transitions[].peers": ("list of whole numbers", ""),
+        "transitions[].from": ("text", ""),
+        "ap50.fusion": ("text, null", ""),
+        "policy_eval_us.p99": ("number, null", "µs"),
+    }
+    assert {name: rows.get(name) for name in wanted} == wanted
 
 
 def test_the_reasons_of_fates_are_those_that_the_radio_gives() -> None:

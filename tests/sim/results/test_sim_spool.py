@@ -21,9 +21,9 @@ from sortie.sim.engine import scoring
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results import box_rows, mission_outcome, record, run_folder, selection, spool
 from sortie.sim.results.outcome import outcome
+from sortie.sim.results.outcome_fields import WALL
 from sortie.sim.results.record import TABLES, SortieRecord
 
-WALL = ("wall_s", "realtime_factor", "policy_eval_us")
 SURROGATE = ("fleet.drones=3", "perception.detector=surrogate")
 ALL_LAND = ", ".join(f"{{kind: drone_lost, at_s: {at_s}, drone: {i}}}" for i, at_s in enumerate((1, 2, 2)))
 SCENARIOS = {

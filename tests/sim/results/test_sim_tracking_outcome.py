@@ -16,7 +16,6 @@ from sortie.perception.types import Capture
 from sortie.scenarios.reading.load import load
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.results.tracking_outcome import tracking_outcome
 
 
 def with_tables(**tables: pa.Table) -> SortieRecord:
@@ -36,7 +35,7 @@ def test_cars_that_change_places_cost_association_and_no_detection() -> None:
     assert 0.0 < before["det_a"] < 1.0
     truths = record.tables["truths"]
     late, car = truths["t_s"].to_numpy() > 3.0, truths["car"].to_numpy()
-    after = tracking_outcome(with_cars(np.where(late, car + 100_000, car)))
+    after = outcome(with_cars(np.where(late, car + 100_000, car)))["tracking"]
     assert after["ass_a"] < 0.8 * before["ass_a"]
     assert after["det_a"] == pytest.approx(before["det_a"], rel=0.1)
 
@@ -48,18 +47,18 @@ def test_a_vehicle_that_is_taken_for_one_of_another_class_is_not_followed() -> N
 
     def judged(there: np.ndarray, found: np.ndarray) -> dict[str, float | None]:
         kinds = {"truths": (truths, there), "detections": (every_car, found)}
-        return tracking_outcome(
+        return outcome(
             with_tables(**{name: table.append_column("kind", pa.array(k)) for name, (table, k) in kinds.items()})
-        )
+        )["tracking"]
 
-    assert judged(cars, cars) == judged(trucks, trucks) == tracking_outcome(with_tables(detections=every_car))
+    assert judged(cars, cars) == judged(trucks, trucks) == outcome(with_tables(detections=every_car))["tracking"]
     assert judged(trucks, cars) == judged(cars, trucks) == {"hota": 0.0, "det_a": 0.0, "ass_a": 0.0}
 
 
 def test_without_identities_or_a_detector_there_is_none() -> None:
     nameless = with_cars(np.full(recorded("surrogate").tables["truths"].num_rows, -1))
     nothing = {"hota": None, "det_a": None, "ass_a": None}
-    assert tracking_outcome(nameless) == tracking_outcome(recorded("base")) == nothing
+    assert outcome(nameless)["tracking"] == outcome(recorded("base"))["tracking"] == nothing
 
 
 def test_a_car_has_the_number_that_the_scene_gives_it() -> None:
