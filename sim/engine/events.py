@@ -196,15 +196,13 @@ class FleetHandle:
             raise self._error(f"lost_fraction is {lost_fraction}, must be > 0 and ≤ 1")
         self._world.drain()
         if self._world.drones[drone].airborne:
-            self._world.batteries.fault(drone, lost_fraction)
-            self._world.ground_landed()
+            self._world.lose_energy(drone, lost_fraction)
 
     def cells(self, drone: int) -> int:
         return int(self._world.batteries.cells[drone])
 
     def drop_cell(self, drone: int) -> None:
-        self._world.batteries.drop_cell(drone)
-        self._world.ground_landed()
+        self._world.drop_cell(drone)
 
     def clock(self, drone: int) -> DroneClock:
         return self._acted.clocks[drone]
@@ -213,13 +211,13 @@ class FleetHandle:
         self._world.read_clocks()
 
     def lie(self, drone: int, about: About, claim: Claim) -> None:
-        self._world.drones[drone].lie(self.index, about, claim)
+        self._world.lie(self.index, drone, about, claim)
 
     def block_cameras(self, drone: int) -> None:
-        self._world.drones[drone].blocked.add(self.index)
+        self._world.block_cameras(self.index, drone)
 
     def slow(self, drone: int, extra_s: float) -> None:
-        self._world.drones[drone].slower_s[self.index] = extra_s
+        self._world.slow(self.index, drone, extra_s)
 
     def slowed_s(self, drone: int) -> float:
         return self._world.drones[drone].slowed_s

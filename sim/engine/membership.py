@@ -81,8 +81,7 @@ class Membership:
         if drone in self._homebound or not world.drones[drone].airborne:
             return
         self._homebound[drone] = math.inf
-        world.homebound.add(drone)
-        world.note(drone, "drone_leaves", f"goes home: {text}")
+        world.descend(drone, f"goes home: {text}")
         down_s = self._manoeuvres.descend(drone, self._mission.descent_mps)
         if down_s is not None:
             self._homebound[drone] = down_s

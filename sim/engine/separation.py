@@ -24,13 +24,10 @@ class Separation:
         self._pairs = np.argwhere(np.triu(strangers(scenario.fleet), 1))
         self._near: NDArray[np.bool_] = np.zeros(len(self._pairs), dtype=bool)
 
-    @property
-    def anyone(self) -> bool:
-        """Whether any two members could meet."""
-        return len(self._pairs) > 0
-
     def check(self, frame: int) -> None:
-        """Note the pairs that are too near since this frame. Call it after everything that moves drones."""
+        """Note the pairs that are too near since this frame."""
+        if not len(self._pairs):
+            return
         world, (one, other) = self._world, self._pairs.T
         (position_m,) = world.motion[frame : frame + 1].position_m
         airborne = np.array([status.airborne for status in world.drones])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
@@ -189,6 +189,7 @@ class Parts:
     events: Events
     manoeuvres: Manoeuvres
     planners: Planners
+    separation: Separation
     pilots: Sequence[Pilot]
     agents: Sequence[Agent]
     detector: Detector | None
@@ -316,6 +317,7 @@ def build(
         events,
         manoeuvres,
         planners,
+        Separation(scenario, world),
         pilots,
         agents,
         detector,
@@ -325,6 +327,32 @@ def build(
         notes,
         journal,
     )
+
+
+def stages(parts: Parts) -> tuple[Callable[[int], None], ...]:
+    """What happens as a frame begins, in this order. The drones act afterwards, each at its own moment."""
+    world = parts.world
+    return (
+        world.end_frame,
+        world.begin_frame,
+        parts.membership.renew,
+        parts.manoeuvres.renew,
+        parts.events.step,
+        parts.separation.check,
+        world.renew_links,
+        world.write,
+    )
+
+
+def run_frames(parts: Parts, on_second: Callable[[float], None]) -> Generator[simpy.Event, Any, None]:
+    """Begins each frame of the flight; `on_second` is called once a second and must not change anything."""
+    env, scenario, all_stages = parts.env, parts.scenario, stages(parts)
+    for frame in range(scenario.frames):
+        yield env.timeout(max(0.0, frame * scenario.frame_s - env.now))
+        for stage in all_stages:
+            stage(frame)
+        if parts.world.is_second(frame):
+            on_second(env.now)
 
 
 def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer: Observer | None = None) -> None:
@@ -342,9 +370,7 @@ def fly(parts: Parts, progress: Callable[[float], None] | None = None, observer:
 
     if observer is not None:
         observer.begin(parts.scenario, parts.scene)
-    separation = Separation(parts.scenario, world)
-    watch = [separation.check] if separation.anyone else []
-    world.start(each_second, [parts.membership.renew, parts.manoeuvres.renew, parts.events.step, *watch])
+    parts.env.process(run_frames(parts, each_second))
     for agent in parts.agents:
         agent.start()
     if scorer is not None:

@@ -6,7 +6,7 @@ Scenario events act on the physics here: extra loss, jammers, battery faults, lo
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
@@ -34,6 +34,7 @@ from sortie.radio.settings import AirSettings
 from sortie.radio.topology import connectivity, usable_graph
 from sortie.scenarios.frames import frame_at, frame_from
 from sortie.scenarios.schema import Scenario
+from sortie.scenarios.schema.events.base import About, Claim
 from sortie.sim.engine.mission import MissionPlan
 from sortie.sim.engine.own_models import of_radio
 from sortie.sim.engine.people import People
@@ -146,47 +147,32 @@ class World:
         self._busy_at_s, self._links = (0.0, 0.0), links
         self._receptions = (0,) * (1 + len(LOSS_CAUSES))  # heard and lost to each cause, up to the frame's begin
         self.frame = 0
-        self._work = deque([[Work()] * n], maxlen=1 + max(1, round(scenario.context.rate_hz * SECOND_S)))
+        self._frames_a_second = max(1, round(scenario.context.rate_hz * SECOND_S))
+        self._work = deque([[Work()] * n], maxlen=1 + self._frames_a_second)
         self._headrooms = [(1.0, 1.0)] * n
         self._down: dict[
             int, list[tuple[int, int]]
         ] = {}  # the frames in which a drone is on the ground, where it stays
-        self.homebound: set[int] = set()
-        """Drones that descend."""
+        self._homebound: set[int] = set()
         self.now = plan.at(0.0)
         """Each group's mission in this frame: the ground station's cue comes with the frame."""
 
-    def start(self, on_second: Callable[[float], None], before_frame: Sequence[Callable[[int], None]] = ()) -> None:
-        """Begin the world's process; call once, before the agents start.
+    def end_frame(self, frame: int) -> None:
+        """What came of the frame that ends as this one begins: charges, receptions and headrooms."""
+        self.drain()
+        if frame:
+            self.write_receptions()
+            self._measure_headrooms()
 
-        Args:
-            on_second: called once a simulated second; must not change anything.
-            before_frame: called in turn at the begin of each frame, before the links are computed. They may reroute the
-                fleet.
-        """
-        self.env.process(self._run(on_second, before_frame))
+    def begin_frame(self, frame: int) -> None:
+        """Clocks and the mission."""
+        self.frame = frame
+        self.read_clocks()
+        self.now = self.plan.at(self.env.now)
 
-    def _run(
-        self, on_second: Callable[[float], None], before_frame: Sequence[Callable[[int], None]]
-    ) -> Generator[simpy.Event, Any, None]:
-        env, scenario = self.env, self._scenario
-        frames_a_second = max(1, round(scenario.context.rate_hz * SECOND_S))
-        for frame in range(scenario.frames):
-            yield env.timeout(max(0.0, frame * scenario.frame_s - env.now))
-            self.drain()
-            if frame:
-                self.write_receptions()
-                self._measure_headrooms()
-            self.frame = frame
-            self.read_clocks()
-            self.now = self.plan.at(env.now)
-            for prepare in before_frame:
-                prepare(frame)
-            self.air.advance(self.extra_loss_db, self.jammers)
-            self._write(frame)
-            if frame % frames_a_second == 0:
-                self._write_medium()
-                on_second(env.now)
+    def renew_links(self, frame: int) -> None:
+        """The links of this frame, after all that moves drones, jams or weakens."""
+        self.air.advance(self.extra_loss_db, self.jammers)
 
     def _measure_headrooms(self) -> None:
         """Over the last second, so that a duty cycle does not show as a computer that is idle and busy in turn."""
@@ -229,6 +215,16 @@ class World:
         )
         self.ground_landed()
 
+    def lose_energy(self, drone: int, lost_fraction: float) -> None:
+        """A part of the energy that a drone has left is gone; it lands where that is too much."""
+        self.batteries.fault(drone, lost_fraction)
+        self.ground_landed()
+
+    def drop_cell(self, drone: int) -> None:
+        """A cell of a drone's pack fails; it lands where that is too much."""
+        self.batteries.drop_cell(drone)
+        self.ground_landed()
+
     def ground_landed(self) -> None:
         """Remove the drones with a battery that gave out."""
         for drone, (status, landed) in enumerate(zip(self.drones, self.batteries.landed, strict=True)):
@@ -253,9 +249,19 @@ class World:
             since = frame_at(self.env.now, self._scenario.frame_s)
             self._down.setdefault(drone, []).append((since, self._scenario.frames))
         status.leave()
-        self.homebound.discard(drone)
+        self._homebound.discard(drone)
         self.air.silence(drone)
         self.batteries.land(drone)
+
+    @property
+    def homebound(self) -> Collection[int]:
+        """Drones that descend."""
+        return self._homebound
+
+    def descend(self, drone: int, text: str) -> None:
+        """A drone begins to descend."""
+        self._homebound.add(drone)
+        self.note(drone, "drone_leaves", text)
 
     def join(self, drone: int, text: str) -> None:
         """A drone on the ground appears in its slot, unless its charge would land it at once."""
@@ -285,6 +291,18 @@ class World:
         self._jammers.pop(cause, None)
         if jammer is not None:
             self._jammers[cause] = jammer
+
+    def lie(self, cause: int, drone: int, about: About, claim: Claim) -> None:
+        """A drone says something false, until `lift`."""
+        self.drones[drone].lie(cause, about, claim)
+
+    def block_cameras(self, cause: int, drone: int) -> None:
+        """A drone's cameras see nothing, until `lift`."""
+        self.drones[drone].blocked.add(cause)
+
+    def slow(self, cause: int, drone: int, extra_s: float) -> None:
+        """A drone's perception takes longer, until `lift`."""
+        self.drones[drone].slower_s[cause] = extra_s
 
     def lift(self, cause: int) -> None:
         """Take back all that an event did to links, jammers and drones."""
@@ -324,6 +342,16 @@ class World:
         self._recorder.rows["receptions"].append((self.frame * self._scenario.frame_s, *since))
         self._receptions = now
 
+    def write(self, frame: int) -> None:
+        """Record the frame's states, and once a second the medium's."""
+        self._write_states(frame)
+        if self.is_second(frame):
+            self._write_medium()
+
+    def is_second(self, frame: int) -> bool:
+        """Whether a second begins with this frame."""
+        return frame % self._frames_a_second == 0
+
     def _write_medium(self) -> None:
         """How busy the channel has been since the last row, and how many drones others heard; and once in a while the links."""
         busy_s = self.air.utilisation * self.env.now
@@ -346,7 +374,7 @@ class World:
         row = (self.env.now, whole.connected, list(whole.cut), *(whole.bottleneck or (-1, -1, NAN)))
         self._recorder.rows["topology"].append(row)
 
-    def _write(self, frame: int) -> None:
+    def _write_states(self, frame: int) -> None:
         rows, now_s, batteries = self._recorder.rows, self.env.now, self.batteries
         airborne = [status.airborne for status in self.drones]
         rows["states"].append(

@@ -27,7 +27,7 @@ from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
 from sortie.sim.cli.app import app
 from sortie.sim.engine.pilot import plan_for
-from sortie.sim.engine.sortie import build, run_sortie
+from sortie.sim.engine.sortie import build, run_frames, run_sortie
 from sortie.sim.export.topics import CONTEXT
 from sortie.sim.live import session
 from sortie.sim.live.context import ReplaySenses, Trace, traces
@@ -214,7 +214,7 @@ def test_a_live_clock_is_off_as_the_simulated_one() -> None:
     scenario = example("fleet.drones=2", *CLOCKS)
     for begin_s in (0.0, 3.0):
         parts = build(scenario, plan_for(scenario), scenario.seed)
-        parts.world.start(lambda _: None)
+        parts.env.process(run_frames(parts, lambda _: None))
         zero_s = 1000.0
         env, status, told = simpy.Environment(begin_s), status_of(scenario, 1, zero_s), []
         events = LiveEvents(scenario, 1, env, status, told.append)  # type: ignore[arg-type]
