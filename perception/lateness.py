@@ -19,6 +19,7 @@ from scipy.special import expit
 
 from sortie.perception.classes import NEAR_M, PERSON
 from sortie.perception.types import Boxes, Capture, Share
+from sortie.scenarios.frames import instant
 
 Floats = NDArray[np.float64]
 
@@ -28,8 +29,6 @@ SPEED_MPS = 5.9
 """Speed of the cars that move."""
 MOVING = 0.45
 """Share of the boxes whose cars move."""
-INSTANT_S = 1e-9
-"""Ages closer together than this are equal but for rounding."""
 
 
 class Movement(NamedTuple):
@@ -83,7 +82,7 @@ def weighed(ego: Capture, shares: Sequence[Share]) -> list[Share]:
     freshest_s = own_age_s(ego, shares) if ego.looked else min((s.age_s for s in shares), default=0.0)
     return [
         s._replace(weight=s.weight * map_weight(s.age_s, freshest_s))
-        if s.is_map and s.age_s > freshest_s + INSTANT_S
+        if s.is_map and instant(s.age_s) > instant(freshest_s)
         else s
         for s in shares
     ]

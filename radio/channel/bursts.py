@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sortie.radio.settings import BurstSettings
+from sortie.scenarios.frames import frame_at
 from sortie.scenarios.streams import stream
 
 FloatArray = NDArray[np.float64]
@@ -97,7 +98,7 @@ class PairStates:
         """Move on by one frame; returns [N, N]: the probability that a try is lost, sender by receiver."""
         c = self.settings
         self._frame += 1
-        due = int(self._frame * self._frame_s / c.step_s + 1e-6)
+        due = frame_at(self._frame * self._frame_s, c.step_s)
         while self._step < due:
             self._step += 1
             u = self._numbers.row()

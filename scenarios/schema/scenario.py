@@ -239,7 +239,7 @@ class Scenario(Section):
     def scoring_periods(self) -> list[range]:
         """The frames of each scoring period; there are `perception.sample_rate_hz` periods a second."""
         share = min(1.0, self.perception.sample_rate_hz / self.context.rate_hz)
-        before = [math.floor((frame - 1) * share + 1e-9) for frame in range(self.frames + 1)]
+        before = [math.floor(round((frame - 1) * share, 9)) for frame in range(self.frames + 1)]
         begins = [frame for frame in range(self.frames) if before[frame + 1] > before[frame]]
         return [range(begin, end) for begin, end in zip(begins, [*begins[1:], self.frames], strict=True)]
 
@@ -278,8 +278,8 @@ class Scenario(Section):
         each = max(1.0, self.context.rate_hz / self.perception.tracking_rate_hz)
         scored = self.scored_frames
         frames = []
-        for k in range(math.ceil(self.frames / each - 1e-9)):
-            first, last = math.ceil(k * each - 1e-9), math.ceil((k + 1) * each - 1e-9)
+        for k in range(math.ceil(round(self.frames / each, 9))):
+            first, last = math.ceil(round(k * each, 9)), math.ceil(round((k + 1) * each, 9))
             at = bisect_left(scored, first)
             frames.append(scored[at] if at < len(scored) and scored[at] < last else first)
         return frames
