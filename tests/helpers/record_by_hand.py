@@ -77,7 +77,7 @@ def rows() -> dict[str, list[dict[str, Any]]]:
             {"t_s": 2.0, "heard": 1, "hidden": 1},
             {"t_s": 3.0, "heard": 0, "half_duplex": 1},
         ],
-        "ages": [{"t_s": 1.0, "drone": 0, "age_s": age_s} for age_s in (0.4, 0.1, 0.3, 0.2)],
+        "ages": [{"t_s": 1.0, "drone": 0, "age_s": age_s} for age_s in (0.8, 0.2, 0.6, 0.4)],
         "fusions": [
             {
                 "t_s": t_s, "drone": d, "peers": [1 - d] * len(ages), "representations": ["features"] * len(ages),
