@@ -21,7 +21,7 @@ from sortie.policies.registry import resolve, within_budget
 from sortie.scenarios.intervals import mean_interval
 from sortie.scenarios.reading.load import load
 from sortie.scenarios.schema import Scenario
-from sortie.sim.engine.choreography import EVENT
+from sortie.sim.engine.manoeuvres import VIEWPOINT
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.outcome import outcome
 from sortie.sim.results.record import SortieRecord
@@ -142,7 +142,7 @@ def _flown(policy: str, seed: int, duration_s: float, mission: str) -> SortieRec
 
 
 def _moves(record: SortieRecord) -> int:
-    return sum(e["kind"] == EVENT and e["text"].startswith("moves") for e in record.tables["events"].to_pylist())
+    return sum(e["kind"] == VIEWPOINT and e["text"].startswith("moves") for e in record.tables["events"].to_pylist())
 
 
 def _gain(arms: np.ndarray) -> Interval:

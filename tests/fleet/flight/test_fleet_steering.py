@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
-from sortie.fleet.flight.displaced import steered
-from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, attitude, fly
 from sortie.fleet.flight.steering import (
     VELOCITY_LASTS_S,
     GoTo,
     Hold,
     SteeredWay,
     Velocity,
+    area_m,
     nearest_m,
     refusal,
     steer,
-    steered_area_m,
 )
 from sortie.scenarios.schema import Fleet, Steering
 
@@ -171,35 +169,19 @@ def test_the_nearest_approach_is_found_between_frames() -> None:
         assert nearest_m(np.zeros((3, 3)), passing) == pytest.approx([2.0])
 
 
-def test_planners_may_fly_where_their_reach_and_the_fence_both_allow() -> None:
+def test_planners_may_fly_where_their_reach_and_the_fence_both_allow(monkeypatch: pytest.MonkeyPatch) -> None:
     """About where each of them begins: of the formation, of groups, or of both, as they have one."""
     groups = ({"drones": [2], "route": {"waypoints_m": [[500.0, 0.0]]}},)
     of = {"drones": 3, "formation": {"shape": "line", "spacing_m": 30.0}, "groups": groups}
     fleet = Fleet.model_validate({**of, "steering": {"reach_m": 100.0}})
     fenced = Fleet.model_validate({**of, "steering": {"reach_m": 100.0, "fence_m": (-60.0, -500.0, 700.0, 90.0)}})
-    assert steered_area_m(fleet, lambda each: True) == pytest.approx((-100.0, -100.0, 600.0, 130.0))
-    assert steered_area_m(fleet, lambda each: each is fleet) == pytest.approx((-100.0, -100.0, 100.0, 130.0))
-    assert steered_area_m(fleet, lambda each: each is not fleet) == pytest.approx((400.0, -100.0, 600.0, 100.0))
-    assert steered_area_m(fenced, lambda each: True) == pytest.approx((-60.0, -100.0, 600.0, 90.0))
-    assert steered_area_m(fleet, lambda each: False) is None
-
-
-def test_a_steered_drone_tilts_as_its_motion_and_its_own_wind_ask() -> None:
-    fleet = Fleet.model_validate({"drones": 2, "motion": {"pose_error_m": 2.0, "heading_error_deg": 5.0}})
-    base = fly(fleet, 10.0, 0.1, 3)
-    way = steer(SteeredWay(3.0, (0.0, 0.0, 60.0), (0.0, 0.0, 0.0)), Velocity(6.0, -3.0, 1.0), 3.0, Steering())
-    shift, speed, push = way.at(base.time_s[30:])
-    shift = shift - np.array([0.0, 0.0, 60.0])
-    moved = steered(base, base, {1: (shift, speed, push)}, 30)
-    np.testing.assert_allclose(moved.position_m[30:, 1], base.position_m[30:, 1] + shift)
-    np.testing.assert_allclose(
-        moved.est_position_m - moved.position_m, base.est_position_m - base.position_m, atol=1e-9
-    )
-    thrust = moved.acceleration_mps2[30:, 1] + DRAG_PER_S * (moved.velocity_mps[30:, 1] - base.wind_mps[30:, 1])
-    thrust[:, 2] += GRAVITY_MPS2
-    wanted = Rotation.from_quat(attitude(thrust, np.zeros(len(thrust))))
-    apart = (Rotation.from_quat(moved.orientation_xyzw[30:, 1]).inv() * wanted).magnitude()
-    assert apart.max() < 1e-9
-    turn = [np.mod(m.est_yaw_rad - m.yaw_rad + np.pi, 2 * np.pi) for m in (base, moved)]
-    np.testing.assert_allclose(turn[1], turn[0], atol=1e-9)
-    assert ((moved.orientation_xyzw[1:] * moved.orientation_xyzw[:-1]).sum(axis=-1) > 0).all()
+    rows: list[tuple[Fleet, Callable[[object], bool], tuple[float, ...]]] = [
+        (fleet, lambda each: True, (-100.0, -100.0, 600.0, 130.0)),
+        (fleet, lambda each: each is fleet, (-100.0, -100.0, 100.0, 130.0)),
+        (fleet, lambda each: each is not fleet, (0.0, -100.0, 600.0, 100.0)),
+        (fenced, lambda each: True, (-60.0, -100.0, 600.0, 90.0)),
+        (fleet, lambda each: False, (0.0, 0.0, 1.0, 1.0)),
+    ]
+    for k, (each, steers, area) in enumerate(rows):
+        monkeypatch.setattr("sortie.fleet.flight.steering.steers", steers)
+        assert area_m(each, (0.0, 0.0, 1.0, 1.0)) == pytest.approx(area), k

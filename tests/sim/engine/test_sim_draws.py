@@ -32,7 +32,7 @@ def drawn(seed: int, replication: int) -> dict[str, np.ndarray]:
         clock.read(1000.0)
     drift_s = [d.clock_skew_s - at_first_s for d, at_first_s in zip(world.drones, offset_s, strict=True)]
     built.air.advance()
-    motion, believed_m = world.motion, world.believed()[1]
+    motion, believed_m = world.motion[:], world.believed()[1]
     return {
         "moment of acting": np.array([[phase_of(built.scenario, seed, replication, d)] for d in range(n)]),
         "offset of the clock": np.array(offset_s)[:, None],
@@ -82,7 +82,7 @@ def test_every_part_draws_by_the_seed_and_the_replication_that_fly_and_not_by_th
 
     noted("People", lambda a, k: a[-1])
     noted("Air", lambda a, k: (k["seed"], k["replication"]))
-    for name in ("Acted", "Steering", "oscillators", "sensor_errors", "flown_motion", "mixed"):
+    for name in ("Acted", "Planners", "oscillators", "sensor_errors", "flown_motion", "mixed"):
         noted(name, lambda a, k: a[-2:])
     parts(9, 4, "seed=1", "duration_s=0.2", "fleet.drones=2")
     assert got == dict.fromkeys(got, (9, 4))

@@ -13,12 +13,11 @@ import pytest
 from sim_examples import example
 from typer.testing import CliRunner
 
-from sortie.fleet.flight.steering import GoTo, Velocity
+from sortie.fleet.flight.steering import GoTo, Velocity, area_m
 from sortie.scenarios.errors import SortieError
 from sortie.sim.cli.app import app
 from sortie.sim.engine.pilot import plan_for
-from sortie.sim.engine.sortie import build, fly, run_sortie
-from sortie.sim.engine.steering import Steering, area_m
+from sortie.sim.engine.sortie import Parts, build, fly, run_sortie
 from sortie.sim.results.record import SortieRecord
 
 OWN = Path(__file__).parent / "own_models.py"
@@ -51,7 +50,7 @@ def texts(record: SortieRecord, drone: int) -> list[str]:
 def test_a_function_gives_positions_and_is_named_among_the_files() -> None:
     record = flown(SPIRAL, params(speed_mps=2))
     scenario = example(CALM, "fleet.route.waypoints_m=[[-60, 0]]")
-    start = build(scenario, plan_for(scenario), 1).world.motion.position_m[0, 3]
+    start = build(scenario, plan_for(scenario), 1).world.motion[:1].position_m[0, 3]
     radius = np.linalg.norm(place_m(record)[:, 3] - start, axis=-1)
     t_s = np.arange(120) / 10
     np.testing.assert_allclose(radius, 2 * np.sqrt(t_s) * 2 * np.abs(np.sin(np.sqrt(t_s) / 4)), atol=1e-9)
@@ -175,26 +174,27 @@ def test_the_slot_of_a_drone_that_may_come_back_is_kept_free_though_it_was_lost_
 # --- commands of one frame, without a flight -----------------------------------------------------
 
 
-def _steering(*sets: str) -> tuple[Steering, Any]:
+def _parts(*sets: str) -> Parts:
     scenario = example("duration_s=20", GOES, params(x_m=0), CALM, LINE, "fleet.drones=4", *sets)
-    parts = build(scenario, plan_for(scenario), 1)
-    return parts.steering, parts.world
+    return build(scenario, plan_for(scenario), 1)
 
 
-def _command(steering: Steering, world: Any, **wishes: Any) -> list[str]:
+def _command(parts: Parts, **commands: Any) -> list[str]:
     """Give commands by drone in one frame, and return what is noted of them."""
-    before = len(world._recorder.rows["events"])
-    steering._wishes = {int(name[1:]): wish for name, wish in wishes.items()}
-    steering.renew(0)
-    return [f"{row[1]} {row[3]}" for row in world._recorder.rows["events"][before:]]
+    events = parts.recorder.rows["events"]
+    before = len(events)
+    for name, command in commands.items():
+        parts.planners.request(int(name[1:]), command)
+    parts.manoeuvres.renew(0)
+    return [f"{row[1]} {row[3]}" for row in events[before:]]
 
 
 def test_of_two_commands_of_one_frame_the_second_keeps_clear_of_what_the_first_was_granted() -> None:
-    steering, world = _steering("fleet.steering.separation_m=10")
-    start_m = world.motion.position_m[0].copy()
+    parts = _parts("fleet.steering.separation_m=10")
+    start_m = parts.world.motion[:1].position_m[0].copy()
     middle_m = (start_m[0] + start_m[1]) / 2
-    noted = _command(steering, world, d1=GoTo(*middle_m.tolist()), d0=GoTo(*middle_m.tolist()))
-    end_m = world.motion.position_m[-1]
+    noted = _command(parts, d1=GoTo(*middle_m.tolist()), d0=GoTo(*middle_m.tolist()))
+    end_m = parts.world.motion[-1:].position_m[0]
     np.testing.assert_allclose(end_m[0], middle_m, atol=1e-6)
     assert np.linalg.norm(end_m[1] - end_m[0]) >= 10.0 - 1e-6
     assert noted[0] == "0 Goes: GoTo"
@@ -202,21 +202,21 @@ def test_of_two_commands_of_one_frame_the_second_keeps_clear_of_what_the_first_w
 
 
 def test_who_is_in_the_way_is_named_by_its_number_and_who_is_gone_is_not_in_the_way() -> None:
-    steering, world = _steering("fleet.steering.separation_m=19")
-    start_m = world.motion.position_m[0]
-    world.remove(0, "drone_lost", "fell silent")
-    (noted,) = _command(steering, world, d1=GoTo(*(start_m[3] + 0.2 * (start_m[1] - start_m[3])).tolist()))
+    parts = _parts("fleet.steering.separation_m=19")
+    start_m = parts.world.motion[:1].position_m[0]
+    parts.world.remove(0, "drone_lost", "fell silent")
+    (noted,) = _command(parts, d1=GoTo(*(start_m[3] + 0.2 * (start_m[1] - start_m[3])).tolist()))
     assert noted == "1 Goes: GoTo refused, it would come too near drone 3"
-    assert _command(steering, world, d1=GoTo(*start_m[0].tolist())) == ["1 Goes: GoTo"]
+    assert _command(parts, d1=GoTo(*start_m[0].tolist())) == ["1 Goes: GoTo"]
 
 
 def test_a_drone_that_goes_home_or_is_down_takes_no_commands() -> None:
-    steering, world = _steering()
-    world.homebound.add(0)
-    world.remove(1, "drone_lost", "fell silent")
+    parts = _parts()
+    parts.world.homebound.add(0)
+    parts.world.remove(1, "drone_lost", "fell silent")
     east = Velocity(1.0, 0.0)
-    assert _command(steering, world, d0=east, d1=east, d2=east) == ["2 Goes: Velocity"]
-    moved = world.motion.position_m[-1] - world.motion.position_m[0]
+    assert _command(parts, d0=east, d1=east, d2=east) == ["2 Goes: Velocity"]
+    moved = parts.world.motion[-1:].position_m[0] - parts.world.motion[:1].position_m[0]
     assert (np.abs(moved).max(axis=1) > 1.0).tolist() == [False, False, True, False]
 
 
@@ -226,8 +226,8 @@ def test_the_scene_reaches_as_far_as_drones_fly_as_planned_and_as_they_may_be_st
     assert area_m(example().fleet, (-1.0, -2.0, 3.0, 4.0)) == (-1.0, -2.0, 3.0, 4.0)
     plain, planned = example("duration_s=1"), example("duration_s=1", GOES, "fleet.steering.reach_m=700")
     parts = build(plain, plan_for(plain), 1)
-    assert not parts.steering.anyone
-    assert parts.scene.made_of[2] == parts.world.motion.bounds_m()
+    assert not parts.planners.anyone
+    assert parts.scene.made_of[2] == parts.world.motion.nominal.bounds_m()
     assert build(planned, plan_for(planned), 1).scene.made_of[2] == pytest.approx((-780, -720, 660, 720))
 
 
@@ -235,8 +235,8 @@ def test_planners_read_what_their_policies_read(monkeypatch: pytest.MonkeyPatch)
     scenario = example(GOES, "duration_s=1", "record.views=true", "mission.phases=[{}]")
     parts = build(scenario, plan_for(scenario), 1)
     shown: list[tuple[int, Any]] = []
-    read = parts.steering.read
-    monkeypatch.setattr(parts.steering, "read", lambda drone, view: (shown.append((drone, view)), read(drone, view)))
+    read = parts.planners.read
+    monkeypatch.setattr(parts.planners, "read", lambda drone, view: (shown.append((drone, view)), read(drone, view)))
     fly(parts)
     assert len(shown) == 5 * 10
     assert all(view.ego == drone for drone, view in shown)

@@ -69,6 +69,16 @@ SIX = {"drones": 6, "groups": [{"drones": [1]}, {"drones": [2, 5]}], "ground": [
 FAR = 100.0
 
 
+class Places:
+    """A motion of which the positions are known."""
+
+    def __init__(self, position_m: np.ndarray) -> None:
+        self._position_m = position_m
+
+    def __getitem__(self, frames: slice) -> Any:
+        return SimpleNamespace(position_m=self._position_m[frames])
+
+
 def noted(fleet: dict[str, object], *frames: Sequence[float], down: str = "", descends: str = "") -> list[str]:
     """What is noted of drones on one line, as `FRAME: DRONE-OTHER DISTANCE`.
 
@@ -82,7 +92,7 @@ def noted(fleet: dict[str, object], *frames: Sequence[float], down: str = "", de
     told: list[str] = []
     frame, drones = 0, [SimpleNamespace(airborne=True) for _ in frames[0]]
     world: Any = SimpleNamespace(
-        motion=SimpleNamespace(position_m=place),
+        motion=Places(place),
         drones=drones,
         homebound=set(map(int, descends.split())),
         note=lambda drone, kind, text: told.append(f"{frame}: {drone}-{text.split(',')[0][-1]} {text.split()[0]}"),

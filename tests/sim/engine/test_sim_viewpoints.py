@@ -15,7 +15,7 @@ from sim_examples import example
 
 from sortie.fleet.coverage import unpack_grid
 from sortie.fleet.flight.motion import MotionError
-from sortie.fleet.flight.viewpoints import Move
+from sortie.fleet.flight.viewpoints import Move, ViewpointWish
 from sortie.policies.catalogue.baselines import everyone
 from sortie.policies.catalogue.vantage import vantage
 from sortie.policies.contract import (
@@ -27,7 +27,7 @@ from sortie.policies.contract import (
     Reposition,
     looks_from,
 )
-from sortie.sim.engine.choreography import Choreography
+from sortie.sim.engine.manoeuvres import Manoeuvres, Viewpoints
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import build, run_sortie
 from sortie.sim.results.outcome import outcome
@@ -42,30 +42,30 @@ class Granting:
     def __init__(self, answer: Callable[[int, int], Move | str | None]) -> None:
         self.answer = answer
         self.asked: list[tuple[int, int]] = []
-        self.gone: list[list[int]] = []
+        self.gone: list[set[int]] = []
 
-    def __call__(
-        self, drone: int, wanted_m: Any, plans: Any, course: Any, bounds: Any, frame: int, gone: list[int]
-    ) -> Any:
-        self.asked.append((frame, drone))
-        self.gone.append(list(gone))
-        return self.answer(frame, drone)
+    def __call__(self, wish: ViewpointWish) -> Any:
+        self.asked.append((wish.frame, wish.drone))
+        self.gone.append(set(wish.gone))  # type: ignore[call-overload]
+        return self.answer(wish.frame, wish.drone)
 
 
-def _choreography(monkeypatch: pytest.MonkeyPatch, grant: Granting, *sets: str) -> tuple[Choreography, Any]:
+def _queue(monkeypatch: pytest.MonkeyPatch, grant: Granting, *sets: str) -> tuple[Viewpoints, Manoeuvres, Any]:
     scenario = example("duration_s=5", "fleet.drones=4", *sets)
-    parts = build(scenario, plan_for(scenario), 1)
-    monkeypatch.setattr("sortie.sim.engine.choreography.grant", grant)
-    monkeypatch.setattr("sortie.sim.engine.choreography.displaced", lambda motion, *_: motion)
-    return Choreography(scenario, parts.world, posed_by_trace=False), parts.world
+    world = build(scenario, plan_for(scenario), 1).world
+    monkeypatch.setattr("sortie.sim.engine.manoeuvres.grant", grant)
+    monkeypatch.setattr(world, "reroute", lambda manoeuvres: None)
+    viewpoints, queue = Viewpoints(scenario, world, posed_by_trace=False), Manoeuvres(scenario, world)
+    queue.serve(viewpoints)
+    return viewpoints, queue, world
 
 
 def test_a_refused_request_is_decided_again_a_second_after_each_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
     grant = Granting(lambda frame, drone: "too near")
-    moves, world = _choreography(monkeypatch, grant)
-    moves.request(2, Reposition(0.0, 0.0, "to see"))
+    viewpoints, queue, world = _queue(monkeypatch, grant)
+    viewpoints.request(2, Reposition(0.0, 0.0, "to see"))
     for frame in range(35):
-        moves.renew(frame)
+        queue.renew(frame)
     assert grant.asked == [(0, 2), (10, 2), (20, 2), (30, 2)]
     assert [row[1:] for row in world._recorder.rows["events"]] == [(2, "viewpoint", "stays, too near: to see")]
 
@@ -78,12 +78,12 @@ def test_who_was_refused_is_decided_again_once_another_moved_out_of_the_way(monk
         return Move(0.0, 2.0, (0.0, 0.0), (3.0, 4.0)) if drone == 1 or 1 in met else "drone 1 is there"
 
     grant = Granting(answer)
-    moves, world = _choreography(monkeypatch, grant)
+    viewpoints, queue, world = _queue(monkeypatch, grant)
     for drone in (0, 1):
-        moves.request(drone, Reposition(0.0, 0.0, "to see"))
-    moves.renew(0)
+        viewpoints.request(drone, Reposition(0.0, 0.0, "to see"))
+    queue.renew(0)
     assert grant.asked == [(0, 0), (0, 1), (0, 0)]
-    assert [len(plan) for plan in moves.plans] == [1, 1, 0, 0]
+    assert [len(plan) for plan in viewpoints.plans] == [1, 1, 0, 0]
     texts = {row[1]: row[3] for row in world._recorder.rows["events"]}
     assert texts == dict.fromkeys((0, 1), "moves 5.0 m in 2.0 s, to +3.0 m ahead and +4.0 m left of its slot: to see")
 
@@ -91,10 +91,10 @@ def test_who_was_refused_is_decided_again_once_another_moved_out_of_the_way(monk
 def test_a_refusal_is_told_again_after_a_move(monkeypatch: pytest.MonkeyPatch) -> None:
     move = Move(0.0, 1.0, (0.0, 0.0), (1.0, 0.0))
     grant = Granting(lambda frame, drone: move if frame == 10 else "too near")
-    moves, world = _choreography(monkeypatch, grant)
-    moves.request(0, Reposition(0.0, 0.0, "r"))
+    viewpoints, queue, world = _queue(monkeypatch, grant)
+    viewpoints.request(0, Reposition(0.0, 0.0, "r"))
     for frame in range(25):
-        moves.renew(frame)
+        queue.renew(frame)
     told = [row[3].partition(" ")[0] for row in world._recorder.rows["events"]]
     assert told == ["stays,", "moves", "stays,"]
 
@@ -104,16 +104,16 @@ def test_only_drones_that_fly_move_and_slots_stay_free_for_those_that_will_come(
 ) -> None:
     joins = "events=[{kind: drone_joins, at_s: 4, drone: 3}]"
     grant = Granting(lambda frame, drone: None)
-    moves, world = _choreography(monkeypatch, grant, joins)
+    viewpoints, queue, world = _queue(monkeypatch, grant, joins)
     for drone in range(4):
-        moves.request(drone, Reposition(0.0, 0.0, "r"))
+        viewpoints.request(drone, Reposition(0.0, 0.0, "r"))
     world.homebound.add(2)
-    moves.renew(0)
+    queue.renew(0)
     assert grant.asked == [(0, 0), (0, 1)], "drone 2 goes home and drone 3 is on the ground"
-    assert grant.gone == [[], []]
+    assert grant.gone == [set(), set()]
     world.remove(1, "drone_lost", "fell silent")
-    moves.renew(1)
-    assert (grant.asked[2:], grant.gone[2:]) == ([(1, 0)], [[1]])
+    queue.renew(1)
+    assert (grant.asked[2:], grant.gone[2:]) == ([(1, 0)], [{1}])
 
 
 # --- in flight -----------------------------------------------------------------------------------

@@ -85,7 +85,7 @@ def test_a_custom_event_sees_the_drones_of_the_frame_and_weakens_a_link_one_way(
     its = _handle(world)
     for t_s, frame in ((0.27, 2), (0.3, 3)):
         world.env.run(until=t_s)
-        np.testing.assert_array_equal(its.positions_m, world.motion.position_m[frame])
+        np.testing.assert_array_equal(its.positions_m, world.motion[:].position_m[frame])
     one_way = np.zeros((3, 3))
     one_way[0, 2] = 9.0
     its.set_loss_db(one_way)
