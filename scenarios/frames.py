@@ -55,6 +55,11 @@ def instant(t_s: float) -> int:
     return round(t_s * 1e9)
 
 
+def instants(t_s: ArrayLike) -> NDArray[np.int64]:
+    """`instant` of many moments."""
+    return np.rint(np.asarray(t_s, dtype=np.float64) * 1e9).astype(np.int64)
+
+
 def with_frame(t_s: float, frame_s: float) -> float:
     """A moment, or the begin of the frame that it is but for rounding.
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from sortie.perception.classes import CAR
 from sortie.perception.metrics.ap import average_precision
+from sortie.scenarios.frames import instants
 from sortie.sim.results.accuracy import FULL_SCENE, MISSION, Pool, score
 from sortie.sim.results.record import SortieRecord
 
 TABLE = "accuracy"
 WINDOW_S = 5.0
 """AP is taken over so long before each moment."""
-_INSTANT_S = 1e-6
 _SCOPES = {FULL_SCENE: "", MISSION: "mission_"}
 COLUMNS: dict[str, pa.DataType] = {"t_s": pa.float64(), "drone": pa.int32()}
 for _prefix in _SCOPES.values():
@@ -80,7 +80,7 @@ def windowed_ap(pool: Pool) -> NDArray[np.float64]:
     found = np.full(len(pool.t_s), np.nan)
     for drone in np.unique(pool.drone):
         own = np.flatnonzero(pool.drone == drone)
-        begins = np.searchsorted(pool.t_s[own], pool.t_s[own] - WINDOW_S + _INSTANT_S)
+        begins = np.searchsorted(instants(pool.t_s[own]), instants(pool.t_s[own] - WINDOW_S) + 1)
         each = pool.fusions(own)
         for k, begin in enumerate(begins.tolist()):
             found[own[k]] = average_precision(each[begin : k + 1])

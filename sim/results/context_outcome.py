@@ -8,7 +8,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from sortie.radio.counters import CAUSES
-from sortie.sim.results.section import INSTANT_S, Flown, OutcomeSection, Share, Span, figure, ratio
+from sortie.scenarios.frames import instants
+from sortie.sim.results.section import Flown, OutcomeSection, Share, Span, figure, ratio
 
 
 class LostTo(OutcomeSection):
@@ -33,8 +34,8 @@ class ContextOutcome(OutcomeSection):
 
 def losses(receptions: pa.Table, span: Span) -> dict[str, Any]:
     """The figures of the frames that begin within a span."""
-    t_s = receptions["t_s"].to_numpy() + INSTANT_S
-    within = receptions.filter(pa.array((span[0] <= t_s) & (t_s < span[1])))
+    at, (begin, end) = instants(receptions["t_s"].to_numpy()), instants(span)
+    within = receptions.filter(pa.array((begin <= at) & (at < end)))
     lost, heard = {cause: _sum(within[cause]) for cause in CAUSES}, _sum(within["heard"])
     every = heard + sum(lost.values())
     return {

@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
+from sortie.scenarios.frames import frame_at
+
 MAX_ROWS = 25
 COARSE_S = 5.0
 """Changes to the same within this share a row where there are too many rows otherwise."""
@@ -108,7 +110,7 @@ def _alike(changes: Iterable[_Change], within_s: float) -> tuple[list[DecisionRo
     """
     rows: dict[tuple[int, str, str], list[_Change]] = {}
     for c in sorted(changes, key=lambda c: (c.t_s, c.link)):
-        key = int(c.t_s / within_s + 1e-6), f"{c.before} → {c.after}", re.sub(r"[\d.]+", "#", c.reason)
+        key = frame_at(c.t_s, within_s), f"{c.before} → {c.after}", re.sub(r"[\d.]+", "#", c.reason)
         rows.setdefault(key, []).append(c)
     caused: list[DecisionRow] = []
     others: list[DecisionRow] = []

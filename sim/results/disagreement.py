@@ -22,6 +22,7 @@ from sortie.fleet.trust import discounted
 from sortie.policies.contract import Directive, FleetView, Policy, PolicyError, Representation, nothing
 from sortie.policies.damping import is_switch
 from sortie.policies.registry import describe_error
+from sortie.scenarios.frames import frame_at
 from sortie.scenarios.plain_sum import plain_sum
 from sortie.scenarios.plugins.user_calls import is_guarded
 from sortie.sim.results.arrow_types import columns_of, from_table, to_table
@@ -148,7 +149,7 @@ def measure(decisions: Iterable[Decision], policy_of: Callable[[Decision], Polic
         episode = Episode(*link[2:], since * frame_s, (until - since) * frame_s, sends, cause)
         ended.setdefault(link[:2], []).append(episode)
 
-    for frame, group in groupby(decisions, key=lambda d: int(d.t_s / frame_s + 1e-9)):
+    for frame, group in groupby(decisions, key=lambda d: frame_at(d.t_s, frame_s)):
         decided = {d.drone: d for d in group}
         views = {drone: d.view for drone, d in sorted(decided.items())}
         for a, b in combinations(views, 2):

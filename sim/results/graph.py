@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
+from sortie.scenarios.frames import instant, instants
 from sortie.sim.folders import RunError
 from sortie.sim.results import links
 from sortie.sim.results.record import HANDSHAKE, SortieRecord
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 SENT_WITHIN_S = 1.0
 """An edge tells what was sent over it in this time before."""
-_INSTANT_S = 1e-6
 
 
 def graph(record: SortieRecord, t_s: float) -> nx.DiGraph:
@@ -89,21 +88,21 @@ def edges_of(rows: pa.Table) -> Iterator[tuple[int, int, float]]:
 def rows_at(table: pa.Table, t_s: float) -> pa.Table:
     """The rows of the latest time that is not after `t_s`; of a table in order of time."""
     times_s = table["t_s"].to_numpy()
-    end = int(np.searchsorted(times_s, t_s + _INSTANT_S, side="right"))
+    end = int(np.searchsorted(instants(times_s), instant(t_s), side="right"))
     begin = int(np.searchsorted(times_s, times_s[end - 1], side="left")) if end else 0
     return table.slice(begin, end - begin)
 
 
 def _latest(table: pa.Table, t_s: float, keys: list[str], columns: list[str]) -> list[dict[str, Any]]:
     """Each key's last row that is not after `t_s`."""
-    before = table.filter(pc.less_equal(table["t_s"], t_s + _INSTANT_S)).select([*keys, *columns])
+    before = table.filter(pa.array(instants(table["t_s"].to_numpy()) <= instant(t_s))).select([*keys, *columns])
     return list({tuple(row[key] for key in keys): row for row in before.to_pylist()}.values())
 
 
 def _sent(transmissions: pa.Table, t_s: float) -> dict[tuple[int, int], tuple[tuple[str, ...], int]]:
     """What each link's sender handed to the radio in the last second: representations and bytes."""
     times_s = transmissions["t_sent_s"].to_numpy()
-    within = (times_s > t_s - SENT_WITHIN_S) & (times_s <= t_s + _INSTANT_S)
+    within = (times_s > t_s - SENT_WITHIN_S) & (instants(times_s) <= instant(t_s))
     found: dict[tuple[int, int], tuple[tuple[str, ...], int]] = {}
     for row in transmissions.filter(pa.array(within)).to_pylist():
         if row["representation"] == HANDSHAKE:

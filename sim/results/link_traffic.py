@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from sortie.scenarios.frames import frames_at
 from sortie.scenarios.link_state import is_tried
 
 Floats = NDArray[np.float64]
@@ -72,7 +73,7 @@ class LinkTraffic:
             self._recent = rows
             return out
         first = self._frames - len(t_s) - window
-        frame = np.floor(rows[:, 0] * self._rate_hz + 1e-6).astype(int) - first
+        frame = frames_at(rows[:, 0], 1.0 / self._rate_hz) - first
         bins = np.zeros((len(t_s) + window, n, n))
         now = (frame >= 0) & (frame < len(bins))
         np.add.at(bins, (frame[now], rows[now, 1].astype(int), rows[now, 2].astype(int)), rows[now, 3])

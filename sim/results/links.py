@@ -9,6 +9,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from sortie.scenarios.disc import LISTED_IDS
+from sortie.scenarios.frames import instant
 from sortie.sim.results.record import Recorder
 
 TABLE = "links"
@@ -61,7 +62,7 @@ class LinkLog:
 
     def is_due(self, t_s: float) -> bool:
         """Whether rows are wanted now."""
-        return t_s >= self._due_s - 1e-6
+        return instant(t_s) >= instant(self._due_s)
 
     def write(
         self,

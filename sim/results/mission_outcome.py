@@ -19,8 +19,9 @@ from sortie.fleet.coverage import cameras_of
 from sortie.perception.geometry import FULL, USUAL, Cameras, Lens, camera_margins
 from sortie.perception.metrics.overlap import overlapping
 from sortie.perception.scene.traffic import TARGET_SIZE_M, TargetPath
+from sortie.scenarios.frames import instant, instants
 from sortie.sim.results.record import SortieRecord
-from sortie.sim.results.section import INSTANT_S, Flown, OutcomeSection, Seconds, Share, figure
+from sortie.sim.results.section import Flown, OutcomeSection, Seconds, Share, figure
 from sortie.sim.results.spool import batches, in_blocks
 
 Floats = NDArray[np.float64]
@@ -210,27 +211,27 @@ def _detected(record: SortieRecord, frame_s: Floats, tracked: dict[int, Bools]) 
     scenario = record.scenario
     if record.detector == "none" or not tracked or scenario.takes_turns:  # then boxes of the others may hold it
         return None, None
-    instants = np.array(scenario.scored_frames) * scenario.frame_s + scenario.perception.fusion_delay_s
+    scored_s = np.array(scenario.scored_frames) * scenario.frame_s + scenario.perception.fusion_delay_s
     periods_s = np.array([period.start for period in scenario.scoring_periods]) * scenario.frame_s
-    flown = instants < scenario.duration_s - INSTANT_S
-    instants, lasts_s = instants[flown], np.diff(periods_s, append=scenario.duration_s)[flown]
+    flown = instants(scored_s) < instant(scenario.duration_s)
+    scored_s, lasts_s = scored_s[flown], np.diff(periods_s, append=scenario.duration_s)[flown]
     size_m = TARGET_SIZE_M[:2]
     paths = {k: TargetPath.of(scenario.mission.targets[k]) for k in tracked}
     truths = {
-        k: np.array([(x, y, *size_m, yaw) for x, y, yaw in map(path.pose, instants.tolist())]).reshape(-1, 5)
+        k: np.array([(x, y, *size_m, yaw) for x, y, yaw in map(path.pose, scored_s.tolist())]).reshape(-1, 5)
         for k, path in paths.items()
     }
-    hit = {k: np.zeros(len(instants), bool) for k in tracked}
+    hit = {k: np.zeros(len(scored_s), bool) for k in tracked}
     for batch in batches(record.tables, "detections", ("t_s", "x_m", "y_m", "length_m", "width_m", "yaw_rad")):
         if not batch.num_rows:
             continue
         at_s, *box = (column.to_numpy() for column in batch.columns)
-        found, of = np.stack(box, axis=-1), np.searchsorted(instants, at_s - INSTANT_S)
+        found, of = np.stack(box, axis=-1), np.searchsorted(instants(scored_s), instants(at_s))
         here = slice(int(of.min()), int(of.max()) + 1)
         for k, truth in truths.items():
-            _, which, iou = overlapping(found, truth[here], of, np.arange(len(instants))[here])
+            _, which, iou = overlapping(found, truth[here], of, np.arange(len(scored_s))[here])
             hit[k][here][which[iou >= FOUND_IOU]] = True
-    frame = np.searchsorted(frame_s, instants + INSTANT_S, side="right") - 1
+    frame = np.searchsorted(instants(frame_s), instants(scored_s), side="right") - 1
     return _share_and_gap((hit[k], now[frame], lasts_s) for k, now in tracked.items())
 
 

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from sortie.perception.classes import NEAR_M, PERSON
 from sortie.perception.metrics.ap import Matched, average_precision, best_pairs, hits
 from sortie.perception.thermal import in_cone
+from sortie.scenarios.frames import frame_at, frames_at, instants
 from sortie.sim.results.record import SortieRecord, classes_in
 from sortie.sim.results.regions import Regions
-from sortie.sim.results.section import INSTANT_S, Flown, OutcomeSection, Seconds, Share, figure
+from sortie.sim.results.section import Flown, OutcomeSection, Seconds, Share, figure
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -86,7 +87,7 @@ def _located(record: SortieRecord) -> tuple[float | None, float | None]:
         return None, None
     alone = _places(sightings, [round(t / frame_s) for t in sightings["t_s"].to_pylist()])
     joined = _places(boxes, boxes["t_s"].to_pylist())
-    frames = [(int(t / frame_s + INSTANT_S), d) for t, d in keys]
+    frames = [(frame_at(t, frame_s), d) for t, d in keys]
     return _near(here_m, [joined.get(k) for k in keys]), _near(here_m, [alone.get(k) for k in frames])
 
 
@@ -139,7 +140,7 @@ def _known(alerts: pa.Table, t_s: Floats, drones: int, frame_s: float) -> Bools:
     for drone in range(drones):
         mine = whose == drone
         # a drone decides within the frame
-        last = np.searchsorted(at_s[mine], t_s + frame_s - INSTANT_S, side="right") - 1
+        last = np.searchsorted(frames_at(at_s[mine], frame_s), frames_at(t_s, frame_s), side="right") - 1
         out[:, drone] = np.concatenate([known[mine].astype(bool), [False]])[last]  # −1: none yet
     return out
 
@@ -151,7 +152,7 @@ def _average_precision(record: SortieRecord, t_s: Floats, looking: Bools, people
     n = looking.shape[1]
     states, table = record.tables["states"], record.tables["sightings"]
     position = np.stack([states[c].to_numpy() for c in ("x_m", "y_m", "z_m")], axis=-1).reshape(-1, n, 3)
-    frame = np.searchsorted(t_s, table["t_s"].to_numpy() - INSTANT_S)
+    frame = np.searchsorted(instants(t_s), instants(table["t_s"].to_numpy()))
     image = frame * n + table["drone"].to_numpy()
     spots = np.column_stack([table["x_m"].to_numpy(), table["y_m"].to_numpy()])
     score: Any = table["score"].to_numpy()

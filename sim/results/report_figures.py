@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sortie.perception.metrics.ap import average_precision
 from sortie.perception.scene.traffic import TargetPath
+from sortie.scenarios.frames import frame_from
 from sortie.scenarios.representation import REPRESENTATION_OF
 from sortie.scenarios.schema import Jammer
 from sortie.sim.folders import RunError
@@ -288,7 +289,7 @@ def landings(record: SortieRecord) -> list[dict[str, Any]]:
 def _edges(record: SortieRecord) -> Floats:
     """Begin and end of every second; the last one ends with the sortie."""
     end_s = record.scenario.duration_s
-    return np.append(np.arange(0.0, end_s - 1e-9), end_s)
+    return np.append(np.arange(frame_from(end_s, 1.0), dtype=float), end_s)
 
 
 def accuracy_points(record: SortieRecord, *, mission: bool) -> Floats:

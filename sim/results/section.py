@@ -15,8 +15,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sortie.sim.results.record import SortieRecord
 
-INSTANT_S = 1e-6
-"""A frame begins a few digits beside the time that a scenario names."""
 Span = tuple[float, float]
 """From a time (inclusive) to another (exclusive)."""
 Computes = TypeVar("Computes", bound="Callable[[Flown], Any]")
