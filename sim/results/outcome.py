@@ -106,7 +106,7 @@ class OutcomeDict(dict[str, Any]):
 
     @property
     def data(self) -> dict[str, Any]:
-        """All values in a plain dictionary. `pprint` prints them, as those of any dictionary that has them as `data`."""
+        """All values in a plain dictionary; `pprint` looks for them under this name."""
         return dict(self)
 
     __repr__ = UserDict.__repr__
