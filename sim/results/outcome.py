@@ -111,6 +111,9 @@ class OutcomeDict(dict[str, Any]):
 
     __repr__ = UserDict.__repr__
 
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:  # of IPython and notebooks
+        printer.pretty(self.data)
+
     @property
     def _drones(self) -> int:
         return len(self["battery"]) if "battery" in self else 0
