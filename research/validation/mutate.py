@@ -62,7 +62,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "fleet": ("*.py", "energy/*.py", "flight/*.py", "messages/*.py"),
     "policies": ("*.py", "catalogue/*.py", "catalogue/prior/*.py"),
     "perception": ("*.py", "metrics/*.py", "network/*.py", "network/fusion/*.py", "scene/*.py", "surrogate/*.py", "tracking/*.py"),
-    "sim": ("engine/*.py", "results/*outcome*.py", "results/accuracy.py", "results/regions.py", "results/disagreement.py",
+    "sim": ("engine/*.py", "results/*outcome*.py", "results/accuracy.py", "results/transitions.py", "results/regions.py", "results/disagreement.py",
             "results/traffic.py", "results/link_traffic.py", "campaign/spread.py", "campaign/rows.py", "campaign/sensitivity.py"),
 }  # fmt: skip
 """The files of each room that decide figures: not its reading, errors, pages and command line."""

@@ -33,16 +33,13 @@ class ConnectivityOutcome(OutcomeSection):
     connected_share: Share | None = figure("Share of the moments at which all drones that fly reach each other.")
     partitioned_s: Seconds | None = figure("The rest of them, as time: for how long the fleet was in parts.")
     mean_hops: Amount | None = figure(
-        "Links on the shortest route, the mean over all pairs with one; in fleets of more than 200 drones from some "
-        "200 of them."
+        "Links on the shortest route, mean over all pairs with one; above 200 drones over pairs from some 200 of them."
     )
     bottleneck: Bottleneck = figure(
-        "The link that limited the worst-off pair that was connected, at the worst moment. Null in fleets of more than "
-        "200 drones."
+        "The link that limited the worst-off connected pair, at worst. Null in fleets of more than 200 drones."
     )
     articulation: dict[str, Share] = figure(
-        "Share of the moments at which the fleet, or its part, would have fallen apart without the drone; of drones "
-        "with any."
+        "Share of the moments at which the fleet, or its part, would fall apart without the drone; of drones with any."
     )
 
     @classmethod

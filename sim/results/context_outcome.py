@@ -22,8 +22,7 @@ class LostTo(OutcomeSection):
 
 class ContextOutcome(OutcomeSection):
     lost: Share | None = figure(
-        "Share of descriptor receptions that were lost on the air. Each descriptor counts once for each other drone in "
-        "the air."
+        "Share of descriptor receptions lost on the air; a descriptor counts once for each other drone in the air."
     )
     lost_to: LostTo = figure("The part of it that each cause has; together they are `lost`.")
 

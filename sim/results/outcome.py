@@ -106,10 +106,13 @@ class OutcomeDict(dict[str, Any]):
 
     @property
     def data(self) -> dict[str, Any]:
-        """All values in a plain dictionary. `pprint` prints them, as those of any dictionary that has them as `data`."""
+        """All values in a plain dictionary; `pprint` looks for them under this name."""
         return dict(self)
 
     __repr__ = UserDict.__repr__
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:  # of IPython and notebooks
+        printer.pretty(self.data)
 
     @property
     def _drones(self) -> int:

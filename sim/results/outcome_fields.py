@@ -70,16 +70,14 @@ class Outcome(OutcomeSection):
     replication: Count = figure("Which draw of a campaign.")
     version: str = figure("The code that made the record: release, plus sign, digest of the package and its libraries.")
     own_files: dict[str, str] = figure(
-        "Digest of each file beside the package that flew: policies, detector and fusion with the modules that they "
-        "import, weights, recordings, traces."
+        "Digests of own files: policies, detector and fusion with modules they import, weights, recordings, traces."
     )
     fingerprint: str = figure("SHA-256 over the record's values; equal inputs give equal fingerprints.")
     duration_s: Seconds = figure("Length of the sortie.")
     frame_s: Seconds = figure("From one frame to the next.")
     ap50: Ap50 = figure("Average precision of cars, of the drones that fly.")
     ap_by_class: ByClass = figure(
-        "AP of each class of targets. A box counts for its own class alone. Null for classes that drones do not look "
-        "for, and for all where cars are the only class."
+        "AP by class; a box counts for its own alone. Null of classes not looked for, of all if cars are the only one."
     )
     tracking: TrackingOutcome = figure("How well each drone that flies follows the cars, beside `ap50`.")
     mission: MissionOutcome = figure("The mission of the whole fleet; null without a region, a target or a detector.")
@@ -90,14 +88,12 @@ class Outcome(OutcomeSection):
     context_share: Share | None = figure("Context bytes over all bytes.")
     data_rate_mbps: Mbps = figure("Payload bytes handed to the radio over the whole sortie, as Mb/s.")
     deadline_miss_rate: Share | None = figure(
-        "Payloads that expired or were replaced before all of them was delivered, over those whose fate is known. "
-        "Handshakes are no payloads."
+        "Payloads that expired or were replaced before all was delivered, over those of known fate; without handshakes."
     )
     payload_fates: dict[str, Count] = figure("Counts of payloads by status and reason, without handshakes.")
     medium_busy_fraction: Share = figure("Share of the time in which the channel was busy.")
     age_s: Ages = figure(
-        "Age of peers' descriptors when a policy read them. The last one of a drone that fell silent grows older to "
-        "the end."
+        "Age of peers' descriptors when a policy read them; the last one of a drone that fell silent grows ever older."
     )
     data_age_s: Ages = figure("Age of peers' captures when they were fused.")
     data_age_mean_s: Seconds | None = figure("Its mean; it follows the mean over time, at any rate of sending.")

@@ -28,8 +28,7 @@ class PeopleOutcome(OutcomeSection):
         "after sharing."
     )
     located_share: Share | None = figure(
-        "Of the people in a drone's region at a scored fusion, the share of which the drone had a box within 2 m, its "
-        "own or a peer's."
+        "Share of people in a drone's region at a scored fusion of whom it had a box within 2 m, its own or a peer's."
     )
     located_alone_share: Share | None = figure("The same by the drone's own thermal camera in that frame.")
     in_region_drone_s: Seconds | None = figure("Time with people in regions of flying drones, summed over drones.")

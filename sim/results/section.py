@@ -1,6 +1,6 @@
-"""What all sections of the outcome share: the base of their models, quantities with unit and range, and the flown sortie.
+"""What sections of the outcome share: the base of their models, quantities with unit and range, the flown sortie.
 
-A section is a model of its figures, in the module that computes them: `compute` takes a `Flown` and returns the figures by
+A section is a model of its figures, in the module that computes them: `compute` takes a `Flown` and returns them by
 the names of the fields. `sortie.sim.results.outcome_fields.Outcome` puts the sections together.
 """
 
@@ -70,7 +70,7 @@ class Flown:
 
 
 def once(compute: Computes) -> Computes:
-    """Decorates a function of a flown sortie that several sections call: it runs at the first call, and its result is kept."""
+    """Decorates a function of a flown sortie that several sections call: its first result is kept."""
 
     @functools.wraps(compute)
     def part(flown: Flown) -> Any:

@@ -17,7 +17,6 @@ from sortie.sim.results.section import Bytes, Flown, OutcomeSection, Span, figur
 from sortie.sim.results.selection import percentiles
 from sortie.sim.results.spool import batches
 
-DATA_STATUSES = ("delivered", "lost", "expired", "in_flight")
 REASONS = {
     Status.DELIVERED: ("", "other_feature_space"),
     Status.LOST: ("fragment_lost", "no_link", "receiver_gone", "sender_gone"),
@@ -64,14 +63,13 @@ class Traffic:
 
     def bytes_by_status(self) -> dict[str, int]:
         """Payload bytes by what they came to. Of a payload that arrived in part, the rest came to what its reason says."""
-        out = {
-            status: sum(s.payload_bytes for fate, s in self._sums.items() if fate.status == status)
-            for status in DATA_STATUSES
-        }
+        out = dict.fromkeys(map(str, REASONS), 0)
         for fate, s in self._sums.items():
             if fate.status == Status.PARTIAL:
                 out[Status.DELIVERED] += s.arrived_bytes
                 out[REST[fate.reason]] += s.payload_bytes - s.arrived_bytes
+            else:
+                out[fate.status] += s.payload_bytes
         return out
 
     @property

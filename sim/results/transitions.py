@@ -29,8 +29,7 @@ class PoliciesOutcome(OutcomeSection):
         "Directives that the shield replaced or could not put right, and its changes at gates."
     )
     invariant_violations: Count = figure(
-        "Violations of invariants by what the gates enforced, after staleness rules and damping; one that lasts counts "
-        "once."
+        "Violations of invariants by what gates enforced, after staleness and damping; one that lasts counts once."
     )
     violated_ticks: Count = figure("Decisions of all drones at which the enforced directives broke an invariant.")
     violations_by_cause: Violations = figure("`invariant_violations`, by the step that broke the line.")

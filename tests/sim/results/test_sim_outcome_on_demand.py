@@ -119,6 +119,11 @@ def test_it_is_used_as_any_dictionary() -> None:
         outcome(by_hand.record())["nothing"]
 
 
+def test_a_notebook_shows_it_as_any_dictionary() -> None:
+    pretty = pytest.importorskip("IPython.lib.pretty").pretty
+    assert pretty(outcome(by_hand.record())) == pretty(dict(outcome(by_hand.record())))
+
+
 def test_names_with_dots_find_figures_and_flat_gives_all_numbers() -> None:
     result = outcome(by_hand.record())
     wanted = {
