@@ -57,19 +57,6 @@ _TOTALS = (
     *(f"{VIOLATIONS_OF}{cause}" for cause in CAUSES),
 )
 """Those that the outcome needs."""
-_OF_THE_RECORD = [
-    "scenario",
-    "duration_s",
-    "frame_s",
-    "policy",
-    "seed",
-    "replication",
-    "version",
-    "own_files",
-    "metrics",
-    "fingerprint",
-]
-"""Fields of the outcome that the record has too."""
 
 Text = Annotated[str, Field(max_length=MOST_CHARACTERS)]
 Count = Annotated[float, Field(ge=0, le=LARGEST)]
@@ -180,7 +167,7 @@ def _ensure_together(read: Mapping[str, Any], record: SortieRecord) -> None:
         ValueError: naming the field that differs.
     """
     known = outcome(record)
-    for name in _OF_THE_RECORD:
+    for name in ("scenario", "duration_s", "frame_s", *(n for n in About.model_fields if n in known), "fingerprint"):
         value = known[name]
         if read.get(name, value if name != "fingerprint" else None) != value:
             raise ValueError(f"outcome.json: {name} is {read.get(name)!r:.80}, the other files give {value!r:.80}")
