@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sortie.fleet.flight.motion import MotionError
-from sortie.fleet.flight.route import FramePath, bend, spread
+from sortie.fleet.flight.route import PEAK, FramePath, bend, spread, turned
 from sortie.fleet.flight.safety import INSTANTS_S, JITTERS
 from sortie.fleet.flight.ways import route_path
 from sortie.scenarios import schema
@@ -28,7 +28,7 @@ Place = tuple[float, float]
 
 LEAST_MOVE_M = 2.0
 """A wish for a place nearer than this to where a drone stands moves nothing: jitter and estimates are no reason."""
-_PEAK_SPEED, _PEAK_ACCELERATION = 2.25, 9.0
+_PEAK_ACCELERATION = 9.0
 """Of a unit step spread over a unit of time (quadratic B-spline)."""
 
 
@@ -53,7 +53,7 @@ class Move(NamedTuple):
     @property
     def speed_mps(self) -> float:
         """The fastest that it gets."""
-        return _PEAK_SPEED * self.length_m / self.width_s
+        return PEAK * self.length_m / self.width_s
 
     @property
     def acceleration_mps2(self) -> float:
@@ -88,11 +88,8 @@ class Course:
 
     def world_m(self, places_m: Array, frames: slice = slice(None)) -> Array:
         """Places [..., 2] of the formation's frame, one for every frame, on the ground, ENU."""
-        yaw = self.path.yaw_rad[frames]
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        x, y = places_m[..., 0], places_m[..., 1]
-        turned: Array = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-        return turned + self.path.position_m[frames]
+        world_m: Array = turned(places_m, self.path.yaw_rad[frames]) + self.path.position_m[frames]
+        return world_m
 
     def wanted_shift_m(self, drone: int, frame: int, x_m: float, y_m: float) -> Place:
         """The shift that would have a drone over (x, y) now."""
@@ -269,7 +266,7 @@ def _distance_m(a: Array, b: Array) -> float:
 
 def _width_s(length_m: float, bounds: Bounds) -> float:
     """The shortest time for a move within speed and acceleration."""
-    by_speed = _PEAK_SPEED * length_m / bounds.speed_mps
+    by_speed = PEAK * length_m / bounds.speed_mps
     return max(by_speed, math.sqrt(_PEAK_ACCELERATION * length_m / bounds.acceleration_mps2))
 
 

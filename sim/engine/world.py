@@ -124,15 +124,8 @@ class World:
         errors: Mapping[int, np.ndarray],
         links: LinkLog,
     ) -> None:
-        self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
-            env,
-            motion,
-            batteries,
-            air,
-            scene,
-            plan,
-        )
-        self.drones = drones
+        self.env, self.motion, self.batteries, self.air = env, motion, batteries, air
+        self.scene, self.plan, self.drones = scene, plan, drones
         n = len(drones)
         self.extra_loss_db: np.ndarray | None = weaker_senders_db(scenario)
         """[N, N], sender by receiver: what weaker senders and scenario events add to the path loss; None for nothing."""
@@ -156,9 +149,8 @@ class World:
         self.frame = 0
         self._work = deque([[Work()] * n], maxlen=1 + max(1, round(scenario.context.rate_hz * SECOND_S)))
         self._headrooms = [(1.0, 1.0)] * n
-        self._down: dict[
-            int, list[tuple[int, int]]
-        ] = {}  # the frames in which a drone is on the ground, where it stays
+        self._down: dict[int, list[tuple[int, int]]] = {}
+        """The frames in which a drone is on the ground, where it stays."""
         self.homebound: set[int] = set()
         """Drones that descend."""
         self.now = plan.at(0.0)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sortie.fleet.flight.manoeuvres import Appearance, Descent, Manoeuvre, Motion, Shifted, Steered
 from sortie.fleet.flight.motion import Trajectories, attitude, fly, thrust_mps2
-from sortie.fleet.flight.rotor import RotorPower
+from sortie.fleet.flight.rotor import RotorPower, fleet_power_w
 from sortie.fleet.flight.steering import GoTo, SteeredWay, Velocity, steer
 from sortie.fleet.flight.viewpoints import Plan, ViewpointWish, bounds_of, course_of
 from sortie.fleet.flight.ways import starts_m
@@ -220,11 +220,11 @@ def test_what_rotors_draw_follows_the_manoeuvres_and_a_custom_model_sees_the_who
     fleet = Fleet.model_validate({**fleet_of(HOVERS).model_dump(), **own})
     motion = Motion(fly(fleet, 20.0, 0.1, 3))
     rotors = RotorPower(fleet, motion)
-    before = rotors.of(slice(None))
+    before = fleet_power_w(fleet, motion[:])
     pilots = Pilots(fleet, motion)
     motion.change([pilots.steered(0, 70, Velocity(5.0, 0.0)), pilots.steered(1, 70, Velocity(0.0, 0.0, 3.0))])
     rotors.forget()
-    after = RotorPower(fleet, motion).of(slice(None))
+    after = fleet_power_w(fleet, motion[:])
     for frame in (0, 69, 70, 90, 199):
         np.testing.assert_array_equal(rotors.at(frame), after[frame])
     assert set(asked) == {200}
