@@ -98,7 +98,8 @@ class Motion:
         self.frames, self.drones = nominal.position_m.shape[:2]
         self._step_s = float(nominal.time_s[1] - nominal.time_s[0]) if self.frames > 1 else 1.0
         self._ways: dict[int, Shifted | Steered] = {}
-        self._descents: dict[int, Descent] = {}
+        self.descents: dict[int, Descent] = {}
+        """By drone, those that lead down."""
         self._flown: dict[str, Array] = {}  # there are none before the first manoeuvre
         self._until = 0  # so many frames of them are worked out
 
@@ -125,7 +126,7 @@ class Motion:
         for drone, way in self._ways.items():
             shift, *_ = way.shift(nominal, rest)
             position[:, drone, : shift.shape[1]] += shift
-        for drone, descent in self._descents.items():
+        for drone, descent in self.descents.items():
             position[:, drone, 2] = descent.height_m(self.nominal.time_s, rest)
         return position
 
@@ -138,9 +139,9 @@ class Motion:
         for manoeuvre in manoeuvres:
             match manoeuvre:
                 case Descent():
-                    self._descents[manoeuvre.drone] = manoeuvre
+                    self.descents[manoeuvre.drone] = manoeuvre
                 case Appearance():
-                    self._descents.pop(manoeuvre.drone, None)
+                    self.descents.pop(manoeuvre.drone, None)
                 case _:
                     self._ways[manoeuvre.drone] = manoeuvre
 
@@ -164,7 +165,7 @@ class Motion:
             drones = list(self._ways)
             for name, values in self._on_ways(frames, drones).items():
                 flown[name][frames, drones] = values[: frames.stop - frames.start]
-        for drone, descent in self._descents.items():
+        for drone, descent in self.descents.items():
             of, height_m = (frames, drone, 2), descent.height_m(self.nominal.time_s, frames)
             flown["est_position_m"][of] += height_m - flown["position_m"][of]
             flown["position_m"][of] = height_m

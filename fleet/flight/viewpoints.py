@@ -121,9 +121,9 @@ def course_of(fleet: schema.Fleet, time_s: Array) -> Course:
     course = Course(time_s, route_path(formation, fleet.route, time_s), slot_m)
     bounds = bounds_of(fleet)
     for drone in members:
-        slot = slot_m[drone]
-        if not fenced(course, bounds, drone, (), 0):
-            x, y = course.world_m(slot[None])[first_outside(course.world_m(slot[None]), bounds)]
+        place_m = first_outside(course, bounds, drone)
+        if place_m is not None:
+            x, y = place_m
             raise MotionError(
                 f"fleet.viewpoints.fence_m {fleet.viewpoints.fence_m} must hold every slot's way with {JITTERS:g} times "
                 f"pose_jitter_m to spare: drone {drone}'s slot comes to ({x:.1f}, {y:.1f})"
@@ -191,24 +191,18 @@ class ViewpointWish:
         if near is not None:
             return f"would come too near drone {near}"
         plan = (*self.plans[self.drone], move)
-        return "" if fenced(self.course, self.bounds, self.drone, plan, self.frame) else "would leave the fence"
+        outside_m = first_outside(self.course, self.bounds, self.drone, plan, self.frame)
+        return "" if outside_m is None else "would leave the fence"
 
 
-def fenced(course: Course, bounds: Bounds, drone: int, plan: Plan, frame: int) -> bool:
-    """Whether a drone's place stays within the fence from a frame to the end."""
+def first_outside(course: Course, bounds: Bounds, drone: int, plan: Plan = (), frame: int = 0) -> Array | None:
+    """The first place outside the fence that a drone's place comes to from a frame to the end; None where it stays inside."""
     if bounds.fence_m is None:
-        return True
-    rest = slice(frame, None)
-    places = course.slot_m[drone] + shift_m(plan, course.time_s[rest])
-    return first_outside(course.world_m(places, rest), bounds) is None
-
-
-def first_outside(world_m: Array, bounds: Bounds) -> int | None:
-    """The first of [T, 2] places that lies outside the fence."""
-    assert bounds.fence_m is not None  # noqa: S101
-    low, high = np.array(bounds.fence_m[:2]), np.array(bounds.fence_m[2:])
-    outside = ((world_m < low) | (world_m > high)).any(axis=-1)
-    return int(outside.argmax()) if outside.any() else None
+        return None
+    rest, (x_min, y_min, x_max, y_max) = slice(frame, None), bounds.fence_m
+    world_m = course.world_m(course.slot_m[drone] + shift_m(plan, course.time_s[rest]), rest)
+    outside = ((world_m < (x_min, y_min)) | (world_m > (x_max, y_max))).any(axis=-1)
+    return world_m[outside.argmax()] if outside.any() else None
 
 
 def least_m(course: Course, bounds: Bounds, i: int, j: int) -> float:

@@ -106,7 +106,10 @@ class Manoeuvres:
             for drone, answer in answers.items():
                 if isinstance(answer, str) and source.lasts:
                     self._again_at[source.event, drone] = frame + self._retry_frames
-                self._report(source, drone, source.text(drone, answer))
+                text = source.text(drone, answer)
+                if text and self._reported.get((source.event, drone)) != text:  # once, however often it is repeated
+                    self._reported[source.event, drone] = text
+                    self._world.note(drone, source.event, text)
             self._fly([a for a in answers.values() if a is not None and not isinstance(a, str)])
             source.decided()
 
@@ -125,8 +128,7 @@ class Manoeuvres:
         frame = world.next_frame
         if frame >= world.motion.frames:
             return None
-        flown = world.motion[frame : frame + 1]
-        height_m = float(flown.position_m[0, drone, 2])
+        height_m = float(world.motion[frame : frame + 1].position_m[0, drone, 2])
         self._fly([Descent(drone, frame, height_m, descent_mps)])
         return frame * self._frame_s + max(0.0, height_m) / descent_mps
 
@@ -135,7 +137,7 @@ class Manoeuvres:
         frame = self._world.next_frame
         if frame >= self._world.motion.frames:
             return
-        manoeuvres: list[Manoeuvre] = [Appearance(drone, frame)]
+        manoeuvres: list[Manoeuvre] = [Appearance(drone, frame)] if drone in self._world.motion.descents else []
         for source in self._sources:
             anew = source.appear(drone, frame)
             if anew:
@@ -146,12 +148,6 @@ class Manoeuvres:
     def _fly(self, manoeuvres: Sequence[Manoeuvre]) -> None:
         if manoeuvres:
             self._world.reroute(manoeuvres)
-
-    def _report(self, source: Source, drone: int, text: str) -> None:
-        """Record a text once, however often it is repeated."""
-        if text and self._reported.get((source.event, drone)) != text:
-            self._reported[source.event, drone] = text
-            self._world.note(drone, source.event, text)
 
 
 class Viewpoints(Source):
