@@ -96,12 +96,7 @@ class FlightSenses:
         cameras = self._cameras[drone]
         position, orientation, velocity, believed = (
             map(tuple, states[:, drone].tolist())
-            for states in (
-                poses.position_m,
-                poses.orientation_xyzw,
-                velocity_mps,
-                poses.est_position_m,
-            )
+            for states in (poses.position_m, poses.orientation_xyzw, velocity_mps, poses.est_position_m)
         )
         yaw = poses.est_yaw_rad[:, drone].tolist()
         radius = footprint_radius_m(poses.est_position_m[:, drone, 2], cameras).tolist()
@@ -117,16 +112,8 @@ class FlightSenses:
                 view,
                 turned(turn, wrong) if wrong else turn,
             )
-            for frame, v, r, view, at, turn, est, heading, wrong in zip(
-                range(frames.start, frames.start + len(yaw)),
-                velocity,
-                radius,
-                views,
-                position,
-                orientation,
-                believed,
-                yaw,
-                wrong_rad,
-                strict=True,
+            for frame, (v, r, view, at, turn, est, heading, wrong) in enumerate(
+                zip(velocity, radius, views, position, orientation, believed, yaw, wrong_rad, strict=True),
+                start=frames.start,
             )
         ]

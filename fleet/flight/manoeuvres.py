@@ -14,13 +14,14 @@ import numpy.typing as npt
 
 from sortie.fleet.flight.frames import up_vector, wrapped, yaw_rad
 from sortie.fleet.flight.motion import OF_A_DRONE, Trajectories, attitude, body_rates, continuous, thrust_mps2
+from sortie.fleet.flight.route import across, turned
 from sortie.fleet.flight.steering import SteeredWay, Vector
 from sortie.fleet.flight.viewpoints import Course, Plan, shifts
 from sortie.scenarios import scratch
 
 Array = npt.NDArray[np.float64]
-Shift = tuple[Array, Array, Array]
-"""Of a drone's place, ENU, with its two derivatives in time: [F, 2] or [F, 3] each."""
+Shift = tuple[Array, Array, Array, Array]
+"""Of a drone's place, ENU, with its two derivatives in time, [F, 2] or [F, 3] each; and the heading, [F]."""
 
 BLOCK = 32
 """At least so many frames are worked out at once."""
@@ -36,17 +37,12 @@ class Shifted:
     course: Course
 
     def shift(self, nominal: Trajectories, frames: slice) -> Shift:
-        """How far it is away from its nominal place in some frames; the shift turns with the formation."""
+        """How far it is away from its nominal place in some frames. The shift turns with the formation, as it looks ahead."""
         path = self.course.path
-        cos, sin = np.cos(path.yaw_rad[frames])[:, None], np.sin(path.yaw_rad[frames])[:, None]
         rate, rate_change = path.yaw_rate_radps[frames, None], path.yaw_acceleration_radps2[frames, None]
-        shift, speed, push = (_turned(v, cos, sin) for v in shifts(self.plan, nominal.time_s))
-        push = push + 2 * rate * _across(speed) + rate_change * _across(shift) - rate**2 * shift
-        return shift, speed + rate * _across(shift), push
-
-    def heading_rad(self, nominal: Trajectories) -> Array:
-        """Where it looks: ahead of the formation."""
-        return nominal.frame_yaw_rad
+        shift, speed, push = (turned(v, path.yaw_rad[frames]) for v in shifts(self.plan, nominal.time_s))
+        push = push + 2 * rate * across(speed) + rate_change * across(shift) - rate**2 * shift
+        return shift, speed + rate * across(shift), push, nominal.frame_yaw_rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +55,9 @@ class Steered:
     start_m: Vector
 
     def shift(self, nominal: Trajectories, frames: slice) -> Shift:
-        """How far it is away from its nominal place in some frames."""
+        """How far it is away from its nominal place in some frames. It looks east, as where it hovers."""
         place, speed, push = self.way.at(nominal.time_s)
-        return place - np.array(self.start_m), speed, push
-
-    def heading_rad(self, nominal: Trajectories) -> Array:
-        """Where it looks: east, as where it hovers."""
-        return np.zeros(len(nominal.time_s))
+        return place - np.array(self.start_m), speed, push, np.zeros(len(place))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +98,8 @@ class Motion:
         self.frames, self.drones = nominal.position_m.shape[:2]
         self._step_s = float(nominal.time_s[1] - nominal.time_s[0]) if self.frames > 1 else 1.0
         self._ways: dict[int, Shifted | Steered] = {}
-        self._descents: dict[int, Descent] = {}
+        self.descents: dict[int, Descent] = {}
+        """By drone, those that lead down."""
         self._flown: dict[str, Array] = {}  # there are none before the first manoeuvre
         self._until = 0  # so many frames of them are worked out
 
@@ -131,9 +124,9 @@ class Motion:
         nominal = self.nominal[rest]
         position = nominal.position_m.copy()
         for drone, way in self._ways.items():
-            shift, _, _ = way.shift(nominal, rest)
+            shift, *_ = way.shift(nominal, rest)
             position[:, drone, : shift.shape[1]] += shift
-        for drone, descent in self._descents.items():
+        for drone, descent in self.descents.items():
             position[:, drone, 2] = descent.height_m(self.nominal.time_s, rest)
         return position
 
@@ -146,9 +139,9 @@ class Motion:
         for manoeuvre in manoeuvres:
             match manoeuvre:
                 case Descent():
-                    self._descents[manoeuvre.drone] = manoeuvre
+                    self.descents[manoeuvre.drone] = manoeuvre
                 case Appearance():
-                    self._descents.pop(manoeuvre.drone, None)
+                    self.descents.pop(manoeuvre.drone, None)
                 case _:
                     self._ways[manoeuvre.drone] = manoeuvre
 
@@ -172,7 +165,7 @@ class Motion:
             drones = list(self._ways)
             for name, values in self._on_ways(frames, drones).items():
                 flown[name][frames, drones] = values[: frames.stop - frames.start]
-        for drone, descent in self._descents.items():
+        for drone, descent in self.descents.items():
             of, height_m = (frames, drone, 2), descent.height_m(self.nominal.time_s, frames)
             flown["est_position_m"][of] += height_m - flown["position_m"][of]
             flown["position_m"][of] = height_m
@@ -182,50 +175,21 @@ class Motion:
         """The states of drones on ways of their own, in some frames and the next one, which decides the last body rates."""
         frames_and_next = slice(frames.start, min(frames.stop + 1, self.frames))
         nominal = self.nominal[frames_and_next]
-        position, believed, velocity, acceleration, wind, est_yaw, yaw = (
-            np.take(states, drones, axis=1)
-            for states in (
-                nominal.position_m,
-                nominal.est_position_m,
-                nominal.velocity_mps,
-                nominal.acceleration_mps2,
-                nominal.wind_mps,
-                nominal.est_yaw_rad,
-                nominal.yaw_rad,
-            )
-        )
+        states = {name: np.take(getattr(nominal, name), drones, axis=1) for name in (*OF_A_DRONE, "wind_mps")}
+        velocity, acceleration, yaw = states["velocity_mps"], states["acceleration_mps2"], states["yaw_rad"]
         heading = np.empty_like(yaw)
         for k, way in enumerate(self._ways.values()):
-            shift, speed, push = way.shift(nominal, frames_and_next)
+            shift, speed, push, heading[:, k] = way.shift(nominal, frames_and_next)
             of = slice(None), k, slice(shift.shape[1])
-            for states, by in ((position, shift), (believed, shift), (velocity, speed), (acceleration, push)):
-                states[of] += by
-            heading[:, k] = way.heading_rad(nominal)
+            for values, by in ((states["position_m"], shift), (states["est_position_m"], shift), (velocity, speed)):
+                values[of] += by
+            acceleration[of] += push
         before = self._flown["orientation_xyzw"][max(frames.start - 1, 0), drones]
-        orientation = continuous(attitude(thrust_mps2(velocity, acceleration, wind), heading), before)
+        thrust = thrust_mps2(velocity, acceleration, states.pop("wind_mps"))
+        orientation = continuous(attitude(thrust, heading), before)
         rates = body_rates(orientation, self._step_s)
-        if len(rates) == 1 and frames.start:
+        if len(rates) == 1 and frames.start:  # the last frame: who flies on keeps his rates
             goes_on = [way.frame < frames.start for way in self._ways.values()]
             rates[:, goes_on] = self._flown["body_rates_radps"][frames.start - 1, drones][goes_on]
-        turned = yaw_rad(orientation)
-        return {
-            "position_m": position,
-            "orientation_xyzw": orientation,
-            "velocity_mps": velocity,
-            "acceleration_mps2": acceleration,
-            "body_rates_radps": rates,
-            "yaw_rad": turned,
-            "est_position_m": believed,
-            "est_yaw_rad": wrapped(turned + est_yaw - yaw),
-        }
-
-
-def _turned(values: Array, cos: Array, sin: Array) -> Array:
-    """[T, 2] of the formation's frame, in ENU."""
-    x, y = values[:, :1], values[:, 1:]
-    return np.concatenate([cos * x - sin * y, sin * x + cos * y], axis=-1)
-
-
-def _across(values: Array) -> Array:
-    """Turned left by a right angle."""
-    return np.stack([-values[:, 1], values[:, 0]], axis=-1)
+        tilted = {"orientation_xyzw": orientation, "body_rates_radps": rates, "yaw_rad": yaw_rad(orientation)}
+        return states | tilted | {"est_yaw_rad": wrapped(tilted["yaw_rad"] + states["est_yaw_rad"] - yaw)}

@@ -38,19 +38,6 @@ class MotionError(SortieError):
     """The motion asked for cannot be flown; the message names the drone, the time and the settings."""
 
 
-OF_A_DRONE = (
-    "position_m",
-    "orientation_xyzw",
-    "velocity_mps",
-    "acceleration_mps2",
-    "body_rates_radps",
-    "yaw_rad",
-    "est_position_m",
-    "est_yaw_rad",
-)
-"""What `Trajectories` has of each drone that changes where it flies another way."""
-
-
 @dataclass(frozen=True, slots=True)
 class Trajectories:
     """A flight, or some frames of one. Every array is read-only."""
@@ -91,6 +78,17 @@ class Trajectories:
         if not np.isfinite([low, high]).all():
             raise ValueError("the motion is not finite")
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+OF_ALL = ("time_s", "frame_position_m", "frame_yaw_rad")
+"""What `Trajectories` has of the whole fleet; all else it has of each drone."""
+OF_A_DRONE = tuple(each.name for each in fields(Trajectories) if each.name not in (*OF_ALL, "wind_mps"))
+"""What changes where a drone flies another way."""
+
+
+def frame_floats(drones: int) -> int:
+    """How many numbers `Trajectories` has of a frame."""
+    return 24 * drones + 5
 
 
 def air_speed_mps(velocity_mps: Array, wind_mps: Array) -> Array:
@@ -152,38 +150,19 @@ def fly(fleet: schema.Fleet, duration_s: float, frame_s: float, seed: int, repli
         MotionError: the asked motion needs thrust that points downwards.
         PluginError: a mobility model that is not there, fails, or cannot be flown.
     """
-    n = fleet.drones
     frames = max(1, math.ceil(round(duration_s / frame_s, 9)))
     flight = _Flight(fleet, frames, frame_s, seed, replication)
-    shapes = shapes_of(n)
-    whole = {name: scratch.empty((frames, *shape)) for name, shape in shapes.items()}
-    for rows in scratch.blocks(frames, 8 * sum(math.prod(shape) for shape in shapes.values())):
+    whole: dict[str, Array] = {}
+    for rows in scratch.blocks(frames, 8 * frame_floats(fleet.drones)):
         block = flight.block(np.arange(rows.start, rows.stop, dtype=np.float64) * frame_s)
+        block["body_rates_radps"] = np.empty_like(block["velocity_mps"])
+        whole = whole or {name: scratch.empty((frames, *values.shape[1:])) for name, values in block.items()}
         for name, values in block.items():
             whole[name][rows] = values
         turned = whole["orientation_xyzw"][max(0, rows.start - 1) : rows.stop]
         whole["body_rates_radps"][max(0, rows.start - 1) : rows.stop] = body_rates(turned, frame_s)
         scratch.release()
     return Trajectories(**whole)
-
-
-def shapes_of(drones: int) -> dict[str, tuple[int, ...]]:
-    """What `Trajectories` has of each frame, by name."""
-    n = drones
-    return {
-        "time_s": (),
-        "position_m": (n, 3),
-        "orientation_xyzw": (n, 4),
-        "velocity_mps": (n, 3),
-        "acceleration_mps2": (n, 3),
-        "body_rates_radps": (n, 3),
-        "wind_mps": (n, 3),
-        "yaw_rad": (n,),
-        "est_position_m": (n, 3),
-        "est_yaw_rad": (n,),
-        "frame_position_m": (3,),
-        "frame_yaw_rad": (),
-    }
 
 
 class _Flight:

@@ -3,8 +3,8 @@
 Two processes, both stationary from their first sample, both given by a standard deviation and a
 correlation time (the integral of the autocorrelation from 0 to ∞):
 
-* `gauss_markov`, first order (Ornstein–Uhlenbeck): continuous, not differentiable. Gusts, estimate errors.
-* `smooth`, four equal poles (Matérn 7/2): three times differentiable, so that velocity, acceleration and jerk
+* `GaussMarkov`, first order (Ornstein–Uhlenbeck): continuous, not differentiable. Gusts, estimate errors.
+* `Smooth`, four equal poles (Matérn 7/2): three times differentiable, so that velocity, acceleration and jerk
   exist and belong to the position. Where a drone really is. Fewer poles would not do: attitude follows from
   acceleration and body rates from jerk; with two poles the one, with three the other would be white noise, its
   size a matter of the time step.
@@ -54,11 +54,6 @@ class GaussMarkov:
         return self._lag.block(driven)
 
 
-def gauss_markov(normals: Array, sigma: float, time_s: float, step_s: float) -> Array:
-    """A whole `GaussMarkov` process."""
-    return GaussMarkov(sigma, time_s, step_s).block(normals)
-
-
 class Smooth:
     """Smooth process with its derivatives; autocorrelation (1 + u + 2u²/5 + u³/15)·e^{−u}, u = λ|t|.
 
@@ -103,11 +98,6 @@ class Smooth:
         _, z2, z3, z4 = lags
         rate, gain = self._rate, self._gain
         return gain * z4, gain * rate * (z3 - z4), gain * rate**2 * (z2 - 2 * z3 + z4)
-
-
-def smooth(normals: Array, sigma: float, time_s: float, step_s: float) -> tuple[Array, Array, Array]:
-    """A whole `Smooth` process."""
-    return Smooth(sigma, time_s, step_s).block(normals)
 
 
 class _Lag:

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from sortie.fleet.flight.manoeuvres import BLOCK, Motion
 from sortie.fleet.flight.motion import Trajectories, air_speed_mps
-from sortie.scenarios import scratch
 from sortie.scenarios.plugins.reference import PluginError, checked_array, name_of, resolve
 from sortie.scenarios.schema import Airframe, Fleet
 
@@ -128,69 +127,61 @@ class PowerModel(Protocol):
         """
 
 
-class RotorPower:
-    """Power at the rotors of every drone in every frame, by the airframes' models and payloads.
+def fleet_power_w(fleet: Fleet, flown: Trajectories) -> Array:
+    """Power at the rotors of every drone in some frames, W [F, N], by the airframes' models and payloads; a ground
+    station has none.
 
-    A ground station has none. A power model of the user's own may look at the whole flight, so it is asked for all of it.
+    Raises:
+        PluginError: a power model of the user's own that is not there, fails, or returns something else.
     """
-
-    def __init__(self, fleet: Fleet, motion: Trajectories | Motion) -> None:
-        """Raises:
-        PluginError: a power model of one's own that is not there, fails, or returns something else.
-        """
-        self._motion, self._drones = motion, fleet.drones
-        standing = [station.drone for station in fleet.ground]
-        machines = [(a.model_copy(update={"payload_kg": 0.0}), a.payload_kg) for a in fleet.airframes]
-        self._built_in: list[tuple[Airframe, list[int], Array]] = []
-        self._own: list[tuple[PowerModel, list[int], Array]] = []
-        distinct: list[Airframe] = []
-        for i, (airframe, _) in enumerate(machines):
-            if airframe in distinct or i in standing:
-                continue
+    standing = [station.drone for station in fleet.ground]
+    machines = [(a.model_copy(update={"payload_kg": 0.0}), a.payload_kg) for a in fleet.airframes]
+    power_w = np.zeros(flown.position_m.shape[:2])
+    distinct: list[Airframe] = []
+    for i, (airframe, _) in enumerate(machines):
+        if airframe not in distinct and i not in standing:
             distinct.append(airframe)
-            of = [k for k, (a, _) in enumerate(machines) if a == airframe and k not in standing]
-            mass_kg = airframe.mass_kg + np.array([machines[k][1] for k in of])
-            if airframe.power_model in ("level", "momentum"):
-                self._built_in.append((airframe, of, mass_kg))
-            else:
-                self._own.append((resolve("power", airframe.power_model, airframe.power_params), of, mass_kg))
+    for airframe in distinct:
+        of = [i for i, (a, _) in enumerate(machines) if a == airframe and i not in standing]
+        mass_kg = airframe.mass_kg + np.array([machines[i][1] for i in of])
+        velocity_mps, wind_mps = flown.velocity_mps[:, of], flown.wind_mps[:, of]
+        acceleration_mps2, climb_mps = flown.acceleration_mps2[:, of], velocity_mps[..., 2]
+        if airframe.power_model == "momentum":
+            power_w[:, of] = momentum_power_w(velocity_mps - wind_mps, acceleration_mps2, airframe, mass_kg)
+        elif airframe.power_model == "level":
+            level_w = rotor_power_w(air_speed_mps(velocity_mps, wind_mps), airframe, mass_kg)
+            power_w[:, of] = level_w + climb_power_w(climb_mps, airframe, mass_kg)
+        else:
+            model = resolve("power", airframe.power_model, airframe.power_params)
+            power_w[:, of] = own_power_w(model, velocity_mps - wind_mps, acceleration_mps2, climb_mps, mass_kg)
+    return power_w
+
+
+class RotorPower:
+    """Power at the rotors of every drone, frame by frame. A model of the user's own is asked for the whole flight."""
+
+    def __init__(self, fleet: Fleet, motion: Motion) -> None:
+        """Raises:
+        PluginError: as `fleet_power_w`.
+        """
+        self._fleet, self._motion = fleet, motion
+        own = any(airframe.power_model not in ("level", "momentum") for airframe in fleet.airframes)
+        self._at_once = motion.frames if own else BLOCK
         self.forget()
         self.at(0)
 
     def forget(self) -> None:
-        """The motion has changed: work out the next frame that is read anew."""
-        self._begin, self._block_w = 0, np.empty((0, self._drones))
-        self._own_w: list[Array] = []
+        """The motion has changed."""
+        self._block, self._power_w = -1, np.empty((0, 0))
 
     def at(self, frame: int) -> Array:
         """Every drone's power in a frame, W [N]."""
-        if not 0 <= frame - self._begin < len(self._block_w):
-            self._begin, self._block_w = frame, self.of(slice(frame, frame + BLOCK))
-        power_w: Array = self._block_w[frame - self._begin]
+        block, row = divmod(frame, self._at_once)
+        if block != self._block:
+            frames = slice(frame - row, frame - row + self._at_once)
+            self._block, self._power_w = block, fleet_power_w(self._fleet, self._motion[frames])
+        power_w: Array = self._power_w[row]
         return power_w
-
-    def of(self, frames: slice) -> Array:
-        """Every drone's power in some frames, W [F, N]."""
-        flown = self._motion[frames]
-        power_w = np.zeros(flown.position_m.shape[:2])
-        for airframe, of, mass_kg in self._built_in:
-            velocity_mps, wind_mps = flown.velocity_mps[:, of], flown.wind_mps[:, of]
-            if airframe.power_model == "momentum":
-                acceleration_mps2 = flown.acceleration_mps2[:, of]
-                power_w[:, of] = momentum_power_w(velocity_mps - wind_mps, acceleration_mps2, airframe, mass_kg)
-            else:
-                level_w = rotor_power_w(air_speed_mps(velocity_mps, wind_mps), airframe, mass_kg)
-                power_w[:, of] = level_w + climb_power_w(velocity_mps[..., 2], airframe, mass_kg)
-        if self._own and not self._own_w:
-            self._own_w = [self._whole_w(*each) for each in self._own]
-        for (_, of, _), own_w in zip(self._own, self._own_w, strict=True):
-            power_w[:, of] = own_w[frames]
-        return power_w
-
-    def _whole_w(self, model: PowerModel, of: list[int], mass_kg: Array) -> Array:
-        flown = self._motion[:]
-        air_mps, climb_mps = (flown.velocity_mps - flown.wind_mps)[:, of], flown.velocity_mps[:, of, 2]
-        return scratch.copied(own_power_w(model, air_mps, flown.acceleration_mps2[:, of], climb_mps, mass_kg))
 
 
 def own_power_w(model: PowerModel, air_mps: Array, acceleration_mps2: Array, climb_mps: Array, mass_kg: Array) -> Array:

@@ -19,8 +19,8 @@ MAX_YAW_RATE_RADPS = 0.5
 """The formation never turns faster than this in one corner; about 30° a second."""
 MAX_RING_SPEED_MPS = 5.0
 """Nor so fast that a drone one spacing away from the centre sweeps round faster than this."""
-_PEAK = 2.25
-"""Peak of the quadratic B-spline of unit width and unit area."""
+PEAK = 2.25
+"""Peak of the quadratic B-spline of unit width and unit area: of the slope of a unit step spread over a unit of time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,18 @@ def turns(course_rad: Array, turn_time_s: float, spacing_m: float) -> tuple[Arra
     turn = np.diff(course_rad)
     turn = turn - 2 * np.pi * np.ceil((turn - np.pi) / (2 * np.pi))
     yaw_rate = min(MAX_YAW_RATE_RADPS, MAX_RING_SPEED_MPS / spacing_m)
-    return turn, np.maximum(turn_time_s, _PEAK * np.abs(turn) / yaw_rate)
+    return turn, np.maximum(turn_time_s, PEAK * np.abs(turn) / yaw_rate)
+
+
+def turned(vectors: Array, yaw_rad: Array) -> Array:
+    """Vectors [..., 2] on the ground that are given in frames with these yaws [...], in ENU."""
+    cos, sin, x, y = np.cos(yaw_rad), np.sin(yaw_rad), vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def across(vectors: Array) -> Array:
+    """Vectors [..., 2] turned left by a right angle."""
+    return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 
 def bend(since_s: Array, width_s: Array | float) -> Array:

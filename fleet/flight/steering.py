@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sortie.fleet.flight.mobility import found_mobility, is_planner
-from sortie.fleet.flight.route import spread
+from sortie.fleet.flight.route import PEAK, spread
 from sortie.fleet.flight.safety import INSTANTS_S, JITTERS
 from sortie.fleet.flight.ways import starts_m
 from sortie.policies.contract import FleetView
@@ -31,8 +31,6 @@ LEAST_MOVE_M = 0.5
 """A place nearer than this to where a drone comes to rest moves nothing: jitter and estimates are no reason."""
 SHORTEST_S = 0.2
 """No change of velocity is spread over less."""
-_PEAK = 2.25
-"""Of the slope of a unit step spread over a unit of time (quadratic B-spline)."""
 _ROUNDS = 24
 
 
@@ -68,15 +66,14 @@ class Land(NamedTuple):
 
 
 Command = GoTo | Velocity | Hold | Return | Land
-COMMANDS = (GoTo, Velocity, Hold, Return, Land)
 
 
 def is_command(given: object) -> TypeGuard[Command]:
     """Whether a planner returned a command, with finite numbers wherever it may not be None, and no speed of 0 or less."""
-    if not isinstance(given, COMMANDS):
+    if not isinstance(given, Command):
         return False
-    optional = (given.z_m, given.speed_mps) if isinstance(given, GoTo) else ()
-    numbers = [*given[:2], *(v for v in optional if v is not None)] if isinstance(given, GoTo) else list(given)
+    optional = given[2:] if isinstance(given, GoTo) else ()
+    numbers = [*(given[:2] if optional else given), *(v for v in optional if v is not None)]
     if not all(isinstance(v, Real) and math.isfinite(v) for v in numbers):
         return False
     return not isinstance(given, GoTo) or given.speed_mps is None or given.speed_mps > 0
@@ -259,71 +256,68 @@ def nearest_m(ours_m: Array, others_m: Array) -> Array:
     return nearest
 
 
+@dataclass(frozen=True, slots=True)
 class SteeringWish:
     """A planner's wish for another way (`sortie.fleet.flight.safety.Wish`), among others whom it comes no nearer than now."""
 
-    def __init__(
-        self,
-        drone: int,
-        aim: GoTo | Velocity | Hold,
-        way: SteeredWay,
-        nominal_m: Array,
-        start_m: Array,
-        time_s: Array,
-        places_m: Array,
-        gone: Sequence[int],
-        fleet: schema.Fleet,
-    ) -> None:
-        """Args:
-        drone: whose planner asks.
-        aim: what it is to do.
-        way: what it flies now.
-        nominal_m: where it would hover from now on, [F, 3].
-        start_m: where it began.
-        time_s: of the same frames, [F].
-        places_m: where all drones will be in them, [F, N, 3].
-        gone: drones that have left the air for good, to whom nobody comes near.
-        fleet: its `steering`, and the jitter, of which the fence keeps clear.
-        """
-        self._aim, self._way, self._fleet, self._time_s = aim, way, fleet, time_s
-        self._nominal_m, self._start_m, self._now_s = nominal_m, start_m, float(time_s[0])
-        left_out = [*gone, drone]
-        self._others = np.delete(np.arange(places_m.shape[1]), left_out)
-        self._others_m = np.delete(places_m, left_out, axis=1)
-        now_m = nearest_m(places_m[:, drone], self._others_m)
-        self._least_m = np.minimum(fleet.steering.separation_m, now_m) - 1e-9
+    drone: int
+    aim: GoTo | Velocity | Hold
+    way: SteeredWay
+    """What it flies now."""
+    start_m: Array
+    hover_m: Array
+    """Where it would hover from now on, [F, 3]."""
+    time_s: Array
+    """Of the same frames, [F]."""
+    places_m: Array
+    """Where all drones will be in them, [F, N, 3]."""
+    gone: Sequence[int]
+    """Drones that have left the air for good, to whom nobody comes near."""
+    fleet: schema.Fleet
+    """Its `steering`, and the jitter, of which the fence keeps clear."""
 
     def attempt(self, share: float) -> SteeredWay | None:
         """The way of a share of the command; None where the drone is on its way there, or there."""
-        aim = self._aim
+        aim = self.aim
         if isinstance(aim, Hold) and share < 1.0:
             return None
         if isinstance(aim, GoTo):
-            end_m = self._way.end_m
+            end_m = self.way.end_m
             height_m = float(end_m[2]) if aim.z_m is None else aim.z_m
             if math.dist(end_m, (aim.x_m, aim.y_m, height_m)) < LEAST_MOVE_M:
                 return None
-        return steer(self._way, aim, self._now_s, self._fleet.steering, share)
+        return steer(self.way, aim, float(self.time_s[0]), self.fleet.steering, share)
 
     def refusal(self, way: SteeredWay) -> str:
         """Why a way is not safe until it rests."""
-        refused = refusal(way, self._now_s, self._start_m, self._fleet)
+        refused = refusal(way, float(self.time_s[0]), self.start_m, self.fleet)
         if refused:
             return refused
-        ours_m = self._nominal_m + way.at(self._time_s)[0] - self._start_m
-        near = np.flatnonzero(nearest_m(ours_m, self._others_m) < self._least_m)
-        return f"would come too near drone {self._others[near[0]]}" if len(near) else ""
+        left_out = [*self.gone, self.drone]
+        others, others_m = (
+            np.delete(np.arange(self.places_m.shape[1]), left_out),
+            np.delete(self.places_m, left_out, 1),
+        )
+        now_m = nearest_m(self.places_m[:, self.drone], others_m)
+        least_m = np.minimum(self.fleet.steering.separation_m, now_m) - 1e-9
+        near = np.flatnonzero(nearest_m(self.hover_m + way.at(self.time_s)[0] - self.start_m, others_m) < least_m)
+        return f"would come too near drone {others[near[0]]}" if len(near) else ""
 
 
-def steers(group: schema.Fleet | schema.FlightGroup) -> bool:
-    """Whether a fleet or a group is steered by planners of the user's own."""
-    return group.mobility != "formation" and is_planner(found_mobility(group.mobility, group.mobility_params))
+def with_planners(fleet: schema.Fleet) -> list[tuple[schema.Fleet | schema.FlightGroup, tuple[int, ...]]]:
+    """The parts of a fleet that planners of the user's own steer, and their drones."""
+    parts: list[tuple[schema.Fleet | schema.FlightGroup, tuple[int, ...]]] = [(fleet, fleet.in_formation)]
+    parts += [(group, group.drones) for group in fleet.groups]
+    return [
+        (part, drones)
+        for part, drones in parts
+        if part.mobility != "formation" and is_planner(found_mobility(part.mobility, part.mobility_params))
+    ]
 
 
 def area_m(fleet: schema.Fleet, flown_m: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
     """x_min, y_min, x_max, y_max of where a fleet flies as planned, and where its planners may take it, ENU."""
-    drones = [i for i in fleet.in_formation if steers(fleet)]
-    drones += [i for group in fleet.groups if steers(group) for i in group.drones]
+    drones = [drone for _, drones in with_planners(fleet) for drone in drones]
     if not drones:
         return flown_m
     limits, starts = fleet.steering, starts_m(fleet)[drones, :2]
@@ -346,7 +340,7 @@ def _fastest(direction: Array, limits: schema.Steering, speed_mps: float | None)
 
 def _width_s(change: Array, limits: schema.Steering) -> float:
     """The shortest time for a change of velocity."""
-    return max(SHORTEST_S, _PEAK * float(np.linalg.norm(change)) / limits.acceleration_mps2)
+    return max(SHORTEST_S, PEAK * float(np.linalg.norm(change)) / limits.acceleration_mps2)
 
 
 def _vector(values: Array) -> Vector:

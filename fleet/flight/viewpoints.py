@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sortie.fleet.flight.motion import MotionError
-from sortie.fleet.flight.route import FramePath, bend, spread
+from sortie.fleet.flight.route import PEAK, FramePath, bend, spread, turned
 from sortie.fleet.flight.safety import INSTANTS_S, JITTERS
 from sortie.fleet.flight.ways import route_path
 from sortie.scenarios import schema
@@ -28,7 +28,7 @@ Place = tuple[float, float]
 
 LEAST_MOVE_M = 2.0
 """A wish for a place nearer than this to where a drone stands moves nothing: jitter and estimates are no reason."""
-_PEAK_SPEED, _PEAK_ACCELERATION = 2.25, 9.0
+_PEAK_ACCELERATION = 9.0
 """Of a unit step spread over a unit of time (quadratic B-spline)."""
 
 
@@ -53,7 +53,7 @@ class Move(NamedTuple):
     @property
     def speed_mps(self) -> float:
         """The fastest that it gets."""
-        return _PEAK_SPEED * self.length_m / self.width_s
+        return PEAK * self.length_m / self.width_s
 
     @property
     def acceleration_mps2(self) -> float:
@@ -88,11 +88,8 @@ class Course:
 
     def world_m(self, places_m: Array, frames: slice = slice(None)) -> Array:
         """Places [..., 2] of the formation's frame, one for every frame, on the ground, ENU."""
-        yaw = self.path.yaw_rad[frames]
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        x, y = places_m[..., 0], places_m[..., 1]
-        turned: Array = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-        return turned + self.path.position_m[frames]
+        world_m: Array = turned(places_m, self.path.yaw_rad[frames]) + self.path.position_m[frames]
+        return world_m
 
     def wanted_shift_m(self, drone: int, frame: int, x_m: float, y_m: float) -> Place:
         """The shift that would have a drone over (x, y) now."""
@@ -124,9 +121,9 @@ def course_of(fleet: schema.Fleet, time_s: Array) -> Course:
     course = Course(time_s, route_path(formation, fleet.route, time_s), slot_m)
     bounds = bounds_of(fleet)
     for drone in members:
-        slot = slot_m[drone]
-        if not fenced(course, bounds, drone, (), 0):
-            x, y = course.world_m(slot[None])[first_outside(course.world_m(slot[None]), bounds)]
+        place_m = first_outside(course, bounds, drone)
+        if place_m is not None:
+            x, y = place_m
             raise MotionError(
                 f"fleet.viewpoints.fence_m {fleet.viewpoints.fence_m} must hold every slot's way with {JITTERS:g} times "
                 f"pose_jitter_m to spare: drone {drone}'s slot comes to ({x:.1f}, {y:.1f})"
@@ -194,24 +191,18 @@ class ViewpointWish:
         if near is not None:
             return f"would come too near drone {near}"
         plan = (*self.plans[self.drone], move)
-        return "" if fenced(self.course, self.bounds, self.drone, plan, self.frame) else "would leave the fence"
+        outside_m = first_outside(self.course, self.bounds, self.drone, plan, self.frame)
+        return "" if outside_m is None else "would leave the fence"
 
 
-def fenced(course: Course, bounds: Bounds, drone: int, plan: Plan, frame: int) -> bool:
-    """Whether a drone's place stays within the fence from a frame to the end."""
+def first_outside(course: Course, bounds: Bounds, drone: int, plan: Plan = (), frame: int = 0) -> Array | None:
+    """The first place outside the fence that a drone's place comes to from a frame to the end; None where it stays inside."""
     if bounds.fence_m is None:
-        return True
-    rest = slice(frame, None)
-    places = course.slot_m[drone] + shift_m(plan, course.time_s[rest])
-    return first_outside(course.world_m(places, rest), bounds) is None
-
-
-def first_outside(world_m: Array, bounds: Bounds) -> int | None:
-    """The first of [T, 2] places that lies outside the fence."""
-    assert bounds.fence_m is not None  # noqa: S101
-    low, high = np.array(bounds.fence_m[:2]), np.array(bounds.fence_m[2:])
-    outside = ((world_m < low) | (world_m > high)).any(axis=-1)
-    return int(outside.argmax()) if outside.any() else None
+        return None
+    rest, (x_min, y_min, x_max, y_max) = slice(frame, None), bounds.fence_m
+    world_m = course.world_m(course.slot_m[drone] + shift_m(plan, course.time_s[rest]), rest)
+    outside = ((world_m < (x_min, y_min)) | (world_m > (x_max, y_max))).any(axis=-1)
+    return world_m[outside.argmax()] if outside.any() else None
 
 
 def least_m(course: Course, bounds: Bounds, i: int, j: int) -> float:
@@ -269,7 +260,7 @@ def _distance_m(a: Array, b: Array) -> float:
 
 def _width_s(length_m: float, bounds: Bounds) -> float:
     """The shortest time for a move within speed and acceleration."""
-    by_speed = _PEAK_SPEED * length_m / bounds.speed_mps
+    by_speed = PEAK * length_m / bounds.speed_mps
     return max(by_speed, math.sqrt(_PEAK_ACCELERATION * length_m / bounds.acceleration_mps2))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sortie.fleet.flight.mobility import found_mobility, heading_rad, is_planner, positions_m
-from sortie.fleet.flight.route import FramePath, frame_path
+from sortie.fleet.flight.route import FramePath, across, frame_path, turned
 from sortie.fleet.flight.steps import GroupPath, GroupWay
 from sortie.scenarios import schema, scratch
 from sortie.scenarios.formation import slots
@@ -167,13 +167,12 @@ class _Sampled:
 
 def _in_slots(path: FramePath, slot_m: Array) -> tuple[Array, Array, Array]:
     """The virtual structure: p + R(ψ)·s and its two time derivatives, [T, n, 2] each."""
-    cos, sin = np.cos(path.yaw_rad)[:, None], np.sin(path.yaw_rad)[:, None]
-    arm = np.stack([cos * slot_m[:, 0] - sin * slot_m[:, 1], sin * slot_m[:, 0] + cos * slot_m[:, 1]], axis=-1)
-    across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
+    arm = turned(slot_m, path.yaw_rad[:, None])
+    left = across(arm)
     rate, rate_change = path.yaw_rate_radps[:, None, None], path.yaw_acceleration_radps2[:, None, None]
     position: Array = path.position_m[:, None] + arm
-    velocity: Array = path.velocity_mps[:, None] + rate * across
-    acceleration: Array = path.acceleration_mps2[:, None] + rate_change * across - rate**2 * arm
+    velocity: Array = path.velocity_mps[:, None] + rate * left
+    acceleration: Array = path.acceleration_mps2[:, None] + rate_change * left - rate**2 * arm
     return position, velocity, acceleration
 
 

@@ -6,8 +6,9 @@ of the next one, by ascending drone (`sortie.fleet.flight.safety`). Drones that 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
-from typing import Protocol
+from typing import get_args
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from sortie.fleet.flight.manoeuvres import Appearance, Descent, Manoeuvre, Shift
 from sortie.fleet.flight.mobility import found_mobility
 from sortie.fleet.flight.safety import grant
 from sortie.fleet.flight.steering import (
-    COMMANDS,
     Array,
     Command,
     GoTo,
@@ -27,13 +27,13 @@ from sortie.fleet.flight.steering import (
     Vector,
     Velocity,
     is_command,
-    steers,
+    with_planners,
 )
 from sortie.fleet.flight.viewpoints import Move, Plan, ViewpointWish, bounds_of, course_of
 from sortie.fleet.flight.ways import starts_m
 from sortie.policies.contract import FleetView, Reposition
 from sortie.scenarios.plugins.reference import Guard, PluginError, checked_call
-from sortie.scenarios.schema import Fleet, FlightGroup, Scenario
+from sortie.scenarios.schema import Scenario
 from sortie.scenarios.schema.events.base import joining
 from sortie.scenarios.streams import stream
 from sortie.sim.engine.world import World
@@ -49,7 +49,7 @@ Answer = Manoeuvre | str | None
 """What is granted of a request, or why nothing is; None where the drone does as before."""
 
 
-class Source(Protocol):
+class Source(ABC):
     """Where requests come from, and what is particular to them."""
 
     event: str
@@ -57,20 +57,24 @@ class Source(Protocol):
     lasts: bool
     """Whether a request stands until another replaces it. Then it is decided again after a refusal."""
 
+    @abstractmethod
     def requesting(self) -> Collection[int]:
         """The drones with a request."""
 
+    @abstractmethod
     def answer(self, drone: int, frame: int, gone: Sequence[int]) -> Answer:
         """Decide a drone's request; nobody keeps clear of those that are gone for good."""
 
+    @abstractmethod
     def text(self, drone: int, answer: Answer) -> str:
         """What the record says of an answer; empty says nothing."""
 
-    def appear(self, drone: int, frame: int) -> Sequence[Manoeuvre]:
-        """What a drone flies that joins the fleet, beside that it is in its slot."""
-
-    def decided(self) -> None:
+    def decided(self) -> None:  # noqa: B027
         """The requests of this frame are decided, and what was granted is flown."""
+
+    def appear(self, drone: int, frame: int) -> Sequence[Manoeuvre]:
+        """What a drone that joins flies, beside that it is in its slot: by default the way that it had."""
+        return ()
 
 
 class Manoeuvres:
@@ -101,7 +105,10 @@ class Manoeuvres:
             for drone, answer in answers.items():
                 if isinstance(answer, str) and source.lasts:
                     self._again_at[source.event, drone] = frame + self._retry_frames
-                self._report(source, drone, source.text(drone, answer))
+                text = source.text(drone, answer)
+                if text and self._reported.get((source.event, drone)) != text:  # once, however often it is repeated
+                    self._reported[source.event, drone] = text
+                    self._world.note(drone, source.event, text)
             self._fly([a for a in answers.values() if a is not None and not isinstance(a, str)])
             source.decided()
 
@@ -120,8 +127,7 @@ class Manoeuvres:
         frame = world.next_frame
         if frame >= world.motion.frames:
             return None
-        flown = world.motion[frame : frame + 1]
-        height_m = float(flown.position_m[0, drone, 2])
+        height_m = float(world.motion[frame : frame + 1].position_m[0, drone, 2])
         self._fly([Descent(drone, frame, height_m, descent_mps)])
         return frame * self._frame_s + max(0.0, height_m) / descent_mps
 
@@ -130,7 +136,7 @@ class Manoeuvres:
         frame = self._world.next_frame
         if frame >= self._world.motion.frames:
             return
-        manoeuvres: list[Manoeuvre] = [Appearance(drone, frame)]
+        manoeuvres: list[Manoeuvre] = [Appearance(drone, frame)] if drone in self._world.motion.descents else []
         for source in self._sources:
             anew = source.appear(drone, frame)
             if anew:
@@ -142,14 +148,8 @@ class Manoeuvres:
         if manoeuvres:
             self._world.reroute(manoeuvres)
 
-    def _report(self, source: Source, drone: int, text: str) -> None:
-        """Record a text once, however often it is repeated."""
-        if text and self._reported.get((source.event, drone)) != text:
-            self._reported[source.event, drone] = text
-            self._world.note(drone, source.event, text)
 
-
-class Viewpoints:
+class Viewpoints(Source):
     """The viewpoints that policies choose. A request lasts until the policy makes another one."""
 
     event, lasts = VIEWPOINT, True
@@ -208,15 +208,8 @@ class Viewpoints:
             return f"{what}, to {x_m:+.1f} m ahead and {y_m:+.1f} m left of its slot: {reason}"
         return "" if answer is None else f"stays, {answer}: {reason}"
 
-    def appear(self, drone: int, frame: int) -> Sequence[Manoeuvre]:
-        """It flies at the shift that it had."""
-        return ()
 
-    def decided(self) -> None:
-        """The requests last."""
-
-
-class Planners:
+class Planners(Source):
     """The commands of mobility models that plan in flight. Each planner reads the view of its drone's policy."""
 
     event, lasts = STEERING, False
@@ -235,15 +228,14 @@ class Planners:
         self._names: dict[int, str] = {}
         self._planners: dict[int, Guard] = {}
         self._starts_m: Array = starts_m(fleet)
-        flown: list[tuple[Fleet | FlightGroup, tuple[int, ...]]] = [(fleet, fleet.in_formation)]
-        for group, drones in [*flown, *((group, group.drones) for group in fleet.groups)]:
-            if steers(group):
-                model = found_mobility(group.mobility, group.mobility_params)
-                for drone in drones:
-                    start, rng = tuple(self._starts_m[drone].tolist()), stream(seed, replication, drone, "planner")
-                    made = checked_call("mobility", model, drone, start, rng)
-                    self._planners[drone] = Guard("mobility", made, ("command",))
-                    self._names[drone] = group.mobility.rpartition(":")[2]
+        for part, drones in with_planners(fleet):
+            model = found_mobility(part.mobility, part.mobility_params)
+            for drone in drones:
+                made = checked_call(
+                    "mobility", model, drone, self._start(drone), stream(seed, replication, drone, "planner")
+                )
+                self._planners[drone] = Guard("mobility", made, ("command",))
+                self._names[drone] = part.mobility.rpartition(":")[2]
         self._ways = {drone: self._resting(drone) for drone in self._planners}
         self._commands: dict[int, Command] = {}
         self._landing: list[int] = []
@@ -251,15 +243,17 @@ class Planners:
         """Where all drones will be from this frame on, while its commands are decided."""
 
     def _resting(self, drone: int) -> SteeredWay:
-        x, y, z = self._starts_m[drone].tolist()
+        x, y, z = self._start(drone)
         limits = self._fleet.steering
-        if not limits.altitude_m[0] <= z <= limits.altitude_m[1]:
-            bound = f"must be within fleet.steering.altitude_m {limits.altitude_m}"
-            raise PluginError(f"mobility {self._names[drone]}: drone {drone} begins at a height of {z:g} m, {bound}")
-        fence_m = limits.fence_m
-        if fence_m is not None and not (fence_m[0] <= x <= fence_m[2] and fence_m[1] <= y <= fence_m[3]):
-            bound = f"must be within fleet.steering.fence_m {fence_m}"
-            raise PluginError(f"mobility {self._names[drone]}: drone {drone} begins at ({x:g}, {y:g}), {bound}")
+        low_m, high_m = limits.altitude_m
+        west_m, south_m, east_m, north_m = limits.fence_m or (x, y, x, y)
+        for within, what, name, bound in (
+            (low_m <= z <= high_m, f"at a height of {z:g} m", "altitude_m", limits.altitude_m),
+            (west_m <= x <= east_m and south_m <= y <= north_m, f"at ({x:g}, {y:g})", "fence_m", limits.fence_m),
+        ):
+            if not within:
+                must = f"must be within fleet.steering.{name} {bound}"
+                raise PluginError(f"mobility {self._names[drone]}: drone {drone} begins {what}, {must}")
         return SteeredWay(0.0, (x, y, z), (0.0, 0.0, 0.0))
 
     @property
@@ -287,7 +281,7 @@ class Planners:
             PluginError: it is none.
         """
         if not is_command(command):
-            kinds = ", ".join(kind.__name__ for kind in COMMANDS)
+            kinds = ", ".join(kind.__name__ for kind in get_args(Command))
             what = f"returns {command!r}, must be None or one of {kinds} with finite numbers and speeds > 0"
             raise PluginError(f"mobility {self._names[drone]} on drone {drone}: {what}")
         self._commands[drone] = command
@@ -304,11 +298,9 @@ class Planners:
             self._places_m = motion.rest_m(frame)
             down = [i for i, d in enumerate(self._world.drones) if not d.airborne]
             self._places_m[:, down] = nominal.position_m[:, down]  # where they appear if they join
-        aim, hover_m = self._aim(drone, frame), nominal.position_m[:, drone]
-        wish = SteeringWish(
-            drone, aim, self._ways[drone], hover_m, start_m, nominal.time_s, self._places_m, gone, self._fleet
-        )
-        way = grant(wish)
+        ours, aim, hover_m = self._ways[drone], self._aim(drone, frame), nominal.position_m[:, drone]
+        rest = nominal.time_s, self._places_m, gone
+        way = grant(SteeringWish(drone, aim, ours, start_m, hover_m, *rest, self._fleet))
         if not isinstance(way, SteeredWay):
             return way
         self._ways[drone] = way

@@ -18,7 +18,7 @@ import psutil
 import pyarrow as pa
 
 from sortie.fleet.coverage import RANGE_M
-from sortie.fleet.flight.motion import shapes_of
+from sortie.fleet.flight.motion import frame_floats
 from sortie.fleet.peers import PeerTable
 from sortie.fleet.probes import window_of
 from sortie.fleet.standings import ROW
@@ -39,8 +39,6 @@ OFFSET_BYTES = 4
 """Before each text and each list in an Arrow column."""
 TEXT_BYTES = 8
 """A word, as in a status or a reason."""
-AIRFRAME_FLOATS = 4
-"""Of a drone in a frame, beside its motion: the airframe's z axis, and what the rotors draw."""
 LINK_BYTES = 2 * 4 * EPOCH + 3 * 4 * EPOCH
 """Of a link within earshot in a large fleet: gain and shadowing in each frame of a block, and as much again in passing."""
 OBJECT_FACTOR = 8
@@ -92,8 +90,7 @@ def needs(scenario: Scenario) -> Needs:
         "truths": cars * fusions,
         "detections": 2 * cars * fusions,
     }
-    floats = AIRFRAME_FLOATS * n + sum(math.prod(shape) for shape in shapes_of(n).values())
-    motion = floats * FLOAT_BYTES * frames
+    motion = frame_floats(n) * FLOAT_BYTES * frames
     sure = sum(width[name] * rows for name, rows in certain.items())
     more = sum(width[name] * rows for name, rows in possible.items())
     batches = sum(min(BATCH_BYTES, width[name] * rows) for name, rows in (certain | possible).items())
@@ -105,7 +102,7 @@ def needs(scenario: Scenario) -> Needs:
         + (PeerTable(1, window_of(scenario.context.detached_after_periods)).pair_bytes + ROW.itemsize) * n * n
         + (LINK_BYTES * n * _neighbours(scenario) if n > SQUARE else 0)
     )
-    return Needs(int(memory), int(motion + sure), int(motion + 2 * (sure + more)))
+    return Needs(int(memory), int(motion + sure), int(2 * (motion + sure + more)))
 
 
 def row_bytes(columns: Mapping[str, pa.DataType], drones: int) -> float:

@@ -227,14 +227,8 @@ def build(
     mains = {station.drone for station in scenario.fleet.ground if station.mains}
     batteries = FleetBatteries(scenario.fleet.batteries, scenario.fleet.overrides, len(drones), charges, mains)
     motion = Motion(nominal)
-    air = Air(
-        env,
-        air_settings(scenario),
-        motion,
-        seed=seed,
-        replication=replication,
-        frame_s=scenario.frame_s,
-    )
+    settings, frame_s = air_settings(scenario), scenario.frame_s
+    air = Air(env, settings, motion, seed=seed, replication=replication, frame_s=frame_s)
     mission = scenario.mission
     scene = SceneModel(
         scenario.perception.scene,

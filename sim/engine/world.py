@@ -118,15 +118,8 @@ class World:
         errors: Mapping[int, np.ndarray],
         links: LinkLog,
     ) -> None:
-        self.env, self.motion, self.batteries, self.air, self.scene, self.plan = (
-            env,
-            motion,
-            batteries,
-            air,
-            scene,
-            plan,
-        )
-        self.drones = drones
+        self.env, self.motion, self.batteries, self.air = env, motion, batteries, air
+        self.scene, self.plan, self.drones = scene, plan, drones
         n = len(drones)
         self._weaker_db = weaker_senders_db(scenario)
         self._drops: dict[int, tuple[int, int | None, float]] = {}  # by cause, here and below
@@ -150,9 +143,8 @@ class World:
         self._frames_a_second = max(1, round(scenario.context.rate_hz * SECOND_S))
         self._work = deque([[Work()] * n], maxlen=1 + self._frames_a_second)
         self._headrooms = [(1.0, 1.0)] * n
-        self._down: dict[
-            int, list[tuple[int, int]]
-        ] = {}  # the frames in which a drone is on the ground, where it stays
+        self._down: dict[int, list[tuple[int, int]]] = {}
+        """The frames in which a drone is on the ground, where it stays."""
         self._homebound: set[int] = set()
         self.now = plan.at(0.0)
         """Each group's mission in this frame: the ground station's cue comes with the frame."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, MotionError, Trajectories, attitude, fly
+from sortie.fleet.flight.motion import DRAG_PER_S, GRAVITY_MPS2, MotionError, Trajectories, attitude, fly, frame_floats
 from sortie.scenarios.formation import slots
 from sortie.scenarios.schema import Fleet, Formation, Route
 from sortie.scenarios.schema import Motion as MotionConfig
@@ -29,6 +29,7 @@ def test_shapes_and_end_exclusive() -> None:
         assert getattr(m, name).shape == (120, 3, 3), name
     assert m.orientation_xyzw.shape == (120, 3, 4)
     assert m.est_yaw_rad.shape == m.yaw_rad.shape == m.air_speed_mps.shape == (120, 3)
+    assert sum(getattr(m, field.name)[0].size for field in fields(m)) == frame_floats(3)
     assert fly(Fleet(drones=1), 0.01, 0.1, seed=1).body_rates_radps.tolist() == [[[0, 0, 0]]]
 
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from sortie.fleet.flight.motion import fly
 from sortie.fleet.flight.rotor import (
-    RotorPower,
     climb_power_w,
     figure_of_merit,
+    fleet_power_w,
     induced_speed,
     momentum_power_w,
     rotor_power_w,
@@ -154,9 +154,7 @@ def test_figure_of_merit_is_ideal_over_true_power() -> None:
 def test_wind_changes_the_air_speed_and_with_it_the_power() -> None:
     """Hovering in a steady 10 m/s of wind is flying at 10 m/s."""
     fleet = Fleet(motion=Motion(wind_mps=(6, 8), gust_sigma_mps=0, pose_jitter_m=0))
-    np.testing.assert_allclose(
-        RotorPower(fleet, fly(fleet, 2.0, 0.1, 1)).of(slice(None)), float(rotor_power_w(10.0)), rtol=1e-9
-    )
+    np.testing.assert_allclose(fleet_power_w(fleet, fly(fleet, 2.0, 0.1, 1)), float(rotor_power_w(10.0)), rtol=1e-9)
 
 
 def test_every_drone_pays_for_its_own_load_in_level_flight_and_in_climb() -> None:
@@ -167,7 +165,7 @@ def test_every_drone_pays_for_its_own_load_in_level_flight_and_in_climb() -> Non
         makes = ({"name": "large", "drones": heavy, "airframe": large},) if heavy else ()
         fleet = Fleet(airframe=frame, drones=4, overrides=loads, makes=makes)
         motion = fly(fleet, 6.0, 0.1, 1)
-        power_w = RotorPower(fleet, motion).of(slice(None))
+        power_w = fleet_power_w(fleet, motion)
         assert (motion.velocity_mps[..., 2] > 0.05).any()
         for drone in range(4):
             own = (large if drone in heavy else frame).model_copy(update={"payload_kg": 0.4 * drone})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -169,19 +169,19 @@ def test_the_nearest_approach_is_found_between_frames() -> None:
         assert nearest_m(np.zeros((3, 3)), passing) == pytest.approx([2.0])
 
 
-def test_planners_may_fly_where_their_reach_and_the_fence_both_allow(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planners_may_fly_where_their_reach_and_the_fence_both_allow(tmp_path: Path) -> None:
     """About where each of them begins: of the formation, of groups, or of both, as they have one."""
-    groups = ({"drones": [2], "route": {"waypoints_m": [[500.0, 0.0]]}},)
-    of = {"drones": 3, "formation": {"shape": "line", "spacing_m": 30.0}, "groups": groups}
-    fleet = Fleet.model_validate({**of, "steering": {"reach_m": 100.0}})
-    fenced = Fleet.model_validate({**of, "steering": {"reach_m": 100.0, "fence_m": (-60.0, -500.0, 700.0, 90.0)}})
-    rows: list[tuple[Fleet, Callable[[object], bool], tuple[float, ...]]] = [
-        (fleet, lambda each: True, (-100.0, -100.0, 600.0, 130.0)),
-        (fleet, lambda each: each is fleet, (-100.0, -100.0, 100.0, 130.0)),
-        (fleet, lambda each: each is not fleet, (0.0, -100.0, 600.0, 100.0)),
-        (fenced, lambda each: True, (-60.0, -100.0, 600.0, 90.0)),
-        (fleet, lambda each: False, (0.0, 0.0, 1.0, 1.0)),
+    (tmp_path / "own.py").write_text("class Plans:\n    def command(self, view): ...\n")
+    plans, fence = {"mobility": f"{tmp_path / 'own.py'}:Plans"}, {"fence_m": (-60.0, -500.0, 700.0, 90.0)}
+    rows: list[tuple[dict[str, str], dict[str, str], dict[str, object], tuple[float, ...]]] = [
+        (plans, plans, {}, (-100.0, -100.0, 600.0, 130.0)),
+        (plans, {}, {}, (-100.0, -100.0, 100.0, 130.0)),
+        ({}, plans, {}, (0.0, -100.0, 600.0, 100.0)),
+        (plans, plans, fence, (-60.0, -100.0, 600.0, 90.0)),
+        ({}, {}, {}, (0.0, 0.0, 1.0, 1.0)),
     ]
-    for k, (each, steers, area) in enumerate(rows):
-        monkeypatch.setattr("sortie.fleet.flight.steering.steers", steers)
-        assert area_m(each, (0.0, 0.0, 1.0, 1.0)) == pytest.approx(area), k
+    for formation, group, steering, area in rows:
+        groups = ({"drones": [2], "route": {"waypoints_m": [[500.0, 0.0]]}, **group},)
+        of = {"drones": 3, "formation": {"shape": "line", "spacing_m": 30.0}, "groups": groups, **formation}
+        fleet = Fleet.model_validate({**of, "steering": {"reach_m": 100.0, **steering}})
+        assert area_m(fleet, (0.0, 0.0, 1.0, 1.0)) == pytest.approx(area), (formation, group, steering)

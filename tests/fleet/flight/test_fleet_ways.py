@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
 from sortie.fleet.flight.motion import Trajectories, fly
-from sortie.fleet.flight.rotor import RotorPower
+from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.fleet.flight.steps import Staircase, Step, landing_s
 from sortie.scenarios.schema import Fleet, FlightGroup
 
@@ -119,7 +119,7 @@ def test_a_station_stands_level_in_any_wind_and_needs_no_rotors() -> None:
     assert (motion.orientation_xyzw[:, 1] == (0, 0, 0, 1)).all()
     for still in (motion.velocity_mps, motion.acceleration_mps2, motion.body_rates_radps, motion.est_yaw_rad):
         assert not still[:, 1].any()
-    power_w = RotorPower(fleet, motion).of(slice(None))
+    power_w = fleet_power_w(fleet, motion)
     assert not power_w[:, 1].any()
     assert power_w[:, [0, 2]].min() > 50
     assert fleet.altitudes_m == (60, 7, 60)

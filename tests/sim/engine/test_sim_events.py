@@ -13,7 +13,7 @@ import pytest
 from recorded import recorded
 from sim_examples import example
 
-from sortie.fleet.flight.rotor import RotorPower
+from sortie.fleet.flight.rotor import fleet_power_w
 from sortie.sim.engine.pilot import plan_for
 from sortie.sim.engine.sortie import Parts, build, fly, run_sortie
 from sortie.sim.results.record import SortieRecord
@@ -235,7 +235,7 @@ def test_a_fleet_that_flies_another_way_pays_for_it_and_believes_as_before() -> 
             assert error_m == pytest.approx(off_m if wrong else (0, 0, 0))
             turn = here.est_yaw_rad - motion.est_yaw_rad[frame, drone]
             assert np.mod(turn + 1, 2 * np.pi) - 1 == pytest.approx(off_rad if wrong else 0.0)
-    power_w, states = RotorPower(scenario.fleet, motion).of(slice(None)), flight.recorder.finish()["states"]
+    power_w, states = fleet_power_w(scenario.fleet, motion), flight.recorder.finish()["states"]
     airborne = np.reshape(states["airborne"].to_numpy(zero_copy_only=False), (-1, 5))
     used_j = (power_w * airborne).sum(axis=0) * scenario.frame_s / scenario.fleet.battery.drivetrain_efficiency
     flown = [i for i in range(5) if airborne[:, i].all()]
