@@ -63,11 +63,6 @@ class Trajectories:
         """Some frames."""
         return Trajectories(**{each.name: getattr(self, each.name)[frames] for each in fields(self)})
 
-    @property
-    def air_speed_mps(self) -> Array:
-        """Horizontal speed through the air [T, N]."""
-        return air_speed_mps(self.velocity_mps, self.wind_mps)
-
     def bounds_m(self) -> tuple[float, float, float, float]:
         """x_min, y_min, x_max, y_max of everything flown, ENU."""
         low, high = np.full(2, np.inf), np.full(2, -np.inf)

@@ -64,7 +64,7 @@ class Needs(NamedTuple):
     least_disk: int
     """Certainly, while it flies and is saved."""
     most_disk: int
-    """Where every drone hears all others, and every link carries a payload in every frame."""
+    """Where every drone hears all others, every link carries a payload in every frame, and drones leave their planned ways."""
 
 
 def needs(scenario: Scenario) -> Needs:

@@ -28,7 +28,7 @@ def test_shapes_and_end_exclusive() -> None:
     for name in ("position_m", "velocity_mps", "acceleration_mps2", "body_rates_radps", "wind_mps", "est_position_m"):
         assert getattr(m, name).shape == (120, 3, 3), name
     assert m.orientation_xyzw.shape == (120, 3, 4)
-    assert m.est_yaw_rad.shape == m.yaw_rad.shape == m.air_speed_mps.shape == (120, 3)
+    assert m.est_yaw_rad.shape == m.yaw_rad.shape == (120, 3)
     assert sum(getattr(m, field.name)[0].size for field in fields(m)) == frame_floats(3)
     assert fly(Fleet(drones=1), 0.01, 0.1, seed=1).body_rates_radps.tolist() == [[[0, 0, 0]]]
 
@@ -46,7 +46,7 @@ def test_calm_hover_is_level_and_still() -> None:
     expected = np.column_stack([slots("cross", 5, 20.0), np.full(5, 60.0)])
     np.testing.assert_allclose(m.position_m, np.tile(expected, (50, 1, 1)))
     np.testing.assert_allclose(m.orientation_xyzw, np.tile([0.0, 0.0, 0.0, 1.0], (50, 5, 1)))
-    for still in (m.velocity_mps, m.acceleration_mps2, m.body_rates_radps, m.wind_mps, m.yaw_rad, m.air_speed_mps):
+    for still in (m.velocity_mps, m.acceleration_mps2, m.body_rates_radps, m.wind_mps, m.yaw_rad):
         assert not still.any()
     np.testing.assert_array_equal(m.est_position_m, m.position_m)
     np.testing.assert_array_equal(m.est_yaw_rad, m.yaw_rad)

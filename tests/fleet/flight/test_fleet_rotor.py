@@ -173,6 +173,6 @@ def test_every_drone_pays_for_its_own_load_in_level_flight_and_in_climb() -> Non
             if model == "momentum":
                 wanted = momentum_power_w(air_mps, motion.acceleration_mps2[:, drone], own)
             else:
-                level_w = rotor_power_w(motion.air_speed_mps[:, drone], own)
+                level_w = rotor_power_w(np.hypot(*air_mps[:, :2].T), own)
                 wanted = level_w + climb_power_w(motion.velocity_mps[:, drone, 2], own)
             np.testing.assert_allclose(power_w[:, drone], wanted, rtol=1e-9)
