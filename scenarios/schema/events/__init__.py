@@ -12,14 +12,14 @@ from sortie.scenarios.schema.events.base import Event
 
 
 def _kinds() -> dict[str, type[Event]]:
-    """Every kind of event by its name, in the order of the files."""
+    """Every kind of event by its name, in alphabetical order."""
     found: dict[str, type[Event]] = {}
     for file in sorted(pkgutil.iter_modules(__path__), key=lambda each: each.name):
         for each in vars(importlib.import_module(f"{__name__}.{file.name}")).values():
             if isinstance(each, type) and issubclass(each, Event) and get_args(each.model_fields["kind"].annotation):
                 (kind,) = get_args(each.model_fields["kind"].annotation)
                 found[kind] = each
-    return found
+    return dict(sorted(found.items()))
 
 
 KINDS = _kinds()

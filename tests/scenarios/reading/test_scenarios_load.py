@@ -19,7 +19,7 @@ from sortie.scenarios.reading.load import ScenarioError, dump, library, load, lo
 from sortie.scenarios.reading.nodes import MAX_DEPTH, as_node, assign, child, nearest, plain
 from sortie.scenarios.reading.strict_yaml import MAX_WEIGHT, read_yaml
 from sortie.scenarios.reading.top_keys import top_keys
-from sortie.scenarios.schema import PolicySection, Scenario
+from sortie.scenarios.schema import KINDS, PolicySection, Scenario
 
 BROKEN = sorted((Path(__file__).parent / "broken").glob("*.yaml"))
 PARSERS = {"python": yaml.SafeLoader, "libyaml": getattr(yaml, "CSafeLoader", None)}
@@ -39,7 +39,9 @@ def expected_of(path: Path) -> str:
     sidecar = path.with_suffix(".expected")  # for files that cannot hold a comment
     if sidecar.exists():
         return sidecar.read_text("utf-8").rstrip("\n")
-    return path.read_text("utf-8").split("\n", 1)[0].removeprefix("# ")
+    *others, last = KINDS
+    told = path.read_text("utf-8").split("\n", 1)[0].removeprefix("# ")
+    return told.replace("{kinds}", f"{', '.join(others)} or {last}")
 
 
 @pytest.mark.parametrize("parser", PARSERS)

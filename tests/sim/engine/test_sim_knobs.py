@@ -20,7 +20,7 @@ from recorded import recorded
 from recording_examples import record_flight
 from sim_examples import example
 
-from sortie.scenarios.schema import FlightGroup, Scenario
+from sortie.scenarios.schema import KINDS, FlightGroup, Scenario
 from sortie.scenarios.schema.fleet import Make
 from sortie.sim.engine.sortie import run_sortie
 from sortie.sim.results.record import SortieRecord
@@ -242,6 +242,8 @@ def test_each_knob_alone_changes_the_record(tmp_path: Path) -> None:
 def test_every_kind_of_event_changes_the_record() -> None:
     prints = {event: flown(event).fingerprint for event in knobs.EVENTS}
     assert len({flown().fingerprint, *prints.values()}) == len(knobs.EVENTS) + 1
+    kinds = {kind for kind in KINDS if any(f"kind: {kind}" in event for event in knobs.EVENTS)}
+    assert kinds == set(KINDS) - {"own"}, "tests/helpers/knobs.py: EVENTS has one of each"
 
 
 SHORT = (

@@ -49,9 +49,8 @@ def test_a_view_that_is_shown_is_read_by_all_that_read_the_drone_s_own() -> None
     steered, kept = list[float](), list[float]()
     pilot, _ = _pilot(
         PolicyPlan(NamedPolicy("p", policy)),
-        moves=SimpleNamespace(
-            request=lambda drone, asked: None, read=lambda drone, view: steered.append(view.me.battery_soc)
-        ),
+        viewpoints=SimpleNamespace(request=lambda drone, asked: None),
+        planners=SimpleNamespace(read=lambda drone, view: steered.append(view.me.battery_soc)),
         journal=SimpleNamespace(decided=lambda drone, name, view, directives, asked: kept.append(view.me.battery_soc)),
     )
     pilot.show(Replay(0.0, 0, fleet_of(3, soc=0.25), to_drone=False))
@@ -66,7 +65,7 @@ def test_who_takes_over_looks_from_its_own_viewpoint_or_from_its_slot() -> None:
     asked: list[Reposition | None] = []
     pilot, audit = _pilot(
         PolicyPlan(NamedPolicy("first", first)),
-        moves=SimpleNamespace(request=lambda drone, wanted: asked.append(wanted), read=lambda drone, view: None),
+        viewpoints=SimpleNamespace(request=lambda drone, wanted: asked.append(wanted)),
     )
     pilot(fleet_of(2))
     pilot.take_over(NamedPolicy("second", second, 7), "command", 0)
