@@ -10,8 +10,8 @@ import struct
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from numbers import Integral
-from typing import Any
+from numbers import Integral, Real
+from typing import Any, get_args
 
 import numpy as np
 import simpy
@@ -144,7 +144,11 @@ class FleetHandle:
         env.process(process())
 
     def weaken(self, drone: int, peer: int | None, loss_db: float) -> None:
-        self._world.weaken(self.index, drone, peer, loss_db)
+        for end in (drone,) if peer is None else (drone, peer):
+            self._check(end)
+        if not (isinstance(loss_db, Real) and 0.0 <= loss_db < np.inf):
+            raise self._error(f"a loss of {loss_db!r:.60} dB, must be finite and ≥ 0")
+        self._world.weaken(self.index, drone, peer, float(loss_db))
 
     def set_loss_db(self, loss_db: ArrayLike) -> None:
         n = len(self.members)
@@ -178,9 +182,11 @@ class FleetHandle:
         return drone in self._world.homebound
 
     def join(self, drone: int) -> None:
+        self._check(drone)
         self._acted.membership.join(drone)
 
     def send_home(self, drone: int) -> None:
+        self._check(drone)
         self._acted.membership.go_home(drone)
 
     def lose(self, drone: int, text: str = "fell silent") -> None:
@@ -211,13 +217,21 @@ class FleetHandle:
         self._world.read_clocks()
 
     def lie(self, drone: int, about: About, claim: Claim) -> None:
+        self._check(drone)
+        if about not in get_args(About) or claim not in get_args(Claim):
+            known = f"{', '.join(get_args(About))}; {', '.join(get_args(Claim))}"
+            raise self._error(f"a lie {about!r:.60}, {claim!r:.60}, must be one of each: {known}")
         self._world.lie(self.index, drone, about, claim)
 
     def block_cameras(self, drone: int) -> None:
+        self._check(drone)
         self._world.block_cameras(self.index, drone)
 
     def slow(self, drone: int, extra_s: float) -> None:
-        self._world.slow(self.index, drone, extra_s)
+        self._check(drone)
+        if not (isinstance(extra_s, Real) and 0.0 <= extra_s < np.inf):
+            raise self._error(f"perception slower by {extra_s!r:.60} s, must be finite and ≥ 0")
+        self._world.slow(self.index, drone, float(extra_s))
 
     def slowed_s(self, drone: int) -> float:
         return self._world.drones[drone].slowed_s

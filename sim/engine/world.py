@@ -122,7 +122,7 @@ class World:
         self.scene, self.plan, self.drones = scene, plan, drones
         n = len(drones)
         self._weaker_db = weaker_senders_db(scenario)
-        self._drops: dict[int, tuple[int, int | None, float]] = {}  # by cause, here and below
+        self._drops: dict[int, list[tuple[int, int | None, float]]] = {}  # by cause, here and below
         self._losses_db: dict[int, np.ndarray] = {}
         self._jammers: dict[int, Jammer] = {}
         self._clocks, self.people = clocks, people
@@ -272,7 +272,7 @@ class World:
 
         Args: `cause` is the event's place in the scenario, as below.
         """
-        self._drops[cause] = drone, peer, loss_db
+        self._drops.setdefault(cause, []).append((drone, peer, loss_db))
 
     def set_loss(self, cause: int, loss_db: np.ndarray) -> None:
         """Add loss to links, [N, N] dB, sender by receiver, until the next call or `lift`."""
@@ -314,7 +314,7 @@ class World:
         given = [] if self._weaker_db is None else [self._weaker_db]
         if self._drops:
             dropped = np.zeros((len(self.drones), len(self.drones)))
-            for drone, peer, loss_db in self._drops.values():
+            for drone, peer, loss_db in chain.from_iterable(self._drops.values()):
                 others = slice(None) if peer is None else peer
                 dropped[drone, others] += loss_db
                 dropped[others, drone] += loss_db

@@ -1,6 +1,6 @@
 """What every event is: its fields, what it does to a fleet as it begins and ends, and what it can do of that.
 
-A kind of event is one class in one file of this folder, and nothing else names it. `Fleet` is all that an event, one of the
+A kind of event is one class of this folder, and nothing else names it. `Fleet` is all that an event, one of the
 user's own too, sees of the fleet and may do to it.
 """
 
@@ -71,7 +71,7 @@ class Fleet(Protocol):
     # --- links
 
     def weaken(self, drone: int, peer: int | None, loss_db: float) -> None:
-        """Add loss to both directions of a link, or of every link of a drone."""
+        """Add loss to both directions of a link, or of every link of a drone. Several calls add up."""
 
     def set_loss_db(self, loss_db: ArrayLike) -> None:
         """Weaken links by this event, until the next call or its end: [N, N] dB, sender by receiver, or one number."""

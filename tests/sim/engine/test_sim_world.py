@@ -96,6 +96,29 @@ def test_a_custom_event_sees_the_drones_of_the_frame_and_weakens_a_link_one_way(
     assert world.extra_loss_db.tolist() == [[0.0, 4.0, 4.0], [4.0, 0.0, 4.0], [4.0, 4.0, 0.0]]
 
 
+def test_what_an_event_asks_for_adds_up_and_what_cannot_be_is_refused() -> None:
+    world = _world()
+    its = _handle(world)
+    its.weaken(0, 1, 3.0)
+    its.weaken(0, None, 4)
+    assert world.extra_loss_db.tolist() == [[8.0, 7.0, 4.0], [7.0, 0.0, 0.0], [4.0, 0.0, 0.0]]
+    its.lift()
+    assert world.extra_loss_db is None
+    nobody = "drone -1, must be a whole number, 0 … 2$"
+    lie = r"a lie 'speed', 'much', must be one of each: coverage, goodput, battery; much, little$"
+    for act, text in (
+        (lambda: its.weaken(0, -1, 3.0), nobody),
+        (lambda: its.weaken(0, 1, -3.0), r"a loss of -3.0 dB, must be finite and ≥ 0$"),
+        (lambda: its.join(-1), nobody),
+        (lambda: its.send_home(-1), nobody),
+        (lambda: its.block_cameras(-1), nobody),
+        (lambda: its.lie(0, "speed", "much"), lie),
+        (lambda: its.slow(0, float("nan")), "perception slower by nan s, must be finite and ≥ 0$"),
+    ):
+        with pytest.raises(PluginError, match=rf"^event mine: {text}"):
+            act()
+
+
 def test_a_custom_event_writes_no_note_that_the_record_cannot_hold() -> None:
     world = _world()
     its = _handle(world)
