@@ -187,7 +187,7 @@ class Lasting(Event):
     def misfit(self, station: GroundStation | None) -> Misfit | None:
         if self.until_s is not None and self.until_s <= self.at_s:
             return "until_s", f"{self.until_s:g}", f"above at_s = {self.at_s:g}"
-        return None
+        return super().misfit(station)
 
     def overlaps(self, other: Event) -> bool:
         """Whether another event that lasts keeps up what this one did."""
@@ -241,9 +241,9 @@ class PackEvent(MemberEvent):
     """What happens to a battery: a ground station on mains power has none."""
 
     def misfit(self, station: GroundStation | None) -> Misfit | None:
-        if station is None or not station.mains:
-            return None
-        return "drone", f"{self.drone}", "a drone that flies, it is a ground station on mains power"
+        if station is not None and station.mains:
+            return "drone", f"{self.drone}", "a drone that flies, it is a ground station on mains power"
+        return super().misfit(station)
 
 
 class PoseFault(Lasting):

@@ -54,10 +54,10 @@ class DroneLeaves(MemberEvent):
     drone: DroneId = Field(description="Who goes home: it publishes landing, descends and leaves.")
 
     def misfit(self, station: GroundStation | None) -> Misfit | None:
-        if station is None:
-            return None
-        bound = "a drone that flies, it is a ground station" + " on mains power" * station.mains
-        return "drone", f"{self.drone}", bound
+        if station is not None:
+            bound = "a drone that flies, it is a ground station" + " on mains power" * station.mains
+            return "drone", f"{self.drone}", bound
+        return super().misfit(station)
 
     def no_effect(self, flies: bool, descends: bool) -> str:
         return "it already descends" if descends else super().no_effect(flies, descends)
