@@ -52,9 +52,6 @@ class Going:
         del self._going[fleet.index]
         event.end(fleet, any(event.overlaps(other) for other in self._going.values()))
 
-    def __contains__(self, index: object) -> bool:
-        return index in self._going
-
     def __iter__(self) -> Iterator[int]:
         return iter(tuple(self._going))
 
