@@ -28,7 +28,8 @@ from scipy import stats
 
 from sortie.scenarios.errors import SortieError
 from sortie.scenarios.reading.load import load
-from sortie.sim.engine.sortie import run_sortie
+from sortie.sim.engine.pilot import plan_for
+from sortie.sim.engine.sortie import build, run_sortie
 from sortie.sim.results.outcome import outcome
 
 DRAWN, SHARING, SEED = 40, 30, 61_000
@@ -67,9 +68,9 @@ SILENT = ("silence",)
 FIELDS: dict[str, tuple[str, ...]] = {
     "fleet.drones": ("3", "5", "8", "16"),
     "fleet.formation": (
-        "{shape: line, spacing_m: 30}",
+        "{shape: line, spacing_m: 15}",
         "{shape: circle, altitude_m: 40}",
-        "{shape: grid, spacing_m: 60}",
+        "{shape: grid, spacing_m: 40}",
     ),
     "fleet.battery.initial_soc": ("0.3", "0.13"),
     "fleet.clock": ("{gnss: false, offset_s: 0.05, drift_ppm: 500}", "{offset_s: 0.3}"),
@@ -119,7 +120,7 @@ EVENTS = (
 
 
 def drawn() -> Iterator[tuple[str, tuple[str, ...]]]:
-    """The drawn scenarios: a name, and what each sets of `track_target`. What the schema refuses is drawn again."""
+    """The drawn scenarios: a name, and what each sets of `track_target`. What is refused before it flies is drawn again."""
     for k in range(DRAWN):
         draw = random.Random(SEED + k)
         while True:
@@ -132,7 +133,8 @@ def drawn() -> Iterator[tuple[str, tuple[str, ...]]]:
             ]
             sets.append(f"events=[{', '.join(draw.sample(EVENTS, draw.randint(0, 4)))}]")
             try:
-                load("track_target", sets)
+                scenario = load("track_target", sets)
+                build(scenario, plan_for(scenario), scenario.seed)
             except SortieError:
                 continue
             yield f"drawn_{k}", tuple(sets)
