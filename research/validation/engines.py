@@ -100,6 +100,10 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "perception.thermal": ("{}",),
     "record": ("{views: true, beliefs: true}",),
 }
+WAYS = (
+    "fleet.route={waypoints_m: [[-60, 0], [80, 0]]}",
+    "mission.target={waypoints_m: [[-60, -1.75], [200, -1.75]], speed_mps: 5}",
+)
 PHASES = "mission.phases=[{at_s: 0, phase: search}, {at_s: 2, phase: track, region: {radius_m: 40}}]"
 EVENTS = (
     "{kind: link_drop, at_s: 1.5, until_s: 4, drone: 1, loss_db: 20}",
@@ -126,7 +130,13 @@ def drawn() -> Iterator[tuple[str, tuple[str, ...]]]:
         while True:
             policy = draw.choice(SHARES if k < SHARING else SILENT)
             detector = draw.choice(("surrogate", "none"))
-            sets = [PHASES, f"seed={SEED + k}", f"duration_s={draw.choice((6, 8))}", f"policy={{name: {policy}}}"]
+            sets = [
+                *WAYS,
+                PHASES,
+                f"seed={SEED + k}",
+                f"duration_s={draw.choice((6, 8))}",
+                f"policy={{name: {policy}}}",
+            ]
             sets.append(f"perception.detector={detector}")
             sets += [
                 f"{field}={draw.choice(FIELDS[field])}" for field in draw.sample(sorted(FIELDS), draw.randint(3, 9))
