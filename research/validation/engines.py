@@ -3,7 +3,8 @@
     python -m research.validation.engines keep FOLDER       fly all with the engine that is here, and keep what came of it
     python -m research.validation.engines compare FOLDER    fly all again, and say what differs from what was kept
 
-Written down before anything was measured:
+`engines.json` beside this file was kept by the engine with an object for each drone, link and packet, before it became
+arrays. Written down before anything was measured:
 
 * **Records.** `DRAWN` scenarios, `track_target` with fields drawn from `FIELDS` and events from `EVENTS` by `SEED`. The first
   `SHARING` of them have a policy that sends payloads. Their fingerprints must be equal.
