@@ -7,8 +7,8 @@ of the next one, by ascending drone (`sortie.fleet.flight.safety`). Drones that 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
-from typing import get_args
+from collections.abc import Collection, Sequence
+from typing import Protocol, get_args
 
 import numpy as np
 
@@ -209,21 +209,25 @@ class Viewpoints(Source):
         return "" if answer is None else f"stays, {answer}: {reason}"
 
 
+class SendsHome(Protocol):
+    """Who sends drones home (`sortie.sim.engine.membership.Membership`)."""
+
+    def go_home(self, drone: int, text: str) -> None: ...
+
+
 class Planners(Source):
     """The commands of mobility models that plan in flight. Each planner reads the view of its drone's policy."""
 
     event, lasts = STEERING, False
 
-    def __init__(
-        self, scenario: Scenario, world: World, go_home: Callable[[int, str], None], seed: int, replication: int
-    ) -> None:
-        """Args: `go_home` sends a drone home that its planner lands, and says why.
+    def __init__(self, scenario: Scenario, world: World, members: SendsHome, seed: int, replication: int) -> None:
+        """Args: `members` sends a drone home that its planner lands.
 
         Raises:
             PluginError: a planner that is not there, does not load, or lacks its method; a start outside the bounds.
         """
         fleet = scenario.fleet
-        self._fleet, self._world, self._go_home = fleet, world, go_home
+        self._fleet, self._world, self._members = fleet, world, members
         self._every = max(1, round(EVERY_S / scenario.frame_s))
         self._names: dict[int, str] = {}
         self._planners: dict[int, Guard] = {}
@@ -344,4 +348,4 @@ class Planners(Source):
         landing, self._landing, self._places_m = self._landing, [], None
         self._commands.clear()
         for drone in landing:
-            self._go_home(drone, f"{self._names[drone]} lands it")
+            self._members.go_home(drone, f"{self._names[drone]} lands it")

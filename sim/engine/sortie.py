@@ -263,7 +263,7 @@ def build(
         viewpoints = Viewpoints(scenario, world, posed_by_trace=posed)
         manoeuvres.serve(viewpoints)
     membership = Membership(scenario, world, manoeuvres)
-    planners = Planners(scenario, world, membership.go_home, seed, replication)
+    planners = Planners(scenario, world, membership, seed, replication)
     if planners.anyone:
         manoeuvres.serve(planners)
     journal = Journal(env) if scenario.record.views or scenario.record.disagreement else None
